@@ -1,4 +1,4 @@
-"""Write small GLBs by hand, as other programs would: dense accessors, nothing of our own."""
+"""Writes small GLBs like other programs: dense accessors, no kouxing extras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The heads of the package, read once for all tests."""
+"""Built-in heads, read once for all tests."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def load(name: str, detail: Detail = "fine") -> Head:
 
 
 def travel_m(head: Head, fap: Fap, value: float) -> tuple[int, float]:
-    """Axis along which a FAP moves its points, and how far."""
+    """Return the direction and distance of a FAP's displacement."""
     axis, sign = AXES[fap.direction]
     return axis, sign * value * head.fapu[fap.fapu] / 1024
 
 
 def only(number: int, value: float) -> NDArray[np.float32]:
-    """FAPs (68,) of which one is not zero."""
+    """Return FAPs (68,) with one value."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[number - 1] = value
     return faps

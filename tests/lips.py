@@ -1,4 +1,4 @@
-"""Made-up speakers with tracked lips, and faces that ship."""
+"""Built-in lip models, faces and artificial speech for tests."""
 
 from collections.abc import Sequence
 
@@ -49,7 +49,7 @@ def phone(
 
 
 def advance(face: FaceAnimator, time_s: float) -> list[Frame]:
-    """Let a silent sound go on up to a time; return the frames that are due."""
+    """Advance silent sound to a time; return the due frames."""
     return face.process(Progress(time_s=time_s, level_db=SILENT_DB))
 
 
@@ -59,7 +59,7 @@ def moment(
     levels: Sequence[tuple[float, float]] = (),
     step_s: float = 0.02,
 ) -> FrameContext:
-    """What modifiers are told while somebody speaks, by default nothing that is known."""
+    """Return a context during speech, by default without levels and phones."""
     return FrameContext(
         time_s=time_s,
         known_s=time_s,

@@ -1,4 +1,4 @@
-"""A model of lips that needs no training: the louder the sound, the wider the jaw."""
+"""A lip predictor without training: louder sound opens the jaw further."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ JAW = MOUTH_FAPS.index(3)
 
 @dataclass(frozen=True)
 class LoudLips:
-    """Offers any delays; the values of the network count a little, too."""
+    """Supports any delays; the network's output has a small effect."""
 
     delays_s: Sequence[float] = (-0.005, 0.025, 0.085, 0.145)
 
@@ -30,7 +30,7 @@ class LoudLips:
 
 
 class LoudLipStream:
-    """Remembers how many positions of the segment came before."""
+    """Counts the earlier positions of the segment."""
 
     def __init__(self, delays_s: Sequence[float]) -> None:
         self._delays_s = delays_s

@@ -1,4 +1,4 @@
-"""Our own head as a stranger's mesh: stripped of what moves it, or with shapes of other names."""
+"""The built-in head as a user's mesh, without fields or with renamed shapes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from kouxing.services.driver.head.head import Head
 from tests.glb_writer import Mesh
 
-STIFF = ("hair_tips", "lashes")  # parts that need transparency, which the meshes here do without
+STIFF = ("hair_tips", "lashes")  # transparent parts, which these meshes omit
 
 
 def meshes(head: Head, shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
-    """Return the parts, with a morph target for each of some sums of FAPs (68,)."""
+    """Return the parts with morph targets, given as FAPs (68,) by name."""
     shown = [part for part in head.parts if not part.name.startswith(STIFF)]
     made = {
         part.name: Mesh(
@@ -38,7 +38,7 @@ def meshes(head: Head, shapes: Mapping[str, NDArray[Any]] | None = None) -> list
 
 
 def write_obj(path: Path, parts: list[Mesh]) -> None:
-    """Write vertices with colours, and texture places that cut the mesh at x = 0."""
+    """Write vertices with colors and texture coordinates with a seam at x = 0."""
     lines, first = [], 1
     for part in parts:
         lines.append(f"o {part.name}")

@@ -1,4 +1,4 @@
-"""How other programs read a face that is sent to them, byte by byte as they are specified."""
+"""Reads sent faces like other programs, by their specifications."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from kouxing.services.senders.target import Target
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import Dialogue, tracking_parameters
 
-# what can be sent, each to a program that reads it otherwise
+# addresses of all protocols and shape sets
 SENT = (
     "vmc://", "vmc://?shapes=arkit", "livelink://", "osc://", "osc://?shapes=oculus", "vts://",
 )  # fmt: skip
-# the weights of Live Link Face in their order, as the protocol numbers them from 0
+# order of the weights in Live Link Face
 LIVE_LINK_ORDER = """
     eyeBlinkLeft eyeLookDownLeft eyeLookInLeft eyeLookOutLeft eyeLookUpLeft eyeSquintLeft
     eyeWideLeft eyeBlinkRight eyeLookDownRight eyeLookInRight eyeLookOutRight eyeLookUpRight

@@ -1,4 +1,4 @@
-"""A small video with sound, as phones play it."""
+"""A small video with sound."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _RATE_HZ = 20.0
 
 
 def write_video(path: Path, *, has_sound: bool = True) -> None:
-    """Write a quarter of a second of grey with a tone: H.264 and AAC in .mp4."""
+    """Write 0.25 s of gray with a tone: H.264 and AAC in .mp4."""
     time_s = np.arange(round(DURATION_S * MEDIA_RATE_HZ)) / MEDIA_RATE_HZ
     with VideoWriter(path, 64, 48, _RATE_HZ, MEDIA_RATE_HZ if has_sound else None) as video:
         for _ in range(round(DURATION_S * _RATE_HZ)):

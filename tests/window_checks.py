@@ -1,4 +1,4 @@
-"""What ``test_window`` checks, in a process of its own: GLX beside other tests' EGL breaks both."""
+"""Checks for ``test_window``, run in a separate process because GLX and EGL conflict."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.system import free_port
 
 
 def shown(window: Window) -> np.ndarray:
-    """What is on the screen: the front buffer, top row first."""
+    """Return the front buffer, top row first."""
     screen = window.context.screen
     width, height = glfw.get_framebuffer_size(window._window)
     raw = screen.read(viewport=(0, 0, width, height), components=3, alignment=1)
@@ -42,13 +42,13 @@ def size_and_close() -> None:
     image = shown(window)
     assert image[5, 5].tolist() == [255, 255, 255]
     red, green, blue = image[124, 160].astype(int)
-    assert red > green > blue, "skin in the middle"
+    assert red > green > blue
     glfw.set_window_size(window._window, 480, 200)
     draw_until(window, (480, 200))
     assert shown(window).shape == (200, 480, 3)
     beside = Renderer(head, 160, 120, samples=0, context=window.context)
-    assert beside.draw(neutral_faps()).shape == (120, 160, 3), "a video goes on in its context"
-    assert window.draw(neutral_faps()), "and the window after it"
+    assert beside.draw(neutral_faps()).shape == (120, 160, 3)
+    assert window.draw(neutral_faps())
     glfw.set_window_should_close(window._window, True)
     assert not window.draw(neutral_faps())
     window.hide()
@@ -56,7 +56,7 @@ def size_and_close() -> None:
 
 
 def lost_stream() -> None:
-    control = f"tcp://127.0.0.1:{free_port()}"  # nobody is there
+    control = f"tcp://127.0.0.1:{free_port()}"  # no control
     service = DriverService(DriverConfig(control=control, view="window", width_px=64, height_px=48))
     window = service.view._window
     assert window is not None
@@ -101,7 +101,7 @@ SHIFT_MASK = 1
 
 
 class InputEvent(ctypes.Structure):
-    """An XKeyEvent; an XButtonEvent differs in the meaning of ``detail`` alone."""
+    """An XKeyEvent; an XButtonEvent has the same layout."""
 
     _fields_ = (
         ("type", ctypes.c_int),

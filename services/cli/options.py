@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.driver.config import DriverConfig, Framing
+from kouxing.services.driver.config import HEAD_NAMES, DriverConfig, Framing
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 
@@ -18,8 +18,7 @@ HeadName = Annotated[
     str,
     typer.Option(
         "--head",
-        help="woman, man, elder, child, ada, leo, rosa, mika, an .npz file, or a .glb file with"
-        " morph targets.",
+        help=f"{', '.join(HEAD_NAMES)}, an .npz file, or a .glb file with morph targets.",
     ),
 ]
 MouthFile = Annotated[

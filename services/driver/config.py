@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from kouxing.shared.config import Form, Switch
 from kouxing.shared.face.config import FaceConfig
+
+HEAD_NAMES = tuple(
+    sorted(path.stem for path in (Path(__file__).parent / "head" / "assets").glob("*.npz"))
+)
 
 
 class Framing(StrEnum):

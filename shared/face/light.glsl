@@ -1,18 +1,18 @@
-// How a head is lit: the driver's shaders are made of this (services/driver/render/shaders.py), and
-// so are the page's where it draws plainly (services/gateway/page/materials.js).
+// Lighting of a head. The driver's shaders include this file (services/driver/render/shaders.py), and
+// so do the page's simple materials (services/gateway/page/materials.js).
 //
-// Colours are linear. A sky and a ground, a warm key light from the front upper left, a cool fill
-// light and a rim light; skin wraps the key light round the terminator, red farthest, as light
-// scattered under it does. Highlights follow Blinn and Phong, those of hair Kajiya and Kay, with
-// Schlick's Fresnel factor.
+// Colors are linear. The lights are a sky and a ground, a warm key light from the front upper left, a
+// cool fill light and a rim light. Skin wraps the key light around the terminator, red farthest, like
+// light that is scattered under the skin. Highlights follow Blinn and Phong, and Kajiya and Kay for
+// hair, with Schlick's Fresnel factor.
 
-uniform vec3 wrap; // of the key light, by channel
+uniform vec3 wrap; // wrap of the key light, by channel
 uniform float gloss; // exponent of the highlight
-uniform float shine; // its strength
-uniform float share; // of the light that falls into the mouth
+uniform float shine; // strength of the highlight
+uniform float share; // share of the light that enters the mouth
 uniform bool two_sided;
-uniform bool strands; // hair, which runs down from the crown
-uniform bool cel; // one tone of light and one of shade, no highlights
+uniform bool strands; // hair, down from the crown
+uniform bool cel; // one light and one dark tone, no highlights
 
 const vec3 KEY = vec3(-0.4067, 0.4842, 0.7747);
 const vec3 FILL = vec3(0.7767, 0.1036, 0.6213);
@@ -23,12 +23,12 @@ const vec3 RIM_COLOR = vec3(0.45, 0.47, 0.50);
 const vec3 SKY = vec3(0.42, 0.44, 0.48);
 const vec3 GROUND = vec3(0.25, 0.21, 0.19);
 const vec3 CROWN = vec3(0.0, 0.97, -0.24);
-// what eyes mirror: lower than the key light, or the lid would hide it
+// reflections in the eyes; lower than the key light, because the lid would hide them
 const vec3 WINDOW = vec3(-0.36, 0.34, 0.87);
 const vec3 FLOOR = vec3(0.50, -0.46, 0.82);
 
-// Light on a vertex with the normal n, seen from the direction v: that which its texture scatters
-// (tint: its own colour, with the baked occlusion) and that which it mirrors.
+// Light on a vertex with the normal n, seen from the direction v: scattered by the texture (tint: color
+// and baked occlusion) and reflected.
 void light_vertex(vec3 n, vec3 v, vec3 tint, out vec3 light, out float high) {
   float facing = dot(n, v);
   if (two_sided && facing < 0.0) {
@@ -43,7 +43,7 @@ void light_vertex(vec3 n, vec3 v, vec3 tint, out vec3 light, out float high) {
   light *= share * tint;
   vec3 half_way = normalize(KEY + v);
   float mirrored = max(dot(n, half_way), 0.0);
-  if (strands) { // darker locks shine higher up
+  if (strands) { // darker strands have higher highlights
     vec3 strand = normalize(n * (dot(n, CROWN) - 0.6 + 0.3 * tint.g) - CROWN);
     float along = dot(strand, half_way);
     mirrored = sqrt(max(1.0 - along * along, 0.0));
@@ -54,7 +54,7 @@ void light_vertex(vec3 n, vec3 v, vec3 tint, out vec3 light, out float high) {
   high = (high + fresnel * 0.10) * shine * share * min(1.0, tint.g * 1.6);
 }
 
-// Colour of a texel. Both are sRGB, and are taken as squared for linear light: close to it, and cheap.
+// Color of a texel. Texel and result are sRGB; squares approximate linear light at low cost.
 vec3 shaded(vec3 texel, vec3 light, float high) {
   if (cel) {
     float strength = dot(light, vec3(0.333));
@@ -64,8 +64,8 @@ vec3 shaded(vec3 texel, vec3 light, float high) {
   return sqrt(min(texel * texel * light + high, 1.0));
 }
 
-// What an eye with the normal n mirrors: a bright window, sharply, and the ground, softly; `ahead`
-// leads from the head to the camera.
+// Reflection in an eye with the normal n: a sharp bright window and a soft ground; `ahead` points from
+// the head to the camera.
 float mirrored(vec3 n, vec3 ahead) {
   float window = smoothstep(0.988, 0.9935, dot(n, normalize(WINDOW + ahead)));
   return window + 0.05 * smoothstep(0.980, 0.992, dot(n, normalize(FLOOR + ahead)));

@@ -1,4 +1,4 @@
-"""A face whose recognizer or synthesizer is replaced amid real speech, anywhere: nobody sees it."""
+"""Replacing the recognizer or synthesizer during speech is not visible."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from tests.system import DEMO
 
 pytestmark = pytest.mark.property
 
-KEPT_S = 3.0  # of events, that a new synthesizer is told again
-LARGEST_STEP = 1.2  # times the largest one undisturbed
-UNSEEN = 1.0  # FAP units; a smaller step is none
+KEPT_S = 3.0  # events repeated for a new synthesizer
+LARGEST_STEP = 1.2  # relative to the largest undisturbed step
+UNSEEN = 1.0  # FAP units; smaller steps are invisible
 SHUT, NEARLY_SHUT = 12.0, 35.0  # FAP units between inner lips
 RATE_HZ = 50.0
 JAW, EYELID, HEAD_PITCH, LOWER_LIP = 3, 19, 48, 5  # FAPs
@@ -34,11 +34,11 @@ JAW, EYELID, HEAD_PITCH, LOWER_LIP = 3, 19, 48, 5  # FAPs
 
 @lru_cache
 def events() -> tuple[SoundEvent, ...]:
-    """What a live recognizer tells of a sentence full of closures."""
+    """Return a live recognizer's output for a sentence with many closures."""
     samples, _ = read_audio(DEMO / "bilabials-female.wav")
     model = load_live_model()
     outputs = recognize_live(model, samples, lips=lip_predictor_for(model), face_delay_s=0.06)
-    return tuple(each for each in outputs if not isinstance(each, Waveform))
+    return tuple(event for event in outputs if not isinstance(event, Waveform))
 
 
 def make_face(lips: str) -> FaceAnimator:
@@ -67,38 +67,38 @@ def time_of(event: SoundEvent) -> float:
 
 
 def with_another_synthesizer(lips: str, cut: int) -> list[Frame]:
-    """A new face is told what was shown last, then the last events, then what comes."""
+    """Resume on a new face: last frame, recent events, then new events."""
     before, after = events()[:cut], events()[cut:]
     frames = tell(make_face(lips), before)
     kept_from_s = time_of(before[-1]) - KEPT_S
-    changes = [each for each in before if isinstance(each, SpeechChange)]
-    older = [each for each in changes if each.time_s < kept_from_s][-1:]
+    changes = [event for event in before if isinstance(event, SpeechChange)]
+    older = [event for event in changes if event.time_s < kept_from_s][-1:]
     face = make_face(lips)
     face.resume(frames[-1][0], len(frames), frames[-1][1])
-    kept = [each for each in before if time_of(each) >= kept_from_s]
+    kept = [event for event in before if time_of(event) >= kept_from_s]
     return frames + tell(face, [*older, *kept, *after])
 
 
 def with_another_recognizer(lips: str, cut: int) -> list[Frame]:
-    """The face is told anew, with phones counted anew, what may not be final."""
+    """Continue with another recognizer that repeats events that may not be final."""
     before = events()[:cut]
     face = make_face(lips)
     frames = tell(face, before)
     final_s = max(map(final_until, before))
-    again = [each for each in events() if middle_of(each) > final_s]
-    first = min((each.index for each in again if isinstance(each, Phone)), default=0)
+    again = [event for event in events() if middle_of(event) > final_s]
+    first = min((event.index for event in again if isinstance(event, Phone)), default=0)
     face.change_recognizer()
     return frames + tell(
         face,
         [
-            replace(each, index=each.index - first) if isinstance(each, Phone) else each
-            for each in again
+            replace(event, index=event.index - first) if isinstance(event, Phone) else event
+            for event in again
         ],
     )
 
 
 def final_until(event: SoundEvent) -> float:
-    """Media time before which nothing is told again after an event."""
+    """Return the media time before which nothing is repeated after an event."""
     match event:
         case Phone(final=True):
             return event.onset_s + event.duration_s
@@ -120,7 +120,7 @@ def steps(frames: Sequence[Frame]) -> NDArray[np.float32]:
 
 
 def assert_unseen(frames: Sequence[Frame], lips: str) -> None:
-    """Every media time comes once, and no FAP steps further than it does anyway."""
+    """Check that every media time occurs once, and that steps are not larger than before."""
     plain = undisturbed(lips)
     assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in plain]
     largest = steps(frames).max(axis=0) / np.maximum(steps(plain).max(axis=0), UNSEEN)
@@ -147,7 +147,7 @@ few_examples = settings(max_examples=8)
 
 @few_examples
 @given(lips=lip_models, cut=cuts)
-def test_another_synthesizer_goes_on_anywhere(lips: str, cut: int) -> None:
+def test_another_synthesizer_continues_anywhere(lips: str, cut: int) -> None:
     frames = with_another_synthesizer(lips, cut)
     assert_unseen(frames, lips)
     assert_shut_in_time(frames, lips)
@@ -155,7 +155,7 @@ def test_another_synthesizer_goes_on_anywhere(lips: str, cut: int) -> None:
 
 @few_examples
 @given(lips=lip_models, cut=cuts)
-def test_another_recognizer_goes_on_anywhere(lips: str, cut: int) -> None:
+def test_another_recognizer_continues_anywhere(lips: str, cut: int) -> None:
     frames = with_another_recognizer(lips, cut)
     assert_unseen(frames, lips)
     assert_shut_in_time(frames, lips)
@@ -163,7 +163,7 @@ def test_another_recognizer_goes_on_anywhere(lips: str, cut: int) -> None:
 
 @pytest.mark.parametrize("fap", [JAW, LOWER_LIP, EYELID, HEAD_PITCH])
 @pytest.mark.parametrize("move", [with_another_synthesizer, with_another_recognizer])
-def test_a_face_goes_on_amid_its_largest_movement(
+def test_continues_during_the_largest_movement(
     move: Callable[[str, int], list[Frame]], fap: int
 ) -> None:
     plain = undisturbed("learnt")

@@ -19,11 +19,11 @@ OPENINGS = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=20)
 KEY_FRAMES = st.lists(st.tuples(st.floats(0.02, 1.0), st.floats(0.0, 5.0)), min_size=1, max_size=12)
 MAX_CURVATURE = 5.0  # 1 / mouth width: a radius of 9 mm
 STRAIGHT = 0.2  # curvature below which an edge counts as straight
-MAX_INFLECTIONS = 2  # of one edge: a dent between two bumps
+MAX_INFLECTIONS = 2  # per edge: a dent between two bumps
 
 
 def assert_no_sick_shape(openings: Sequence[float] | NDArray[np.float64]) -> None:
-    """Lips must not cross, and edges must not bend sharply or have more than one dent."""
+    """Check that lips do not cross and edges do not bend sharply or have more than one dent."""
     opening = np.asarray(openings, float)
     x = np.linspace(*lip_lines()["inner upper"].ends, 201)
     heights = np.stack([lip_lines()[name].heights(x, opening) for name in LINES])
@@ -65,7 +65,7 @@ def test_moves_without_jumps(steps: list[tuple[float, float]], smooth: bool) -> 
     moments_s = np.arange(-0.1, times_s[-1] + 0.1, 0.005)
     openings = motion.openings_at(moments_s, smooth=smooth)
     assert_no_sick_shape(openings[::50])
-    # the lower lip's travel, at most, between key frames 20 ms apart; a smooth curve's slope is
-    # up to three times a line's
+    # maximum lower-lip travel between key frames 20 ms apart; a smooth curve is up to three times
+    # as steep as a line
     leap = np.abs(np.diff(contour(openings, 5)[..., 1], axis=0)).max(initial=0.0)
     assert leap <= 0.22 * 3.0 * 0.005 / 0.02

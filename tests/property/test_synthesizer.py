@@ -32,12 +32,11 @@ PARAMETERS = LIPS.parameters
 FRAME_S = 0.02
 examples = settings(max_examples=40)
 few_examples = settings(max_examples=12)
-CLOSED = 20.0  # FAP units: half a millimetre on a face
-CLOSED_IN_HASTE = 35.0  # recognised less than two frames before the apex
-# One step of a frame: from wide open to shut within the 20 ms that are left when a closure is
-# recognised at the last moment.
+CLOSED = 20.0  # FAP units: 0.5 mm on a face
+CLOSED_IN_HASTE = 35.0  # recognized less than two frames before the apex
+# One frame step: from wide open to closed within 20 ms, if a closure is recognized very late.
 LARGEST_STEP = 900.0
-# Jaw, width and protrusion have no closure to catch.
+# Jaw, width and protrusion have no closures.
 UNHURRIED_FAPS = (3, 6, 7, 14, 16, 17, 53, 54)
 FINE_RATE_HZ = 240.0
 LARGEST_FINE_STEP, LARGEST_FINE_STEP_UNHURRIED, LARGEST_FINE_TURN_UNHURRIED = 250.0, 60.0, 40.0
@@ -49,7 +48,7 @@ symbols = st.one_of(
 
 @st.composite
 def utterances(draw: st.DrawFn, shortest_s: float = 0.03) -> list[Phone]:
-    """Phones one after the other, at any speaking rate, with pauses."""
+    """Draw consecutive phones at any speaking rate, with pauses."""
     rate = draw(st.floats(0.4, 2.0))
     onset_s, phones = 0.3, []
     for index, symbol in enumerate(draw(st.lists(symbols, min_size=1, max_size=14))):
@@ -69,7 +68,7 @@ def utterances(draw: st.DrawFn, shortest_s: float = 0.03) -> list[Phone]:
 
 
 def closure_error(faps: NDArray[np.floating], time_s: NDArray[np.float64], phone: Phone) -> float:
-    """Least distance of the inner lips from contact within 20 ms of a phone's apex."""
+    """Return the minimum distance of the inner lips within 20 ms of a phone's apex."""
     viseme = INVENTORY.visemes[phone.symbol][0][0]
     inner = [fap for fap in CLOSURE_FAPS[viseme] if fap < 51]
     target = PARAMETERS.target[VISEME_INDEX[viseme], [MOUTH_FAPS.index(fap) for fap in inner]]
@@ -80,9 +79,7 @@ def closure_error(faps: NDArray[np.floating], time_s: NDArray[np.float64], phone
 
 @examples
 @given(phones=utterances(), time_s=st.floats(-1e6, 1e6))
-def test_weights_sum_to_one_and_curves_stay_in_the_hull_of_the_targets(
-    phones: list[Phone], time_s: float
-) -> None:
+def test_curves_stay_in_the_hull_of_the_targets(phones: list[Phone], time_s: float) -> None:
     timeline = build_timeline(phones, INVENTORY)
     times = np.array([time_s, 0.3, 0.5, 1.0])
     if len(timeline.viseme):
@@ -99,7 +96,7 @@ levels = st.lists(st.floats(-90.0, 0.0), max_size=40)
 
 @examples
 @given(phones=utterances(), levels_db=levels)
-def test_full_model_closes_the_lips_at_every_rate_and_level(
+def test_full_model_closes_lips_at_every_rate_and_level(
     phones: list[Phone], levels_db: list[float]
 ) -> None:
     rate_hz = 200.0
@@ -118,7 +115,7 @@ def test_full_model_closes_the_lips_at_every_rate_and_level(
     delay_s=st.floats(0.0, 0.3),
     notice_s=st.floats(0.02, 0.3),
 )
-def test_live_closes_the_lips_when_recognised_before_the_apex(
+def test_live_closes_lips_recognized_before_the_apex(
     phones: list[Phone], levels_db: list[float], delay_s: float, notice_s: float
 ) -> None:
     apexes_s = [phone.onset_s + min(0.5 * phone.duration_s, EDGE_S) for phone in phones]
@@ -142,7 +139,7 @@ def test_live_closes_the_lips_when_recognised_before_the_apex(
 
 @st.composite
 def revised_utterances(draw: st.DrawFn) -> list[tuple[float, Phone | SpeechChange]]:
-    """What a bad recognizer emits, and when: guesses, wrong phones, wrong times, late revisions."""
+    """Draw the output of a bad recognizer: guesses, wrong phones, wrong times, late revisions."""
     emitted: list[tuple[float, Phone | SpeechChange]] = []
     delay_s = draw(st.floats(0.0, 0.2))
     phones = draw(utterances())
@@ -169,7 +166,7 @@ def run(
     face: FaceAnimator,
     cuts: Sequence[float] = (),
 ) -> NDArray[np.float32]:
-    """Frames of a session, ``advance`` being called at ``cuts`` too."""
+    """Return the frames of a session that also advances at ``cuts``."""
     frames = []
     stops = sorted([(time_s, None) for time_s in cuts] + list(emitted), key=lambda stop: stop[0])
     for time_s, item in stops:
@@ -199,7 +196,7 @@ def test_any_chunking_gives_identical_frames(
 
 @examples
 @given(emitted=revised_utterances(), delay_s=st.floats(0.0, 0.3))
-def test_a_bad_recognizer_makes_no_jump(
+def test_a_bad_recognizer_causes_no_jump(
     emitted: list[tuple[float, Phone | SpeechChange]], delay_s: float
 ) -> None:
     faps = run(emitted, make_face(delay_s=delay_s))
@@ -208,12 +205,12 @@ def test_a_bad_recognizer_makes_no_jump(
     assert np.abs(steps).max() < LARGEST_STEP
     assert np.abs(np.diff(steps, axis=0)).max() < 2.0 * LARGEST_STEP
     assert np.abs(steps[:, np.array(UNHURRIED_FAPS) - 1]).max() < 260.0
-    # slow speech opens the mouth by up to 15 % further than its targets
+    # slow speech exceeds the targets by up to 15 %
     hull = 1.15 * np.vstack([PARAMETERS.target, PARAMETERS.neutral])
     mouth = faps[:, np.array(MOUTH_FAPS) - 1]
     assert (mouth >= hull.min(axis=0) - 0.01).all()
     assert (mouth <= hull.max(axis=0) + 0.01).all()
-    assert not faps[-1].round(1).any()  # rest in the end
+    assert not faps[-1].round(1).any()  # rest at the end
 
 
 @few_examples
@@ -221,7 +218,7 @@ def test_a_bad_recognizer_makes_no_jump(
 def test_position_and_velocity_are_continuous(
     emitted: list[tuple[float, Phone | SpeechChange]], delay_s: float
 ) -> None:
-    # between frames 4 ms apart neither has time to change much, whatever is revised
+    # neither can change much between frames 4 ms apart
     face = make_face(delay_s=delay_s, frame_rate_hz=FINE_RATE_HZ)
     faps = run(emitted, face)
     steps = np.diff(faps, axis=0)
@@ -233,7 +230,7 @@ def test_position_and_velocity_are_continuous(
 
 @examples
 @given(emitted=revised_utterances(), frame=st.integers(1, 100), delay_s=st.floats(0.0, 0.3))
-def test_flush_is_at_rest_within_150_ms(
+def test_flush_rests_within_150_ms(
     emitted: list[tuple[float, Phone | SpeechChange]], frame: int, delay_s: float
 ) -> None:
     face = make_face(delay_s=delay_s)
@@ -256,9 +253,7 @@ def test_flush_is_at_rest_within_150_ms(
     rate_hz=st.floats(1.0, 240.0),
     name=st.text("abc 0123.\\:", max_size=20),
 )
-def test_fap_files_give_back_what_was_written(
-    values: list[float], rate_hz: float, name: str
-) -> None:
+def test_fap_files_round_trip(values: list[float], rate_hz: float, name: str) -> None:
     faps = np.zeros((2, NUM_FAPS), dtype=np.float32)
     faps[1, 2:] = values
     with TemporaryDirectory() as folder:
@@ -271,7 +266,7 @@ def test_fap_files_give_back_what_was_written(
 
 
 def sound(seed: int) -> list[SoundEvent]:
-    """Lip frames of speech and its pauses, some lost, with phones and progress in between."""
+    """Draw lip frames with pauses and losses, with phones and progress in between."""
     rng = np.random.default_rng(seed)
     events: list[SoundEvent] = []
     opening, is_speaking = 0.0, False
@@ -280,7 +275,9 @@ def sound(seed: int) -> list[SoundEvent]:
         if rng.random() < 0.05 or number == 5:
             is_speaking = not is_speaking
             events.append(SpeechChange(active=is_speaking, time_s=now_s))
-        if rng.random() < 0.15 and number > 8:  # a lip frame has come, so the visemes do not lead
+        if (
+            rng.random() < 0.15 and number > 8
+        ):  # after a lip frame the visemes do not move the mouth
             phone = Phone(
                 index=number,
                 symbol=str(rng.choice(["b", "p", "m", "f", "a", "u", "t"])),
@@ -306,12 +303,12 @@ def sound(seed: int) -> list[SoundEvent]:
 
 @few_examples
 @given(st.integers(0, 1000), st.sampled_from([0.0, 0.02, 0.1]))
-def test_learnt_lips_have_neither_jumps_nor_corners(seed: int, delay_s: float) -> None:
+def test_learnt_lips_have_no_jumps_or_corners(seed: int, delay_s: float) -> None:
     face = FaceAnimator(LearntLips(LIPS), frame_rate_hz=FINE_RATE_HZ, delay_s=delay_s)
     faps = np.array([faps for event in sound(seed) for _, faps in face.process(event)])
     faps = faps[:, [fap - 1 for fap in MOUTH_FAPS if fap not in (14, 44, 45, 46, 47)]]
     assert np.isfinite(faps).all()
     if len(faps) > 2:
-        # from wide open to shut within 20 ms would be 62 a frame; a jump is five times as far
+        # closing within 20 ms is 62 per frame; a jump is five times larger
         assert np.abs(np.diff(faps, axis=0)).max() < 62.0
         assert np.abs(np.diff(faps, n=2, axis=0)).max() < 40.0

@@ -1,4 +1,4 @@
-"""How far the mouth opens: level and rate."""
+"""Mouth openings scale with level and rate."""
 
 import math
 
@@ -8,7 +8,6 @@ import pytest
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
 from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.phones.events import Phone
 from tests.lips import LIPS, articulation_of, moment
 
@@ -20,7 +19,7 @@ STEP_S = 0.02
 
 
 def syllables(rate_hz: float, phones: str = "d a", num: int = 12) -> list[Phone]:
-    """Syllables of one initial and one vowel at a rate."""
+    """Return syllables of an initial and a vowel at a rate."""
     initial, vowel = phones.split()
     length_s = 1.0 / rate_hz
     return [
@@ -38,9 +37,9 @@ def syllables(rate_hz: float, phones: str = "d a", num: int = 12) -> list[Phone]
 
 
 def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[float]:
-    """Gain of every frame for a level at each."""
+    """Return the gain of every frame, one level per frame."""
     amplitude = Amplitude()
-    found = []
+    gains = []
     for k, level_db in enumerate(levels_db):
         level = (k * STEP_S, level_db)
         faps = np.zeros(68, dtype=np.float32)
@@ -49,21 +48,11 @@ def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[floa
         assert faps[UPPER_LIP] == -faps[JAW]
         assert faps[LOWER_LIP] == 100.0  # pressed lips stay pressed
         assert faps[WIDTH] == -100.0
-        found.append(float(faps[JAW]) / 100.0)
-    return found
+        gains.append(float(faps[JAW]) / 100.0)
+    return gains
 
 
-def test_nothing_is_scaled_while_nothing_is_known() -> None:
-    amplitude = Amplitude()
-    faps = np.full(68, 100.0, dtype=np.float32)
-    amplitude.apply(faps, moment(0.0))
-    assert (faps == 100.0).all()
-    levels = [(math.nan, -20.0), (0.0, -math.inf)]
-    amplitude.apply(faps, moment(0.1, articulation_of(syllables(5.0)), levels))
-    assert (faps == 100.0).all()
-
-
-def test_louder_speech_opens_further_and_microphones_do_not_matter() -> None:
+def test_louder_speech_opens_further_at_any_microphone_gain() -> None:
     vowel = [Phone(index=0, symbol="a", onset_s=0.0, duration_s=9.0, confidence=1.0, final=True)]
     articulation = articulation_of(vowel)
     for microphone_db in (-40.0, -20.0):
@@ -75,7 +64,7 @@ def test_louder_speech_opens_further_and_microphones_do_not_matter() -> None:
         assert np.abs(np.diff(gain[290:])).max() < 0.2
 
 
-def test_a_level_that_is_usual_for_the_viseme_changes_nothing() -> None:
+def test_the_usual_level_of_a_viseme_changes_nothing() -> None:
     articulation = articulation_of(syllables(4.0, num=30))
     timeline = articulation.timeline
     usual = {viseme: float(PARAMETERS.level_db[VISEME_INDEX[viseme]]) for viseme in "da"}
@@ -88,11 +77,11 @@ def test_a_level_that_is_usual_for_the_viseme_changes_nothing() -> None:
         levels.append(-30.0 + usual[VISEMES[near]])
     gain = gains(articulation, levels)[150:]
     assert max(gain) - min(gain) < 0.05
-    flat = gains(articulation, [-30.0] * 350)[150:]  # a vowel as quiet as its consonant is weak
+    flat = gains(articulation, [-30.0] * 350)[150:]  # a vowel as quiet as its consonant
     assert max(flat) - min(flat) > 0.1
 
 
-def test_fast_speech_opens_less_beyond_what_blending_does() -> None:
+def test_fast_speech_opens_less() -> None:
     slow, usual, fast = (
         gains(articulation_of(syllables(rate_hz)), [math.nan] * 100)[60]
         for rate_hz in (3.0, 5.0, 8.0)
@@ -100,14 +89,3 @@ def test_fast_speech_opens_less_beyond_what_blending_does() -> None:
     assert slow == pytest.approx(1.06, abs=0.01)
     assert usual == pytest.approx(1.0, abs=0.01)
     assert fast == pytest.approx(0.91, abs=0.01)
-
-
-def test_jaw_and_lips_shrink_with_the_rate() -> None:
-    peaks = []
-    for rate_hz in (3.0, 5.0, 8.0):
-        frames = synthesize(LIPS, syllables(rate_hz), 400)
-        middle = frames[60 : int(50.0 * 12.0 / rate_hz)]
-        peaks.append([float(np.ptp(middle[:, fap])) for fap in (JAW, LOWER_LIP)])
-    slow, usual, fast = np.array(peaks)
-    assert (usual < 0.95 * slow).all()
-    assert (fast < 0.85 * usual).all()

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
     blend,
-    log_weights,
-    softmax,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -36,13 +34,13 @@ pytestmark = pytest.mark.unit
 
 INVENTORY = load_inventory()
 
-PARAMETERS = initial_parameters()  # these do not change with training
+PARAMETERS = initial_parameters()  # independent of training
 JAW = MOUTH_FAPS.index(3)
 LOWER_LIP = MOUTH_FAPS.index(5)
 
 
 def phones(text: str, start_s: float = 0.5) -> list[Phone]:
-    """Phones as "b:0.08 a:0.2", one after the other."""
+    """Return consecutive phones from text such as "b:0.08 a:0.2"."""
     made: list[Phone] = []
     for word in text.split():
         symbol, duration = word.split(":")
@@ -65,7 +63,7 @@ def curve(text: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def sharp(parameters: VisemeParameters) -> VisemeParameters:
-    """Parameters whose visemes have died away at each other's apexes."""
+    """Return parameters whose visemes do not act at each other's apexes."""
     return dataclasses.replace(
         parameters,
         theta_minus=parameters.theta_minus * 20.0,
@@ -73,14 +71,8 @@ def sharp(parameters: VisemeParameters) -> VisemeParameters:
     )
 
 
-def test_weights_sum_to_one_and_do_not_overflow() -> None:
-    weights = softmax(np.array([[1e9, -1e9], [1e9 + 1.0, -1e9]]))
-    np.testing.assert_allclose(weights.sum(axis=0), 1.0)
-    np.testing.assert_allclose(weights[:, 0], [0.26894142, 0.73105858])
-
-
-def test_pair_of_visemes_by_hand() -> None:
-    # Li 2011, eq. 11, written out as quotients
+def test_two_visemes_match_a_manual_calculation() -> None:
+    # Li 2011, eq. 11, as quotients
     p = PARAMETERS
     timeline = build_timeline(phones("e:0.1 i:0.12"), INVENTORY)
     first, second = (VISEME_INDEX[shape] for shape in "ei")
@@ -91,20 +83,20 @@ def test_pair_of_visemes_by_hand() -> None:
     d_second = p.alpha[second] * np.exp(
         -p.theta_minus[second] * np.abs(0.66 + p.offset_s[second] - time_s) ** p.c
     )
-    # apexes before the one and after the other viseme, so that plus and minus are these
+    # the time is after the first apex and before the second apex
     assert (np.abs(p.offset_s[[first, second]]) < 0.05).all()
     want = (d_second * p.target[second] + d_first * p.target[first]) / (d_second + d_first)
     alone = dataclasses.replace(timeline, silence_start_s=np.zeros(0), silence_end_s=np.zeros(0))
     np.testing.assert_allclose(blend(p, alone, np.array([time_s]))[0], want)
 
 
-def test_curve_is_at_its_target_at_apexes_when_neighbours_have_died_away() -> None:
+def test_isolated_visemes_reach_their_targets() -> None:
     timeline = build_timeline(phones("d:0.2 a:0.3 j:0.2 i:0.3 g:0.2 u:0.3"), INVENTORY)
     got = blend(sharp(PARAMETERS), timeline, timeline.apex_start_s)
     np.testing.assert_allclose(got, PARAMETERS.target[timeline.viseme], atol=3.0)
 
 
-def test_fast_speech_falls_short_of_its_targets() -> None:
+def test_fast_speech_misses_its_targets() -> None:
     slow = curve("d:0.12 a:0.24 d:0.12", np.array([0.74]))
     fast = curve("d:0.04 a:0.08 d:0.04", np.array([0.58]))
     assert fast[0, JAW] < 0.9 * slow[0, JAW]
@@ -115,13 +107,13 @@ def test_curve_is_continuous_at_every_apex() -> None:
         phones("n:0.07 i:0.12 h:0.08 ao:0.25 sil:0.1 b:0.08 iao:0.2 m:0.06"), INVENTORY
     )
     apexes = np.concatenate([timeline.apex_start_s, timeline.apex_end_s])
-    beside = 1e-7
-    left, right = (blend(PARAMETERS, timeline, apexes + sign * beside) for sign in (-1.0, 1.0))
-    # no faster than the fastest lips of the model
-    assert np.abs(right - left).max() < 2.0 * beside * 40_000.0
+    offset_s = 1e-7
+    left, right = (blend(PARAMETERS, timeline, apexes + sign * offset_s) for sign in (-1.0, 1.0))
+    # maximum speed of the model's lips
+    assert np.abs(right - left).max() < 2.0 * offset_s * 40_000.0
 
 
-def test_pause_relaxes_the_mouth_the_more_the_longer_it_is() -> None:
+def test_longer_pauses_relax_the_mouth_more() -> None:
     jaw = [
         curve(f"a:0.2 sil:{pause} a:0.2", np.array([0.7 + pause / 2.0]))[0, JAW]
         for pause in (0.04, 0.1, 0.2, 0.4)
@@ -132,29 +124,24 @@ def test_pause_relaxes_the_mouth_the_more_the_longer_it_is() -> None:
     assert jaw[3] < 0.05 * held
 
 
-def test_no_silence_between_touching_phones() -> None:
-    assert len(build_timeline(phones("a:0.2 i:0.2"), INVENTORY).silence_start_s) == 2
-    assert len(build_timeline(phones("a:0.2 sil:0.2 i:0.2"), INVENTORY).silence_start_s) == 3
-
-
-def test_long_vowel_is_held() -> None:
+def test_holds_a_long_vowel() -> None:
     inside = np.linspace(0.5 + EDGE_S, 1.5 - EDGE_S, 20)
     assert np.ptp(curve("d:0.08 a:1.0 d:0.08", inside + 0.08)[:, JAW]) < 60.0
 
 
-def test_mouth_is_at_rest_a_million_seconds_away() -> None:
+def test_mouth_is_at_rest_far_from_speech() -> None:
     got = curve("d:0.1 a:0.2 b:0.1", np.array([-1e6, 0.0, 3.0, 1e6]))
     np.testing.assert_allclose(got, np.tile(PARAMETERS.neutral, (4, 1)), atol=1e-6)
 
 
-def test_speech_at_a_million_seconds_looks_the_same() -> None:
+def test_speech_at_a_late_time_is_unchanged() -> None:
     timeline = build_timeline(phones("d:0.1 a:0.2 b:0.1", start_s=1e6), INVENTORY)
     far = blend(PARAMETERS, timeline, 1e6 + np.arange(0.0, 0.5, 0.02))
     near = curve("d:0.1 a:0.2 b:0.1", 0.5 + np.arange(0.0, 0.5, 0.02))
     np.testing.assert_allclose(far, near, atol=0.1)
 
 
-def test_pair_and_reach() -> None:
+def test_selects_the_pair_and_visemes_within_reach() -> None:
     timeline = build_timeline(
         phones("d:0.1 a:0.1 j:0.1 i:0.1 g:0.1"), INVENTORY
     )  # apexes 0.55, 0.65, ...
@@ -166,13 +153,7 @@ def test_pair_and_reach() -> None:
     assert active_visemes(timeline, 9.0, 0.0).tolist() == [False, False, False, False, True]
 
 
-def test_weights_have_one_row_for_each_viseme_and_silence() -> None:
-    timeline = build_timeline(phones("d:0.1 iao:0.2 sil:0.1 b:0.1"), INVENTORY)
-    shape = log_weights(PARAMETERS, timeline, np.zeros(7)).shape
-    assert shape == (4 + 3, 7, len(MOUTH_FAPS))
-
-
-def test_full_model_does_not_depend_on_its_blocks() -> None:
+def test_full_model_does_not_depend_on_block_size() -> None:
     spoken = phones("d:0.1 a:0.2 sil:0.3 b:0.1 iao:0.2 " * 8)
     lips = DynamicVisemes(PARAMETERS, INVENTORY)
     faps = synthesize(lips, spoken, 500)
@@ -183,7 +164,7 @@ def test_full_model_does_not_depend_on_its_blocks() -> None:
     assert synthesize(lips, [], 3).shape == (3, 68)
 
 
-def test_parameters_that_ship_open_the_mouth_for_a_and_round_it_for_u() -> None:
+def test_built_in_parameters_open_a_and_round_u() -> None:
     shipped = load_parameters()
     target = {shape: shipped.target[VISEME_INDEX[shape]] for shape in ("a", "i", "u", "zh")}
     protrusion, width = MOUTH_FAPS.index(17), MOUTH_FAPS.index(6)
@@ -218,7 +199,7 @@ def test_parameters_round_trip(tmp_path: Path) -> None:
         ("learnt_from", None),
     ],
 )
-def test_bad_parameters_are_refused(tmp_path: Path, key: str, value: object) -> None:
+def test_rejects_bad_parameter_files(tmp_path: Path, key: str, value: object) -> None:
     path = tmp_path / "parameters.json"
     save_parameters(initial_parameters(), path, "a test")
     data = json.loads(path.read_text())
@@ -228,7 +209,7 @@ def test_bad_parameters_are_refused(tmp_path: Path, key: str, value: object) -> 
         load_parameters(path)
 
 
-def test_values_without_sense_are_refused(tmp_path: Path) -> None:
+def test_rejects_parameters_out_of_range(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
     save_parameters(initial_parameters(), path, "a test")
     data = json.loads(path.read_text())

@@ -20,25 +20,25 @@ def array(*values: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.array(values)
 
 
-def test_viseme_by_hand() -> None:
+def test_viseme_matches_a_manual_calculation() -> None:
     # alpha 2, theta 3 before the apex and 5 after it, c 1.5
     got = np.exp(log_dominance(array(0.25, 0.0, -0.25), array(2.0), array(3.0), array(5.0), 1.5))
     want = [2.0 * math.exp(-3.0 * 0.125), 2.0, 2.0 * math.exp(-5.0 * 0.125)]
     np.testing.assert_allclose(got, want)
 
 
-def test_left_silence_falls_with_time_by_hand() -> None:
+def test_left_silence_falls_with_time() -> None:
     # sigma = t_l - t: positive before the apex
     got = np.exp(log_left_silence(array(0.25, 0.0, -0.25), array(2.0), array(3.0), 1.5))
     np.testing.assert_allclose(got, [2.0 * math.exp(0.375), 2.0, 2.0 * math.exp(-0.375)])
 
 
-def test_right_silence_grows_with_time_by_hand() -> None:
+def test_right_silence_grows_with_time() -> None:
     got = np.exp(log_right_silence(array(0.25, 0.0, -0.25), array(2.0), array(3.0), 1.5))
     np.testing.assert_allclose(got, [2.0 * math.exp(-0.375), 2.0, 2.0 * math.exp(0.375)])
 
 
-def test_everything_is_finite_a_million_seconds_away() -> None:
+def test_log_weights_are_finite_far_away() -> None:
     far, one = array(1e6, -1e6), array(1.0)
     for weights in (
         log_dominance(far, one, 40.0 * one, 40.0 * one, 1.3),
@@ -48,25 +48,25 @@ def test_everything_is_finite_a_million_seconds_away() -> None:
         assert np.isfinite(weights).all()
 
 
-def test_silence_vanishes_between_touching_units_and_grows_with_the_pause() -> None:
+def test_silence_vanishes_between_touching_phones() -> None:
     strength = [float(log_pause(array(0.0), array(0.0), array(s))[0]) for s in (1e-6, 0.05, 0.5)]
     assert strength[0] < -10.0 < strength[1] < strength[2]
-    # the intersection of both models: never above the lower one
+    # the intersection is never above the lower model
     assert float(log_pause(array(3.0), array(-2.0), array(1.0))[0]) <= -2.0
 
 
-def test_a_silence_with_one_side_is_that_side() -> None:
+def test_silence_at_one_end_has_one_side() -> None:
     assert float(log_pause(array(math.inf), array(-2.0), array(math.inf))[0]) == -2.0
     assert float(log_pause(array(-3.0), array(math.inf), array(math.inf))[0]) == -3.0
 
 
-def test_closure_has_the_two_ends_of_wang_and_cai_eq_7() -> None:
-    own, others = array(-1.0, -1.0, -1.0), array(2.0, 2.0, 2.0)
-    got = log_closure(own, others, array(0.07, 0.0, -0.2), reach_s=0.07, closure_ratio=25.0)
+def test_closure_has_the_ends_of_wang_and_cai_eq_7() -> None:
+    viseme, others = array(-1.0, -1.0, -1.0), array(2.0, 2.0, 2.0)
+    got = log_closure(viseme, others, array(0.07, 0.0, -0.2), reach_s=0.07, closure_ratio=25.0)
     np.testing.assert_allclose(got, [-1.0, math.log(25.0) + 2.0, -1.0])
 
 
-def test_closure_grows_towards_the_centre() -> None:
+def test_closure_grows_towards_the_apex() -> None:
     tau = np.linspace(0.07, 0.0, 50)
     got = log_closure(np.full(50, -1.0), np.full(50, 0.5), tau, reach_s=0.07, closure_ratio=25.0)
     assert (np.diff(got) > 0.0).all()

@@ -1,4 +1,4 @@
-"""A driver and two sessions at once, over real sockets: one is shown, the other is recorded."""
+"""A driver with two sessions: one is shown, the other is recorded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FRAME_SAMPLES = 320  # 20 ms
 
 
 class Stage:
-    """Control and the publishers, and a driver without a window, all stepped in turns."""
+    """Control, publishers and a driver without a window, stepped in turn."""
 
     def __init__(self, folder: Path) -> None:
         self.bus = Bus()
@@ -65,7 +65,7 @@ class Stage:
         while not condition():
             assert time.monotonic() < end_s
             for publisher in (self.phones, self.faps):
-                list(publisher.receive())  # answers subscriptions
+                list(publisher.receive())  # process subscriptions
             self.driver.step(0.005)
             for received in self.commands.receive():
                 match received.message:
@@ -113,11 +113,11 @@ class Stage:
         )
 
     def num_images(self) -> int:
-        """Number of images in all videos so far."""
+        """Return the number of images in all videos."""
         return round(self.driver.metrics.snapshot(time.monotonic())["video_ms"]) // 40
 
     def shown(self) -> float:
-        """FAP 1 as shown."""
+        """Return the shown value of FAP 1."""
         return float(self.driver.poses.faps(time.monotonic())[0])
 
 
@@ -128,17 +128,17 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
     stage.close()
 
 
-def test_one_of_two_sessions_is_shown_and_the_other_goes_on_being_recorded(stage: Stage) -> None:
+def test_shows_one_session_while_recording_another(stage: Stage) -> None:
     stage.start("filmed", record=True)
     stage.start("other")
     seen = set()
-    for number in range(51):  # both talk at once
+    for number in range(51):  # simultaneous frames
         stage.publish("filmed", number, 100.0)
         stage.publish("other", number, 200.0)
         if number % 10 == 9:
             stage.step_until(partial(all_in, stage, 2 * (number + 1)))
             seen.add(stage.shown())
-    assert seen == {200.0}, "the newest, and no flicker"
+    assert seen == {200.0}
 
     stage.driver.poses.switch(1)
     assert stage.shown() == 100.0
@@ -161,7 +161,7 @@ def all_in(stage: Stage, num_frames: int) -> bool:
     return stage.driver.metrics.snapshot(time.monotonic()).get("in_fap_frame", 0) >= num_frames
 
 
-def test_a_video_goes_on_through_a_restart(stage: Stage) -> None:
+def test_a_video_continues_after_a_restart(stage: Stage) -> None:
     stage.start("film", record=True)
     for number in range(26):
         stage.publish("film", number, 100.0)
@@ -174,7 +174,7 @@ def test_a_video_goes_on_through_a_restart(stage: Stage) -> None:
     assert stage.num_images() == 26
 
 
-def test_a_session_name_used_again_overwrites_no_video(stage: Stage) -> None:
+def test_a_reused_session_name_does_not_overwrite_a_video(stage: Stage) -> None:
     for epoch in (1, 2, 3):
         stage.start("film", epoch=epoch, record=True)
         stage.publish("film", 0, 100.0, epoch=epoch)
@@ -187,7 +187,7 @@ def test_a_session_name_used_again_overwrites_no_video(stage: Stage) -> None:
     assert all(path.stat().st_size > 0 for path in paths)
 
 
-def test_a_video_that_cannot_be_written_is_told_to_control(tmp_path: Path, stage: Stage) -> None:
+def test_reports_an_unwritable_video_to_control(tmp_path: Path, stage: Stage) -> None:
     (tmp_path / "film.mp4").mkdir()
     stage.start("film", record=True)
     stage.publish("film", 0, 100.0)

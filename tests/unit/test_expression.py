@@ -1,4 +1,4 @@
-"""Expressions beside speech: they ease in, stay and fade, and open no lips that speech has shut."""
+"""Expressions ease in, stay and fade, and keep the closures of speech."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def gaps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("name", ExpressionName)
-def test_every_expression_eases_in_stays_and_fades(name: ExpressionName) -> None:
+def test_expressions_ease_in_stay_and_fade(name: ExpressionName) -> None:
     face = make_face()
     advance(face, 1.0)
     face.set_expressions({name: 1.0}, 2.0)
@@ -48,10 +48,10 @@ def test_every_expression_eases_in_stays_and_fades(name: ExpressionName) -> None
     np.testing.assert_allclose(curve[40:100], full, rtol=0.02)
     assert curve[150] < 0.5 * full
     assert curve[-1] < 0.01 * full
-    assert np.abs(np.diff(curve, n=2)).max() < 0.02 * full  # and no corner anywhere
+    assert np.abs(np.diff(curve, n=2)).max() < 0.02 * full  # no corners
 
 
-def test_strengths_add_up_and_the_newest_wish_counts() -> None:
+def test_strengths_add_up_and_the_newest_request_counts() -> None:
     face = make_face()
     face.set_expressions({"joy": 0.4, "brow_up": 1.0}, 10.0)
     both = shown(face, 2.0)[-1]
@@ -65,7 +65,7 @@ def test_strengths_add_up_and_the_newest_wish_counts() -> None:
     assert np.abs(none).max() < 1.0
 
 
-def test_surprise_opens_a_mouth_at_rest_but_not_one_that_is_about_to_speak() -> None:
+def test_surprise_opens_the_mouth_only_without_speech() -> None:
     face = make_face()
     face.set_expressions({"surprise": 1.0}, 60.0)
     assert gaps(shown(face, 3.0)[-1]).max() > 300.0
@@ -84,10 +84,10 @@ strengths = st.dictionaries(st.sampled_from([*ExpressionName]), st.floats(0.0, 1
 
 @settings(max_examples=20)
 @given(symbols=symbols, wanted=strengths, from_s=st.floats(0.0, 1.0))
-def test_no_expression_opens_lips_that_speech_has_shut(
+def test_expressions_do_not_open_closures(
     symbols: list[str], wanted: dict[str, float], from_s: float
 ) -> None:
-    """What is shut without an expression is as shut with it, from the sound's beginning on."""
+    """Closures without expression stay closed with any expression, from the start of the sound."""
     plain, expressive = make_face(), make_face()
     for face in (plain, expressive):
         face.process(SpeechChange(active=True, time_s=0.2))
@@ -112,7 +112,7 @@ def test_no_expression_opens_lips_that_speech_has_shut(
     assert (gaps(mixed)[from_sound][~shut] >= SHUT - 0.01).all()
 
 
-def test_surprise_on_an_open_vowel_drops_no_jaw() -> None:
+def test_surprise_does_not_overextend_the_jaw() -> None:
     wide = np.zeros(NUM_FAPS, np.float32)
     wide[np.array(MOUTH_FAPS) - 1] = LIPS.parameters.target[VISEME_INDEX["a"]]
     wide[UPPER] *= 1.5
@@ -125,7 +125,7 @@ def test_surprise_on_an_open_vowel_drops_no_jaw() -> None:
 
 @settings(max_examples=20)
 @given(wanted=strengths)
-def test_the_lower_lip_of_f_does_not_leave_the_teeth(wanted: dict[str, float]) -> None:
+def test_expressions_keep_the_lower_lip_of_f_at_the_teeth(wanted: dict[str, float]) -> None:
     face = make_face()
     face.set_expressions(wanted, 60.0)
     expression = shown(face, 2.0)[-1]
@@ -136,7 +136,7 @@ def test_the_lower_lip_of_f_does_not_leave_the_teeth(wanted: dict[str, float]) -
     assert (mixed[LOWER] >= teeth[LOWER] - 0.01).all()
 
 
-def test_a_blink_shuts_the_eyes_of_every_expression_as_it_shuts_those_at_rest() -> None:
+def test_blinks_close_the_eyes_in_every_expression() -> None:
     upper, lower = FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_b_l_eyelid"] - 1
     faces = make_face(idle_motion_seed=3), make_face(idle_motion_seed=3)
     faces[1].set_expressions({"joy": 1.0, "squint": 1.0}, 60.0)
@@ -158,6 +158,8 @@ def test_a_blink_shuts_the_eyes_of_every_expression_as_it_shuts_those_at_rest() 
         ({"joy": 0.5}, None, "hold_s is None"),
     ],
 )
-def test_a_wrong_wish_is_named(strengths: dict[str, object], hold_s: object, named: str) -> None:
+def test_rejects_invalid_expressions(
+    strengths: dict[str, object], hold_s: object, named: str
+) -> None:
     with pytest.raises(UserError, match=named):
         check_expressions(strengths, hold_s)

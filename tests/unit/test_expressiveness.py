@@ -1,4 +1,4 @@
-"""Larger and smaller movements of the mouth, which keep its closures."""
+"""Mouth movements are scaled, closures are kept."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def gaps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("amount", [0.5, DEFAULT, 2.0])
-def test_closed_lips_stay_as_they_are(amount: float) -> None:
+def test_closed_lips_stay_closed(amount: float) -> None:
     rng = np.random.default_rng(5)
     for _ in range(200):
         faps = rng.normal(0.0, 150.0, NUM_FAPS).astype(np.float32)
@@ -49,7 +49,7 @@ def test_closed_lips_stay_as_they_are(amount: float) -> None:
 
 
 @pytest.mark.parametrize("amount", [0.5, DEFAULT, 2.0])
-def test_rest_and_the_closures_of_b_and_f_are_kept(amount: float) -> None:
+def test_keeps_rest_and_closures(amount: float) -> None:
     rest = np.zeros(NUM_FAPS, np.float32)
     np.testing.assert_array_equal(expressed(rest, amount), rest)
     b, f = target("b"), target("f")
@@ -63,7 +63,7 @@ def test_one_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("viseme", ["a", "e", "i", "o", "u", "v"])
-def test_more_opens_further_up_to_a_limit(viseme: str) -> None:
+def test_opens_further_up_to_a_limit(viseme: str) -> None:
     opened = [expressed(target(viseme), amount) for amount in (0.5, 0.8, 1.0, DEFAULT, 2.0)]
     middle = [float(gaps(faps)[0]) for faps in opened]
     assert middle == sorted(middle)
@@ -73,7 +73,7 @@ def test_more_opens_further_up_to_a_limit(viseme: str) -> None:
     assert opened[-1][JAW] < 500.0
 
 
-def test_i_spreads_beyond_rest_and_u_is_narrower_and_pushed_further() -> None:
+def test_exaggerates_spreading_and_rounding() -> None:
     assert expressed(target("i"), DEFAULT)[CORNER] > 5.0
     plain, more = target("u"), expressed(target("u"), DEFAULT)
     assert more[CORNER] < 1.3 * plain[CORNER] < 0.0

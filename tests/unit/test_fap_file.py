@@ -1,4 +1,4 @@
-"""Reading and writing .fap files, with what differs in the wild."""
+"""Reading and writing .fap files and their variants."""
 
 from pathlib import Path
 from typing import Literal
@@ -43,7 +43,7 @@ def test_no_frames(tmp_path: Path) -> None:
     assert read_fap(path).faps.shape == (0, 68)
 
 
-def test_frame_of_xface(tmp_path: Path) -> None:
+def test_reads_an_xface_frame(tmp_path: Path) -> None:
     path = write(
         tmp_path,
         "# made by hand",
@@ -66,7 +66,7 @@ def test_frame_of_xface(tmp_path: Path) -> None:
     assert got.faps[1, 2] == 150.0
 
 
-def test_frame_of_greta(tmp_path: Path) -> None:
+def test_reads_a_greta_frame(tmp_path: Path) -> None:
     path = write(
         tmp_path, "2.1 AU Interpolation_1111.fap 25 1", mask(1, 3, 48, digits=69), "12 0 80 -900"
     )
@@ -78,7 +78,7 @@ def test_frame_of_greta(tmp_path: Path) -> None:
     assert got.expressions is None
 
 
-def test_a_selection_alone_is_meant_in_full(tmp_path: Path) -> None:
+def test_a_single_selection_has_full_strength(tmp_path: Path) -> None:
     got = read_fap(write(tmp_path, "2.1 x 25 1", mask(1, 2), "0 3 6"))
     assert got.visemes is not None
     assert got.expressions is not None
@@ -86,7 +86,7 @@ def test_a_selection_alone_is_meant_in_full(tmp_path: Path) -> None:
     assert got.expressions.tolist() == [[6, 63, 0, 0, 0, 0]]
 
 
-def test_viseme_and_expression_are_written_back(tmp_path: Path) -> None:
+def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
     faps = np.zeros((2, 68), dtype=np.float32)
     faps[:, 0], faps[:, 1], faps[:, 2] = [4, 0], [1, 2], [7, 8]
     visemes = np.array([[4, 9, 31, 0], [0, 0, 0, 0]])
@@ -104,12 +104,12 @@ def test_viseme_and_expression_are_written_back(tmp_path: Path) -> None:
     assert again.expressions is None
 
 
-def test_digits_without_blanks_and_values_without_bounds(tmp_path: Path) -> None:
+def test_reads_joined_masks_and_infinite_values(tmp_path: Path) -> None:
     path = write(tmp_path, "2.1 x 25 1", mask(3, 5, 6, 7).replace(" ", ""), "0 inf nan -inf 1e60")
     assert not read_fap(path).faps.any()
 
 
-def test_outer_lips_follow_the_inner_ones_where_the_file_has_only_those(tmp_path: Path) -> None:
+def test_outer_lips_follow_inner_lips_if_not_set(tmp_path: Path) -> None:
     got = read_fap(write(tmp_path, "2.1 x 25 1", mask(4, 5, 57, 52), "0 -10 -20 -30 -40")).faps[0]
     assert got[[3, 50, 4, 51, 56, 9]].tolist() == [-10.0, -10.0, -20.0, -30.0, -40.0, -40.0]
 
@@ -142,14 +142,12 @@ def test_outer_lips_follow_the_inner_ones_where_the_file_has_only_those(tmp_path
         (["2.1 x 25 1", mask(3), "0 1", mask(3)], "line 4: announces only 1 frames"),
     ],
 )
-def test_bad_files_are_refused_with_line_and_reason(
-    tmp_path: Path, lines: list[str], complaint: str
-) -> None:
+def test_error_names_line_and_reason(tmp_path: Path, lines: list[str], complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         read_fap(write(tmp_path, *lines))
 
 
-def test_places_that_do_not_exist_are_named(tmp_path: Path) -> None:
+def test_errors_of_missing_paths(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="absent"):
         read_fap(tmp_path / "absent.fap")
     with pytest.raises(UserError, match="absent"):

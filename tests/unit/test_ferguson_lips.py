@@ -1,4 +1,4 @@
-"""Ferguson lips live: shapes of the phones, times of the sound, and no jerk."""
+"""Live Ferguson lips: phone shapes at the times of the sound, without jumps."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def progress(start_s: float, end_s: float, *, loud: bool) -> list[SoundEvent]:
 
 
 def openings(events: Sequence[SoundEvent], face: FaceAnimator | None = None) -> NDArray[np.float64]:
-    """R of each frame, at 50 Hz."""
+    """Return R of the frames at 50 Hz."""
     face = face or FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
     frames = [faps for event in events for _, faps in face.process(event)]
     return 5.0 * np.array(frames, dtype=np.float64)[:, LOWER_LIP] / WIDEST
@@ -60,23 +60,23 @@ SAID: list[SoundEvent] = [
 ]
 
 
-def test_the_mouth_has_the_phones_openings_and_rests_in_silence() -> None:
+def test_openings_of_phones_and_rest_in_silence() -> None:
     made = openings(SAID)
     assert made[:15].max() == 0.0
     assert made[25] == pytest.approx(TABLE.opening["m"], abs=0.7)
     assert made[31] == pytest.approx(TABLE.opening["a"], abs=0.7)
     assert np.argmax(made) < 36
-    assert made[60:].max() < 0.05  # the energy tells the end, long before voice activity does
+    assert made[60:].max() < 0.05  # energy shows the end long before voice activity does
 
 
-def test_the_energy_moves_the_mouth_before_a_phone_is_known() -> None:
+def test_energy_opens_the_mouth_before_the_first_phone() -> None:
     no_phones = [event for event in SAID if not isinstance(event, Phone)]
     made = openings(no_phones)
     assert made[26] > 0.5
-    assert made[50:].max() < 0.05  # and what no phone explains is no speech
+    assert made[50:].max() < 0.05  # sound without phones is not speech
 
 
-def test_a_vowel_lasts_as_long_as_its_sound_while_its_end_is_an_estimate() -> None:
+def test_an_unfinished_vowel_lasts_as_long_as_its_sound() -> None:
     made = openings(
         [
             replace(event, duration_s=0.15, final=False)
@@ -90,7 +90,7 @@ def test_a_vowel_lasts_as_long_as_its_sound_while_its_end_is_an_estimate() -> No
     assert made[62:].max() < 0.05
 
 
-def test_revisions_and_interruptions_leave_no_jump() -> None:
+def test_no_jump_at_revisions_and_interruptions() -> None:
     revised: list[SoundEvent] = [
         replace(event, symbol="u") if isinstance(event, Phone) and event.index else event
         for event in SAID
@@ -106,14 +106,14 @@ def test_revisions_and_interruptions_leave_no_jump() -> None:
     assert after[8:].max() < 0.05
 
 
-def test_lips_at_rest_while_no_sound_comes() -> None:
+def test_lips_rest_without_sound() -> None:
     face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
     openings(SAID[:42], face)
     frames = np.array([faps for _, faps in face.relax(12)])
     assert np.abs(frames[-1]).max() < 1e-6
 
 
-def test_speech_moves_all_lips_within_their_travel_whatever_the_chunks() -> None:
+def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     samples = to_16_khz(samples, rate_hz)[:32_000]
     settings = SynthesizerConfig(lips="ferguson", idle_motion_seed=0, expressiveness=1.0)
@@ -132,6 +132,6 @@ def test_speech_moves_all_lips_within_their_travel_whatever_the_chunks() -> None
     assert opening.max() <= 5.0
 
 
-def test_a_language_without_a_table_is_named() -> None:
+def test_error_for_a_language_without_a_table() -> None:
     with pytest.raises(UserError, match="no table for other"):
         load_table(replace(load_inventory(), language="other"))

@@ -1,4 +1,4 @@
-"""Endpoints, and when the phones of a known text are spoken."""
+"""Syllable endpoints, and phone times of a known text."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RATE_HZ = 16_000
 
 
 def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
-    """Make a sound of vowels (v), hissing consonants (s), weak nasals (n) and silence (-)."""
+    """Return a sound of vowels (v), hissing consonants (s), weak nasals (n) and silence (-)."""
     rng = np.random.default_rng(0)
     made = []
     for kind, length_s in parts:
@@ -46,23 +46,23 @@ def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
     return np.concatenate(made).astype(np.float32)
 
 
-def test_zero_crossings_of_a_tone_are_twice_its_frequency() -> None:
+def test_zero_crossing_rate_of_a_tone() -> None:
     tone = np.sin(2 * np.pi * 1000.0 * (np.arange(RATE_HZ) + 0.5) / RATE_HZ).astype(np.float32)
     assert zero_crossing_rate(tone) == pytest.approx(2 * 1000.0 / RATE_HZ, abs=1e-3)
     assert zero_crossing_rate(tone[:0]) == 0.0
 
 
-def test_pieces_end_at_pauses_at_dips_and_before_hisses() -> None:
+def test_segments_end_at_pauses_dips_and_hisses() -> None:
     parts = [("-", 0.4), ("v", 0.2), ("-", 0.2), ("v", 0.2), ("n", 0.08), ("v", 0.2)]
-    pieces = segment_speech(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
-    starts = [piece.start_s for piece in pieces]
+    segments = segment_speech(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
+    starts = [segment.start_s for segment in segments]
     np.testing.assert_allclose(starts, [0.4, 0.8, 1.0, 1.28], atol=0.045)
-    assert pieces[0].end_s == pytest.approx(0.6, abs=0.045)
-    assert pieces[1].end_s == pieces[2].start_s
-    assert pieces[-1].end_s == pytest.approx(1.58, abs=0.045)
+    assert segments[0].end_s == pytest.approx(0.6, abs=0.045)
+    assert segments[1].end_s == segments[2].start_s
+    assert segments[-1].end_s == pytest.approx(1.58, abs=0.045)
 
 
-def test_the_thresholds_follow_the_noise() -> None:
+def test_thresholds_follow_the_noise_floor() -> None:
     parts = [("-", 1.0), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 0.5)]
     noise = 0.01 * np.random.default_rng(1).standard_normal(round(2.2 * RATE_HZ))
     quiet, noisy = (
@@ -74,43 +74,46 @@ def test_the_thresholds_follow_the_noise() -> None:
         assert one.start_s == pytest.approx(other.start_s, abs=0.045)
 
 
-def test_pieces_are_found_in_loud_noise_and_again_after_it_has_begun() -> None:
+def test_finds_segments_in_loud_noise() -> None:
     parts = [("-", 0.8), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 4.0), ("v", 0.2), ("-", 0.5)]
     sound = 0.3 * speech(parts)
     noise = 0.03 * np.random.default_rng(1).standard_normal(len(sound))  # 3 dB below the vowels
     starts = [
-        piece.start_s for piece in segment_speech(progress_of((sound + noise).astype(np.float32)))
+        segment.start_s
+        for segment in segment_speech(progress_of((sound + noise).astype(np.float32)))
     ]
     np.testing.assert_allclose(starts, [0.8, 1.3, 5.5], atol=0.045)
     noise[: 2 * RATE_HZ] = 0.0
-    pieces = segment_speech(progress_of((sound + noise).astype(np.float32)))
-    assert pieces[2].end_s - pieces[2].start_s == pytest.approx(3.0, abs=0.2)  # noise, until known
-    assert pieces[3].start_s == pytest.approx(5.5, abs=0.045)
-    assert pieces[3].end_s == pytest.approx(5.7, abs=0.045)
+    segments = segment_speech(progress_of((sound + noise).astype(np.float32)))
+    assert segments[2].end_s - segments[2].start_s == pytest.approx(
+        3.0, abs=0.2
+    )  # counts as noise until enough is known
+    assert segments[3].start_s == pytest.approx(5.5, abs=0.045)
+    assert segments[3].end_s == pytest.approx(5.7, abs=0.045)
 
 
 @pytest.mark.parametrize("chunk", [113, 4000])
-def test_pieces_of_a_stream_are_those_of_the_whole(chunk: int) -> None:
+def test_streaming_finds_the_same_segments(chunk: int) -> None:
     samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]
-    cutter = SyllableSegmenter()
-    pieces = []
+    segmenter = SyllableSegmenter()
+    segments = []
     for output in LiveStream(load_model()).feed(samples, chunk=chunk):
         if isinstance(output, Progress):
-            pieces += cutter.add_slice(output)
-    pieces += cutter.finish()
-    assert pieces == segment_speech(progress_of(samples))
-    assert len(pieces) > 3
+            segments += segmenter.add_slice(output)
+    segments += segmenter.finish()
+    assert segments == segment_speech(progress_of(samples))
+    assert len(segments) > 3
 
 
-def test_a_hole_in_time_ends_a_piece() -> None:
-    cutter = SyllableSegmenter()
+def test_a_time_gap_ends_a_segment() -> None:
+    segmenter = SyllableSegmenter()
     slices = progress_of(speech([("-", 0.3), ("v", 0.3)]))
-    assert not [piece for one in slices for piece in cutter.add_slice(one)]
+    assert not [segment for one in slices for segment in segmenter.add_slice(one)]
     later = Progress(time_s=5.0, level_db=-20.0)
-    assert [piece.end_s for piece in cutter.add_slice(later)] == [0.6]
+    assert [segment.end_s for segment in segmenter.add_slice(later)] == [0.6]
 
 
-def test_syllables_begin_with_their_pieces_and_finals_by_the_influence_factor() -> None:
+def test_finals_follow_by_the_influence_factor() -> None:
     sound = speech([("-", 0.4), ("n", 0.06), ("v", 0.2), ("s", 0.12), ("v", 0.2), ("-", 0.4)])
     phones = time_text(progress_of(sound), [("m", "a"), ("s", "an")], TABLE)
     assert [phone.symbol for phone in phones] == ["m", "a", "s", "an"]
@@ -122,7 +125,7 @@ def test_syllables_begin_with_their_pieces_and_finals_by_the_influence_factor() 
     assert a.onset_s + a.duration_s == pytest.approx(s.onset_s)
 
 
-def test_more_and_fewer_pieces_than_syllables() -> None:
+def test_more_and_fewer_segments_than_syllables() -> None:
     slices = progress_of(speech([("-", 0.4), ("v", 0.6), ("-", 0.4)]))
     three = time_text(slices, [("a",), ("m", "a"), ("er",)], TABLE)
     onsets = [phone.onset_s for phone in three]
@@ -134,7 +137,7 @@ def test_more_and_fewer_pieces_than_syllables() -> None:
     assert one.duration_s == pytest.approx(0.26, abs=0.05)
 
 
-def test_what_cannot_be_timed_is_refused() -> None:
+def test_rejects_text_that_cannot_be_timed() -> None:
     silent = progress_of(speech([("-", 1.0)]))
     with pytest.raises(UserError, match="found no speech"):
         time_text(silent, [("a",)], TABLE)
@@ -144,7 +147,7 @@ def test_what_cannot_be_timed_is_refused() -> None:
         time_text(silent, [("a",)] * (MAX_SYLLABLES + 1), TABLE)
 
 
-def test_key_frames_are_linear_or_smooth_and_never_overshoot() -> None:
+def test_key_frames_do_not_overshoot() -> None:
     frames = KeyFrames(np.array([0.0, 1.0, 2.0]), np.array([0.0, 4.0, 4.0]))
     np.testing.assert_allclose(frames.openings_at([-1.0, 0.25, 1.5, 9.0]), [0.0, 1.0, 4.0, 4.0])
     time_s = np.linspace(-1.0, 3.0, 401)
@@ -157,19 +160,19 @@ def test_key_frames_are_linear_or_smooth_and_never_overshoot() -> None:
 @pytest.mark.parametrize(
     ("times", "openings"), [([0.0, 0.0], [1.0, 1.0]), ([0.0], [5.1]), ([], []), ([0.0], [1.0, 2.0])]
 )
-def test_wrong_key_frames_are_refused(times: list[float], openings: list[float]) -> None:
+def test_rejects_invalid_key_frames(times: list[float], openings: list[float]) -> None:
     with pytest.raises(ValueError, match=r"times_s|opening"):
         KeyFrames(np.array(times), np.array(openings))
 
 
-def test_the_mouth_has_a_phones_opening_when_it_begins_and_closes_in_pauses() -> None:
+def test_key_frames_of_phones_and_pauses() -> None:
     def phone(symbol: str, onset_s: float) -> Phone:
         return Phone(
             index=0, symbol=symbol, onset_s=onset_s, duration_s=0.1, confidence=1.0, final=True
         )
 
-    said = [phone("m", 1.0), phone("a", 1.1), phone("sil", 1.2), phone("i", 2.0)]
-    frames = key_frames_of(said, TABLE, INVENTORY.silence)
+    phones = [phone("m", 1.0), phone("a", 1.1), phone("sil", 1.2), phone("i", 2.0)]
+    frames = key_frames_of(phones, TABLE, INVENTORY.silence)
     of = TABLE.opening
     np.testing.assert_allclose(
         frames.openings_at([0.5, 1.0, 1.1, 1.2, 1.5, 2.0, 2.1]),
@@ -179,7 +182,7 @@ def test_the_mouth_has_a_phones_opening_when_it_begins_and_closes_in_pauses() ->
     assert key_frames_of([], TABLE, INVENTORY.silence).openings_at([1.0]) == [0.0]
 
 
-def test_the_table_that_ships_is_plausible_and_read_back() -> None:
+def test_built_in_table_is_plausible_and_round_trips() -> None:
     assert set(TABLE.opening) == set(INVENTORY.phones)
     assert all(TABLE.opening[phone] == 0.0 for phone in "bpm")
     assert 1.0 < TABLE.opening["i"] < TABLE.opening["a"]

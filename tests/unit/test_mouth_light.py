@@ -1,4 +1,4 @@
-"""The light on teeth and tongue."""
+"""Light on teeth and tongue."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from kouxing.services.driver.head.mouth_light import mouth_light
 pytestmark = pytest.mark.unit
 
 
-# the page does the same: services/gateway/page/tests/mouth-light.test.js
+# same values as in services/gateway/page/tests/mouth-light.test.js
 @pytest.mark.parametrize(
     ("upper", "lower", "pushed", "light"),
     [(0, 0, 0, 0.08), (0, -120, 0, 0.5698), (-20, -120, 260, 0.4065), (-280, -600, 70, 0.9242)],
 )
-def test_little_light_comes_through_a_small_mouth_or_pushed_lips(
+def test_small_mouths_and_protruding_lips_admit_little_light(
     upper: float, lower: float, pushed: float, light: float
 ) -> None:
     faps = np.zeros(68, np.float32)

@@ -1,4 +1,4 @@
-"""Which session's face is shown, and how it goes to rest when frames stop."""
+"""The choice of the shown session, and the fade to rest without frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def faps(value: float) -> np.ndarray:
 
 
 def poses_of(*sessions: str, configured: str = "newest") -> Poses:
-    """Poses of sessions opened in this order at 1 s; the FAPs of each are its number, from 1."""
+    """Return poses of sessions opened in order at 1 s, with FAPs 1, 2 and so on."""
     poses = Poses(configured)
     for number, session in enumerate(sessions, start=1):
         poses.add(session, 1.0)
@@ -34,7 +34,7 @@ def test_frames_of_two_sessions_do_not_mix() -> None:
         assert poses.faps(now_s)[0] == 200
 
 
-def test_the_newest_is_shown_until_it_closes() -> None:
+def test_shows_the_newest_session_until_it_closes() -> None:
     poses = poses_of("a", "b", "c")
     shown = [poses.shown]
     for session in ("c", "a", "b"):
@@ -43,7 +43,7 @@ def test_the_newest_is_shown_until_it_closes() -> None:
     assert shown == ["c", "b", "b", ""]
 
 
-def test_a_named_session_is_waited_for() -> None:
+def test_waits_for_a_named_session() -> None:
     poses = poses_of("a", configured="b")
     assert (poses.shown, poses.caption(0.0)) == ("", "waiting for b")
     assert poses.faps(0.0)[0] == 0
@@ -52,7 +52,7 @@ def test_a_named_session_is_waited_for() -> None:
     assert poses.shown == "b"
 
 
-def test_switching_goes_round_and_holds_until_the_session_closes() -> None:
+def test_switching_wraps_around_and_holds_until_the_session_closes() -> None:
     poses = poses_of("a", "b", "c")
     shown = []
     for step in (1, 1, -1, -1, -1):
@@ -60,12 +60,12 @@ def test_switching_goes_round_and_holds_until_the_session_closes() -> None:
         shown.append(poses.shown)
     assert shown == ["a", "b", "a", "c", "b"]
     poses.add("d", 0.0)
-    assert poses.shown == "b", "the user's choice is kept"
+    assert poses.shown == "b"
     poses.remove("b")
     assert poses.shown == "d"
 
 
-def test_back_at_the_newest_new_sessions_are_shown_again() -> None:
+def test_returning_to_the_newest_follows_new_sessions_again() -> None:
     poses = poses_of("a", "b")
     poses.switch(1)
     poses.switch(1)
@@ -74,19 +74,13 @@ def test_back_at_the_newest_new_sessions_are_shown_again() -> None:
 
 
 @pytest.mark.parametrize(("step", "shown"), [(1, "a"), (-1, "b")])
-def test_switching_works_while_the_named_session_is_awaited(step: int, shown: str) -> None:
+def test_can_switch_while_waiting_for_a_named_session(step: int, shown: str) -> None:
     poses = poses_of("a", "b", configured="other")
     poses.switch(step)
     assert poses.shown == shown
 
 
-def test_without_sessions_a_switch_does_nothing() -> None:
-    poses = Poses()
-    poses.switch(1)
-    assert poses.shown == ""
-
-
-def test_a_stalled_face_fades_to_rest_and_comes_back() -> None:
+def test_a_stalled_face_fades_to_rest_and_returns() -> None:
     poses = poses_of("a")
     assert poses.faps(1.9)[0] == 1
     assert not poses.is_stalled(1.9)
@@ -101,14 +95,14 @@ def test_a_stalled_face_fades_to_rest_and_comes_back() -> None:
     assert not poses.is_stalled(3.5)
 
 
-def test_a_face_that_has_ended_rests_without_a_remark() -> None:
+def test_an_ended_face_rests_without_a_remark() -> None:
     poses = poses_of("a")
     poses.end("a")
     assert not poses.faps(5.0).any()
     assert poses.caption(2.0) == "a"
 
 
-def test_the_last_face_fades_after_its_session_closed() -> None:
+def test_the_last_face_fades_after_its_session_closes() -> None:
     poses = poses_of("a")
     assert poses.faps(1.5)[0] == 1
     poses.remove("a")
@@ -116,7 +110,7 @@ def test_the_last_face_fades_after_its_session_closed() -> None:
     assert not poses.faps(2.0).any()
 
 
-def test_a_face_without_a_session_lives_and_does_not_jump_when_one_comes_or_goes() -> None:
+def test_resting_face_moves_and_does_not_jump() -> None:
     poses, session = Poses(idle_motion_seed=3), IdleMotion(8)
     shown = []
     for number in range(60 * 30):
@@ -135,10 +129,10 @@ def test_a_face_without_a_session_lives_and_does_not_jump_when_one_comes_or_goes
     assert (lids[60 * 19 :] > 500.0).any()
     assert (np.ptp(head[: 60 * 12], axis=0) > 100.0).all()
     step_deg = np.rad2deg(np.abs(np.diff(head, axis=0)).max() * 1e-5)
-    assert step_deg < 0.15  # 9 degrees a second
+    assert step_deg < 0.15  # 9 degrees per second
 
 
-def test_the_caption_counts_the_sessions() -> None:
+def test_caption_counts_the_sessions() -> None:
     poses = poses_of("a", "b", "c")
     poses.switch(-1)
     assert poses.caption(0.0) == "b, 2 of 3 (Tab: next)"

@@ -25,9 +25,7 @@ def frame(value: float) -> np.ndarray:
     return faps
 
 
-def test_images_follow_media_time_whatever_the_frame_rates(
-    renderer: Renderer, tmp_path: Path
-) -> None:
+def test_images_follow_media_time_at_any_frame_rate(renderer: Renderer, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     recording.add_sound(0, np.zeros(16000, np.float32))
     for number in range(31):
@@ -35,13 +33,13 @@ def test_images_follow_media_time_whatever_the_frame_rates(
     while recording.step():
         pass
     recording.close()
-    assert recording.num_images == 26, "0 to 1 s, both included"
+    assert recording.num_images == 26
     assert recording.duration_s == pytest.approx(26 / 25)
     with av.open(str(tmp_path / "a.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 26
 
 
-def test_no_image_is_made_before_its_frames_have_come(renderer: Renderer, tmp_path: Path) -> None:
+def test_images_wait_for_their_frames(renderer: Renderer, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     assert not recording.step()
     recording.add_frame(0.0, frame(0))
@@ -53,9 +51,7 @@ def test_no_image_is_made_before_its_frames_have_come(renderer: Renderer, tmp_pa
     recording.close()
 
 
-def test_missing_sound_becomes_silence_and_repeated_sound_is_left_out(
-    renderer: Renderer, tmp_path: Path
-) -> None:
+def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)
     recording.add_sound(8000, loud)

@@ -23,7 +23,7 @@ def head() -> Head:
     return Head.load(detail="coarse")
 
 
-def test_the_picture_shows_a_face(head: Head) -> None:
+def test_picture_shows_a_face(head: Head) -> None:
     renderer = Renderer(head, 160, 120, samples=0)
     image = renderer.draw(neutral_faps())
     renderer.close()
@@ -35,7 +35,7 @@ def test_the_picture_shows_a_face(head: Head) -> None:
     assert image[60, 5, 2] > image[60, 5, 0]  # bluish background
 
 
-def test_a_differs_from_b_in_the_mouth(head: Head) -> None:
+def test_a_and_b_differ_only_in_the_mouth(head: Head) -> None:
     renderer = Renderer(head, 160, 120, samples=0)
     closed, opened = (renderer.draw(f).astype(int) for f in (neutral_faps(), OPEN))
     renderer.close()
@@ -62,7 +62,7 @@ def test_resize(head: Head) -> None:
 
 def test_drawing_into_a_window(head: Head, monkeypatch: pytest.MonkeyPatch) -> None:
     context = render.standalone_context()
-    screen = context.simple_framebuffer((160, 120), components=3)  # stands for the window's own
+    screen = context.simple_framebuffer((160, 120), components=3)  # replaces the window
     monkeypatch.setattr(moderngl.Context, "screen", property(lambda _: screen))
     renderer = Renderer(head, 160, 120, context=context, on_screen=True)
     renderer.draw_on_screen(neutral_faps())
@@ -74,12 +74,12 @@ def test_drawing_into_a_window(head: Head, monkeypatch: pytest.MonkeyPatch) -> N
     context.release()
 
 
-def test_no_size(head: Head) -> None:
+def test_rejects_an_empty_picture(head: Head) -> None:
     with pytest.raises(UserError, match="positive size"):
         Renderer(head, 0, 60)
 
 
-def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_missing_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(**_: Any) -> None:
         raise Exception("libEGL.so not loaded")
 

@@ -45,16 +45,12 @@ def document(glb: Path) -> dict[str, Any]:
     return read
 
 
-def test_size(glb: Path) -> None:
-    assert glb.stat().st_size < 5_000_000
-
-
-def test_trimesh_reads_it(glb: Path) -> None:
+def test_trimesh_reads_the_export(glb: Path) -> None:
     scene = trimesh.load_scene(glb)
     assert {"skin", "eye_left", "teeth_lower", "tongue", "hair"} <= set(scene.geometry)
 
 
-def test_opaque_parts_have_coarser_triangles(document: dict[str, Any]) -> None:
+def test_opaque_parts_have_coarse_triangles(document: dict[str, Any]) -> None:
     coarse = heads.load("woman", "coarse")
     of_mesh = {mesh["name"]: mesh["extras"].get("coarse") for mesh in document["meshes"]}
     assert {name for name, index in of_mesh.items() if index is not None} == {"skin", "tongue"}
@@ -66,7 +62,7 @@ def test_opaque_parts_have_coarser_triangles(document: dict[str, Any]) -> None:
         assert np.array_equal(stored, triangles.ravel())
 
 
-def test_accessors_fit_their_views(document: dict[str, Any]) -> None:
+def test_accessors_match_their_views(document: dict[str, Any]) -> None:
     views = document["bufferViews"]
     for view in views:
         assert view["byteOffset"] + view["byteLength"] <= len(document["binary"])
@@ -102,7 +98,7 @@ def test_every_fap_is_a_target_or_a_rotation(document: dict[str, Any]) -> None:
 
 
 def moved(document: dict[str, Any], mesh_name: str, target: str) -> dict[int, Any]:
-    """Displacements by vertex number."""
+    """Return displacements by vertex number."""
     mesh = next(mesh for mesh in document["meshes"] if mesh["name"] == mesh_name)
     row = mesh["extras"]["targetNames"].index(target)
     accessor = document["accessors"][mesh["primitives"][0]["targets"][row]["POSITION"]]
@@ -117,7 +113,7 @@ def moved(document: dict[str, Any], mesh_name: str, target: str) -> dict[int, An
     return dict(zip(rows.tolist(), values.reshape(-1, 3), strict=True))
 
 
-def test_a_target_moves_as_the_head_does(document: dict[str, Any]) -> None:
+def test_targets_move_like_the_head(document: dict[str, Any]) -> None:
     head = heads.load("woman")
     shift = moved(document, "skin", "raise_b_midlip")
     at = head.feature_points["2.3"]  # the skin is the first part
@@ -136,7 +132,7 @@ def test_every_arkit_shape_is_a_target(document: dict[str, Any]) -> None:
     assert described[ARKIT.names.index("jawOpen")]["faps"]["open_jaw"] > 0
 
 
-def test_arkit_shapes_move_skin_teeth_tongue_and_eyes(document: dict[str, Any]) -> None:
+def test_arkit_shapes_move_all_parts(document: dict[str, Any]) -> None:
     head = heads.load("woman")
     for shape, part, point in (
         ("jawOpen", "skin", "2.3"),
@@ -147,14 +143,8 @@ def test_arkit_shapes_move_skin_teeth_tongue_and_eyes(document: dict[str, Any]) 
         vertex = head.feature_points[point]
         faps = ARKIT.basis[ARKIT.names.index(shape)]
         wanted = (head.deform(faps) - head.vertices)[vertex]
-        found = moved(document, part, shape)[vertex - head.part(part).vertices.start]
-        np.testing.assert_allclose(found, wanted, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", heads.NAMES)
-def test_every_head_is_exported(name: str, tmp_path: Path) -> None:
-    export_glb(heads.load(name, "coarse"), tmp_path / "head.glb")
-    assert "skin" in trimesh.load_scene(tmp_path / "head.glb").geometry
+        shift = moved(document, part, shape)[vertex - head.part(part).vertices.start]
+        np.testing.assert_allclose(shift, wanted, atol=1e-5)
 
 
 def test_unwritable_path(tmp_path: Path) -> None:
@@ -171,11 +161,11 @@ def read(document: dict[str, Any], binary: bytes, accessor: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("as_arkit", [False, True])
-def test_an_animation_moves_the_head_as_its_faps_do(tmp_path: Path, *, as_arkit: bool) -> None:
+def test_animation_moves_the_head_like_its_faps(tmp_path: Path, *, as_arkit: bool) -> None:
     head = heads.load("woman", "coarse")
     faps = np.zeros((3, 68), np.float32)
     faps[1] = 0.5 * ARKIT.basis[ARKIT.names.index("jawOpen")]
-    faps[2, 48] = 0.1 / 1e-5  # the head turns by 0.1 rad
+    faps[2, 48] = 0.1 / 1e-5  # the head rotates by 0.1 rad
     path = tmp_path / "speaks.glb"
     export_glb(head, path, [(0.02 * k, row) for k, row in enumerate(faps)], as_arkit=as_arkit)
     data = path.read_bytes()

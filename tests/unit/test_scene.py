@@ -1,4 +1,4 @@
-"""Where the camera stands, what is behind the head, what a name stands for."""
+"""Camera framings, backgrounds and head names."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ def head() -> Head:
 
 
 def seen(head: Head, framing: Framing, point: str, size: tuple[int, int] = (160, 90)) -> np.ndarray:
-    """Where a feature point is in the picture, -1 to 1."""
+    """Return the position of a feature point in the picture, -1 to 1."""
     matrix = camera(head, framing).view_projection(*size)
     place = matrix @ [*head.vertices[head.feature_points[point]], 1.0]
     seen_at: np.ndarray = place[:2] / place[3]
     return seen_at
 
 
-def test_the_default_is_the_face(head: Head) -> None:
+def test_default_framing_is_the_face(head: Head) -> None:
     face, plain = camera(head), Camera()
     assert face.position == pytest.approx(plain.position, abs=0.003)
     assert face.target == pytest.approx(plain.target, abs=0.003)
 
 
 @pytest.mark.parametrize("framing", list(Framing))
-def test_what_is_framed_is_in_the_picture(head: Head, framing: Framing) -> None:
+def test_framed_parts_are_in_the_picture(head: Head, framing: Framing) -> None:
     points = {"face": ("2.1", "11.1", "10.1"), "head": ("11.4",), "mouth": ("9.3", "2.1", "8.3")}
     for point in points[framing]:
         assert np.abs(seen(head, framing, point)).max() < 0.97
@@ -50,7 +50,7 @@ def test_closer_framings_show_more(head: Head) -> None:
     assert np.abs(seen(head, Framing.MOUTH, "2.2")).max() < 0.15
 
 
-def test_a_narrow_picture_shows_the_whole_face(head: Head) -> None:
+def test_narrow_picture_shows_the_whole_face(head: Head) -> None:
     assert abs(seen(head, Framing.FACE, "10.1", (90, 160))[0]) < 0.97
 
 
@@ -61,7 +61,7 @@ def test_yaw_and_pitch(head: Head) -> None:
     assert camera(head, pitch_deg=30).position[1] > 0.4
 
 
-def test_transparent_edges_keep_the_colours_of_the_head(head: Head) -> None:
+def test_transparent_edges_keep_their_colors(head: Head) -> None:
     renderer = Renderer(head, 160, 120, background=None)
     image = renderer.draw(neutral_faps())
     renderer.close()
@@ -89,6 +89,6 @@ def test_backgrounds() -> None:
     ("name", "said"),
     [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
 )
-def test_no_such_head(name: str, said: str) -> None:
+def test_error_of_an_unknown_head(name: str, said: str) -> None:
     with pytest.raises(UserError, match=said):
         load_head(name)

@@ -1,4 +1,4 @@
-"""The synthesizer's sessions among each other, without sockets."""
+"""Several sessions of one synthesizer, without sockets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ START = replace(
 
 
 class Watched(SynthesizerService):
-    """A synthesizer without control that keeps what it publishes."""
+    """A synthesizer without control that stores published frames."""
 
     def __init__(self) -> None:
         self.sent: list[FapFrame | EndOfFaps] = []
@@ -40,7 +40,7 @@ class Watched(SynthesizerService):
         self.sent.append(message)
 
     def take(self, session: str, sequence: int, time_s: float) -> None:
-        """Take a message about sound up to a time."""
+        """Receive a progress message up to a time."""
         progress = Progress(
             session=session,
             epoch=1,
@@ -66,7 +66,7 @@ def service() -> Iterator[Watched]:
     service.bus.close()
 
 
-def test_frames_of_a_gap_do_not_hold_others_up(service: Watched) -> None:
+def test_a_gap_does_not_delay_other_sessions(service: Watched) -> None:
     service.take("gap", 1, 9.9)
     assert len(service.frames("gap")) == round(MAX_BURST_S * RATE_HZ)
     service.take("other", 1, 0.02 + SynthesizerConfig().delay_ms / 1e3)
@@ -86,7 +86,7 @@ def test_frames_of_a_gap_do_not_hold_others_up(service: Watched) -> None:
     assert num_ticks > 100
 
 
-def test_two_with_gaps_take_turns_and_show_what_others_would(service: Watched) -> None:
+def test_sessions_with_gaps_take_turns(service: Watched) -> None:
     for name in ("gap", "other"):
         service.take(name, 1, 3.0)
     for _ in range(10):
@@ -103,7 +103,7 @@ def test_two_with_gaps_take_turns_and_show_what_others_would(service: Watched) -
     assert np.array_equal(gap, other)
 
 
-def test_what_comes_too_early_is_left_to_be_sent_again(service: Watched) -> None:
+def test_rejects_messages_beyond_the_queue(service: Watched) -> None:
     for sequence in range(1, MAX_QUEUED + 10):
         service.take("gap", sequence, 5.0 + sequence * 0.02)
     assert len(service._sessions["gap"].queue) == MAX_QUEUED

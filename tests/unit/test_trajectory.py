@@ -1,4 +1,4 @@
-"""Transitions between trajectories: continuous in value and slope, each FAP in its own time."""
+"""Transitions are continuous in value and velocity, with one duration per FAP."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ DIFFERENCE = FapState(np.linspace(-100.0, 100.0, NUM), np.linspace(500.0, -500.0
 DURATION_S = np.linspace(0.02, 0.14, NUM)
 
 
-def test_a_transition_leads_value_and_slope_to_zero() -> None:
+def test_transition_ends_at_zero_value_and_velocity() -> None:
     transition = Transition(DIFFERENCE, DURATION_S)
     begin, end = transition.at(0.0), transition.at(0.14)
     np.testing.assert_allclose(begin.value, DIFFERENCE.value)
@@ -27,14 +27,14 @@ def test_a_transition_leads_value_and_slope_to_zero() -> None:
 
 
 @pytest.mark.parametrize("time_s", [0.005, 0.0199, 0.06])
-def test_the_slope_is_the_value_s_derivative(time_s: float) -> None:
+def test_transition_velocity_is_the_derivative_of_its_value(time_s: float) -> None:
     transition, step_s = Transition(DIFFERENCE, DURATION_S), 1e-7
     before, after = transition.at(time_s - step_s), transition.at(time_s + step_s)
     slope = (after.value - before.value) / (2.0 * step_s)
     np.testing.assert_allclose(transition.at(time_s).velocity, slope, atol=0.05)
 
 
-def test_the_slope_of_a_target_trajectory_is_its_derivative() -> None:
+def test_target_velocity_is_the_derivative_of_its_value() -> None:
     trajectory = TargetTrajectory(LIPS.parameters, articulation_of(utterance(2, 8)).timeline)
     times = np.arange(0.4, 0.9, 0.001)
     values = np.array([trajectory.at(time_s).value for time_s in times])
@@ -46,7 +46,7 @@ def test_the_slope_of_a_target_trajectory_is_its_derivative() -> None:
     )
 
 
-def test_rest_ends_at_the_neutral_mouth() -> None:
+def test_rest_transition_ends_at_the_neutral_mouth() -> None:
     neutral = np.full(NUM, 7.0)
     rest = RestTransition(still(neutral) + DIFFERENCE, neutral, duration_s=0.3)
     mouths = [rest.step(0.02) for _ in range(16)]

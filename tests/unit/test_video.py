@@ -1,4 +1,4 @@
-"""Videos have all their pictures, and sound as long."""
+"""Videos contain all pictures and the whole sound."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.unit
 
 
 def read(path: Path) -> tuple[int, float, float]:
-    """Count the pictures; durations of picture and sound in seconds."""
+    """Return the number of pictures, and the durations of pictures and sound, seconds."""
     with av.open(str(path)) as container:
         video, sound = container.streams.video[0], container.streams.audio[0]
         assert video.codec_context.name == "h264"
@@ -28,13 +28,13 @@ def read(path: Path) -> tuple[int, float, float]:
     return images, durations[0], durations[1]
 
 
-def test_pictures_and_sound_agree(tmp_path: Path) -> None:
+def test_pictures_and_sound_are_in_sync(tmp_path: Path) -> None:
     path = tmp_path / "out.mp4"
     with VideoWriter(path, 64, 48, 25.0, 16000) as writer:
         for number in range(30):
             writer.write_image(np.full((48, 64, 3), number * 8, np.uint8))
             writer.write_sound(np.zeros(640, np.float32))
-        assert not path.exists()  # not under its name before it is complete
+        assert not path.exists()  # not visible before it is complete
     images, picture_s, sound_s = read(path)
     assert images == 30
     assert picture_s == pytest.approx(1.2, abs=0.001)
@@ -59,7 +59,7 @@ def test_sound_starts_with_the_picture(tmp_path: Path) -> None:
     assert min(heard) == pytest.approx(0.5, abs=0.01)
 
 
-def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_an_exception_leaves_no_file(tmp_path: Path) -> None:
     def fail() -> None:
         with VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer:
             writer.write_image(np.zeros((48, 64, 3), np.uint8))
@@ -85,7 +85,7 @@ def test_unwritable_path(tmp_path: Path, path: str) -> None:
         ((64, 48), 25.0, 17000, "does not support"),
     ],
 )
-def test_bad_values(
+def test_rejects_invalid_settings(
     tmp_path: Path, size: tuple[int, int], frame_rate_hz: float, sample_rate_hz: int, said: str
 ) -> None:
     with pytest.raises(UserError, match=said):
@@ -93,7 +93,7 @@ def test_bad_values(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_picture_of_a_wrong_size(tmp_path: Path) -> None:
+def test_rejects_a_picture_of_a_wrong_size(tmp_path: Path) -> None:
     with (
         pytest.raises(ValueError, match="shape"),
         VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer,

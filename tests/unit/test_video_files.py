@@ -21,7 +21,7 @@ PICTURE[30:40, 10:40] = [20, 50, 200, 128]
 
 
 def first_picture(path: Path) -> NDArray[np.uint8]:
-    """Decode as a program does that knows about alpha in VP9: through libvpx."""
+    """Decode VP9 with alpha, by libvpx."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         decoder = stream.codec_context
@@ -35,20 +35,20 @@ def first_picture(path: Path) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("name", ["out.mov", "out.webm"])
-def test_alpha_is_in_the_video(tmp_path: Path, name: str) -> None:
+def test_transparent_videos_have_alpha(tmp_path: Path, name: str) -> None:
     with VideoWriter(tmp_path / name, 64, 48, 25.0, 16000, transparent=True) as writer:
         for _ in range(5):
             writer.write_image(PICTURE)
             writer.write_sound(np.zeros(640, np.float32))
     got = first_picture(tmp_path / name)
     inner = np.zeros((48, 64), dtype=bool)
-    inner[12:28, 12:38] = inner[32:38, 12:38] = inner[:8] = True  # away from smoothed edges
+    inner[12:28, 12:38] = inner[32:38, 12:38] = inner[:8] = True  # without smoothed edges
     np.testing.assert_allclose(got[inner, 3].astype(int), PICTURE[inner, 3], atol=3)
     np.testing.assert_allclose(got[20, 20].astype(int), [200, 50, 20, 255], atol=6)
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_moving_picture_for_a_page(tmp_path: Path, channels: int) -> None:
+def test_webp_is_an_animation(tmp_path: Path, channels: int) -> None:
     path = tmp_path / "face.webp"
     with VideoWriter(path, 64, 48, 20.0, 16000, transparent=channels == 4) as writer:
         for number in range(3):
@@ -65,7 +65,7 @@ def test_a_moving_picture_for_a_page(tmp_path: Path, channels: int) -> None:
 @pytest.mark.parametrize(
     ("name", "codec"), [("a.mp4", "h264"), ("a.mov", "h264"), ("a.webm", "vp9")]
 )
-def test_opaque_videos_name_their_colours(tmp_path: Path, name: str, codec: str) -> None:
+def test_opaque_videos_declare_their_colors(tmp_path: Path, name: str, codec: str) -> None:
     with VideoWriter(tmp_path / name, 64, 48, 25.0, None) as writer:
         for _ in range(5):
             writer.write_image(np.ascontiguousarray(PICTURE[..., :3]))
@@ -79,13 +79,13 @@ def test_opaque_videos_name_their_colours(tmp_path: Path, name: str, codec: str)
         )
 
 
-def test_mp4_has_no_transparency(tmp_path: Path) -> None:
+def test_mp4_cannot_be_transparent(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="MP4 has cannot be transparent"):
         VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000, transparent=True)
 
 
 @pytest.mark.parametrize("name", ["frames", "face%03d.png"])
-def test_a_sequence(tmp_path: Path, name: str) -> None:
+def test_writes_a_picture_sequence(tmp_path: Path, name: str) -> None:
     writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000, transparent=True)
     for _ in range(3):
         writer.write_image(PICTURE)
@@ -101,11 +101,11 @@ def test_a_sequence(tmp_path: Path, name: str) -> None:
     ("name", "said"),
     [("out.avi", "ends in"), ("out.png", "number"), ("no/frames", "cannot write")],
 )
-def test_names_that_stand_for_nothing(tmp_path: Path, name: str, said: str) -> None:
+def test_rejects_invalid_names(tmp_path: Path, name: str, said: str) -> None:
     with pytest.raises(UserError, match=said):
         open_writer(tmp_path / name, (64, 48), 25.0, None)
 
 
-def test_a_picture_that_cannot_be_written(tmp_path: Path) -> None:
+def test_error_of_an_unwritable_picture(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot write"):
         write_picture(tmp_path / "no" / "out.png", PICTURE)

@@ -1,4 +1,4 @@
-"""The virtual camera takes pictures at its rate; without a device or library the fix is named."""
+"""The virtual camera sends pictures at its rate; errors name the missing device or library."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.unit
 
 
 class Device:
-    """Stands for the library's camera: there is none on a machine that runs tests."""
+    """Replaces the library's camera."""
 
     device = "/dev/video0"
 
@@ -38,7 +38,9 @@ def renderer() -> Renderer:
     return Renderer(Head.load(detail="coarse"), 64, 48, samples=0)
 
 
-def test_pictures_go_out_at_their_rate(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sends_pictures_at_the_frame_rate(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyvirtualcam", SimpleNamespace(Camera=Device))
     camera = VirtualCamera(renderer, 25.0)
     for tick in range(101):
@@ -46,7 +48,9 @@ def test_pictures_go_out_at_their_rate(renderer: Renderer, monkeypatch: pytest.M
     assert 25 <= len(camera._camera.sent) <= 26
 
 
-def test_what_lacks_is_named(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_name_missing_requirements(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyvirtualcam", None)
     with pytest.raises(UserError, match=r"kouxing\[camera\]"):
         VirtualCamera(renderer, 25.0)

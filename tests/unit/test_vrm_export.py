@@ -1,4 +1,4 @@
-"""A head as a VRM 1.0 avatar: its bones and expressions, and what these do."""
+"""Bones and expressions of a head exported as a VRM 1.0 avatar."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def avatar(document: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def test_its_bones_stand_in_a_t(document: dict[str, Any], avatar: dict[str, Any]) -> None:
+def test_bones_are_in_t_pose(document: dict[str, Any], avatar: dict[str, Any]) -> None:
     nodes = document["nodes"]
     parents = {
         child: number for number, node in enumerate(nodes) for child in node.get("children", ())
@@ -60,19 +60,19 @@ def test_its_bones_stand_in_a_t(document: dict[str, Any], avatar: dict[str, Any]
     assert bones["leftFoot"][1] == pytest.approx(0.08)
     assert bones["leftHand"][1] == bones["leftUpperArm"][1] == bones["rightHand"][1]
     assert bones["leftHand"][0] == pytest.approx(-bones["rightHand"][0])
-    assert bones["leftHand"][0] > 0.6, "left is the avatar's own, which looks along z"
+    assert bones["leftHand"][0] > 0.6
     head = avatar["humanoid"]["humanBones"]["head"]["node"]
     assert {"eye_left", "hair"} <= {nodes[child]["name"] for child in nodes[head]["children"]}
 
 
-def test_every_weight_that_is_sent_has_its_expression(avatar: dict[str, Any]) -> None:
+def test_every_sent_weight_has_an_expression(avatar: dict[str, Any]) -> None:
     expressions = avatar["expressions"]
     assert set(expressions["preset"]) == set(VRM.names) | EMOTIONS
     assert set(expressions["custom"]) == set(ARKIT.names)
 
 
 @pytest.mark.parametrize("name", [*VRM.names, *sorted(EMOTIONS), "jawOpen"])
-def test_an_expression_is_what_its_faps_are(
+def test_expressions_match_their_faps(
     name: str, document: dict[str, Any], avatar: dict[str, Any]
 ) -> None:
     every = avatar["expressions"]["preset"] | avatar["expressions"]["custom"]
@@ -86,6 +86,6 @@ def test_an_expression_is_what_its_faps_are(
         assert np.array_equal(faps, VRM.basis[VRM.names.index(name)])
 
 
-def test_it_is_free(avatar: dict[str, Any]) -> None:
+def test_built_in_heads_are_free(avatar: dict[str, Any]) -> None:
     assert avatar["meta"]["otherLicenseUrl"].endswith("publicdomain/zero/1.0/")
     assert avatar["meta"]["avatarPermission"] == "everyone"

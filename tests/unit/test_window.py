@@ -1,4 +1,4 @@
-"""The window on a display of its own (Xvfb): drawn, resized, closed; its title, its keys."""
+"""The window on a separate display (Xvfb): drawing, size, closing, title and keys."""
 
 from __future__ import annotations
 

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.head.shading import Shading
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
@@ -104,9 +105,9 @@ class Head:
         if file.suffix != ".npz":
             file = ASSETS / f"{path}.npz"
         if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
-            known = ", ".join(sorted(asset.stem for asset in ASSETS.glob("*.npz")))
             raise UserError(
-                f"unknown head {str(path)!r}; give the path of an .npz or one of {known}"
+                f"unknown head {str(path)!r}; give the path of an .npz or one of"
+                f" {', '.join(HEAD_NAMES)}"
             )
         try:
             return assemble(file.stem, read_arrays(file, MAX_BYTES), detail)

@@ -1,4 +1,4 @@
-"""Brows, head and eyes that go with speech."""
+"""Brow, head and eye motion with speech."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ QUIET_DB, SILENT_DB, STRESS_DB = -26.0, -80.0, -14.0
 
 
 def levels(*parts: tuple[float, float]) -> list[float]:
-    """Levels every 20 ms of parts that last so long and are so loud."""
+    """Return levels every 20 ms for parts given by duration and level."""
     return [level_db for duration_s, level_db in parts for _ in range(round(duration_s / FRAME_S))]
 
 
 def show(
     face: FaceAnimator, levels_db: Sequence[float], step: int = 1, pitch_hz: Sequence[float] = ()
 ) -> NDArray[np.float32]:
-    """Frames of a sound with these levels and pitches, which arrives in so many at a time."""
+    """Return the frames for levels and pitches that arrive in chunks of a given size."""
     pitch_hz = pitch_hz or [0.0] * len(levels_db)
     frames = face.process(SpeechChange(active=True, time_s=0.0))
     for first in range(0, len(levels_db), step):
@@ -46,7 +46,7 @@ def show(
 
 
 def lively(levels_db: Sequence[float], seed: int) -> NDArray[np.float32]:
-    """What speech adds to the face, beside what goes on anyway."""
+    """Return the difference from idle motion without speech."""
     flat = [QUIET_DB] * len(levels_db)
     return show(make_face(idle_motion_seed=seed), levels_db) - show(
         make_face(idle_motion_seed=seed), flat
@@ -56,35 +56,36 @@ def lively(levels_db: Sequence[float], seed: int) -> NDArray[np.float32]:
 STRESSED = levels((1.0, QUIET_DB), (0.2, STRESS_DB), (0.8, QUIET_DB))
 
 
-def test_brows_rise_and_the_head_dips_with_most_stressed_syllables() -> None:
+def test_brows_and_head_move_on_stressed_syllables() -> None:
     added = [lively(STRESSED, seed) for seed in range(1, 21)]
     raised = [faps[:, BROW] for faps in added]
     heights = np.array([curve.max() for curve in raised])
-    assert 6 < np.count_nonzero(heights > 10.0) < 18  # not each time
+    assert 6 < np.count_nonzero(heights > 10.0) < 18  # not on every stress
     assert heights.max() < 60.0  # a small movement
     peaks_s = FRAME_S * np.array([curve.argmax() for curve in raised if curve.max() > 10.0])
     assert (np.abs(peaks_s - 1.15) < 0.2).all()
-    assert all(np.abs(np.diff(curve, n=2)).max() < 5.0 for curve in raised)  # no corner
+    assert all(np.abs(np.diff(curve, n=2)).max() < 5.0 for curve in raised)  # no corners
     dips = np.array([faps[:, PITCH].max() for faps in added])
     assert 8 < np.count_nonzero(dips > 500.0) < 20
     assert dips.max() < np.deg2rad(2.5) * 1e5
 
 
-def test_a_raised_voice_is_stress_too() -> None:
+def test_a_raised_pitch_is_stress() -> None:
     levels_db = levels((1.0, QUIET_DB), (0.2, QUIET_DB + 3.0), (0.8, QUIET_DB))
     pitch_hz = levels((1.0, 200.0), (0.2, 280.0), (0.8, 200.0))
     raised, level = (
         [
-            show(make_face(idle_motion_seed=seed), levels_db, pitch_hz=each)[:, BROW].max() > 10.0
+            show(make_face(idle_motion_seed=seed), levels_db, pitch_hz=voice)[:, BROW].max()
+            > 10.0
             for seed in range(1, 21)
         ]
-        for each in (pitch_hz, [200.0] * len(levels_db))
+        for voice in (pitch_hz, [200.0] * len(levels_db))
     )
     assert sum(raised) > 5
     assert sum(level) == 0
 
 
-def test_the_head_nods_when_a_phrase_ends_and_the_eyes_stay() -> None:
+def test_nods_at_the_end_of_a_phrase() -> None:
     phrase = levels((1.5, QUIET_DB), (0.4, SILENT_DB))
     nods = np.array([lively(phrase, seed) for seed in range(1, 21)])
     depth_deg = np.rad2deg(nods[:, 75:, PITCH].max(axis=1) * 1e-5)
@@ -96,16 +97,16 @@ def test_the_head_nods_when_a_phrase_ends_and_the_eyes_stay() -> None:
     assert max(lively(short, seed)[:, PITCH].max() for seed in range(1, 11)) < 100.0
 
 
-def test_nothing_moves_a_lip_and_any_portions_give_the_same() -> None:
+def test_does_not_move_lips_and_is_independent_of_chunks() -> None:
     sound = STRESSED + levels((0.5, SILENT_DB)) + STRESSED
     one, other = (show(make_face(idle_motion_seed=5), sound, step) for step in (1, 17))
     np.testing.assert_array_equal(one, other)
     assert one[:, BROW].any() or one[:, PITCH].any()
     assert not one[:, np.array(MOUTH_FAPS) - 1].any()
-    assert not show(make_face(), sound).any()  # turned off
+    assert not show(make_face(), sound).any()  # seed 0: off
 
 
-def test_noise_without_speech_moves_no_brow() -> None:
+def test_noise_does_not_move_brows() -> None:
     face = make_face(idle_motion_seed=5)
     frames = [
         faps
@@ -115,7 +116,7 @@ def test_noise_without_speech_moves_no_brow() -> None:
     assert not np.array(frames)[:, BROW].any()
 
 
-def test_eyes_leave_the_viewer_more_often_in_thought() -> None:
+def test_eyes_look_away_more_often_in_pauses() -> None:
     def share_on_viewer(state: State) -> float:
         motion = IdleMotion(3)
         faps = np.zeros((3000, 68), np.float32)
@@ -129,14 +130,14 @@ def test_eyes_leave_the_viewer_more_often_in_thought() -> None:
     assert share_on_viewer(State.THINKING) < 0.65
 
 
-def test_the_head_moves_on_after_a_gap() -> None:
+def test_head_motion_continues_after_a_gap() -> None:
     face = make_face(idle_motion_seed=5)
     before = show(face, levels((2.0, QUIET_DB)))[-1]
     after = np.array([faps for _, faps in face.process(Progress(time_s=20.0, level_db=SILENT_DB))])
     assert np.abs(after[0, [PITCH, YAW]] - before[[PITCH, YAW]]).max() < 300.0  # 0.2 degrees
 
 
-def test_who_begins_in_the_midst_looks_where_the_others_look() -> None:
+def test_a_late_start_converges_to_the_same_gaze() -> None:
     first, second = (IdleMotion(3) for _ in range(2))
     for number in range(3000):
         first.apply(np.zeros(68, np.float32), number * 0.02, State.SPEAKING)
