@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
 from kouxing.corpora.scoring import is_emitted
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.measures import is_near
 from kouxing.services.live_chain import sound_events
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
@@ -34,7 +35,6 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.lip_model import LipModel
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory

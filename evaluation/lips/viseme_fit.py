@@ -24,6 +24,7 @@ from rich.table import Table
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.clip_scores import MEASURES, real_faps
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
 from kouxing.evaluation.lips.scores import clips_to_score
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -32,7 +33,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisem
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,12 +81,8 @@ def read_fap(path: Path) -> FapAnimation:
         raise UserError(f"{path}, {error}; give a .fap file of version {_VERSION}") from error
 
 
-def write_fap(
-    path: Path, animation: FapAnimation, style: Literal["xface", "greta"] = "xface"
-) -> None:
-    """Write a ``.fap`` file.
-
-    The style "greta" has a longer mask, whole numbers, one number for FAP 1, and no FAP 2.
+def write_fap(path: Path, animation: FapAnimation) -> None:
+    """Write a ``.fap`` file in Xface's style.
 
     Raises
     ------
@@ -96,18 +91,13 @@ def write_fap(
     """
     visemes, expressions = animation.visemes, animation.expressions
     low = animation.faps[:, 2:]
-    if style == "greta":
-        expressions = None
-        visemes = None if visemes is None else visemes[:, :1]
-        rows = [[f"{value:.0f}" for value in row] for row in low]
-    else:
-        # nine digits represent every float32 exactly
-        rows = [[f"{value:.9g}" for value in row] for row in low]
+    # nine digits represent every float32 exactly
+    rows = [[f"{value:.9g}" for value in row] for row in low]
     for high in (expressions, visemes):
         if high is not None:
             rows = [[*map(str, numbers), *row] for numbers, row in zip(high, rows, strict=True)]
     digits = [str(int(high is not None)) for high in (visemes, expressions)]
-    mask = " ".join([*digits, *["1"] * 66, *["0"] * (style == "greta")])
+    mask = " ".join([*digits, *["1"] * 66])
     name = " ".join(animation.name.split()) or "kouxing"
     lines = [f"{_VERSION} {name} {animation.frame_rate_hz:.10g} {len(low)}"]
     for number, row in enumerate(rows):

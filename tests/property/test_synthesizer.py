@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend, log_weights, softmax
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
@@ -20,7 +21,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
 )
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange

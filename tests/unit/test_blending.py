@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
     blend,
@@ -17,18 +18,17 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisem
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     VisemeParameters,
     load_parameters,
-    save_parameters,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     static_targets,
 )
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
+from kouxing.training.visemes.parameters_file import save_parameters
 
 pytestmark = pytest.mark.unit
 

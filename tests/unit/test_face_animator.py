@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import LIP_HEIGHT_FAPS
 from kouxing.services.synthesizer.lips.known_phones import KnownPhones
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion, State

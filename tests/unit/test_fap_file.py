@@ -1,7 +1,6 @@
 """Reading and writing .fap files and their variants."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -22,19 +21,16 @@ def write(tmp_path: Path, *lines: str, end: str = "\n") -> Path:
     return path
 
 
-@pytest.mark.parametrize("style", ["xface", "greta"])
-def test_round_trip(tmp_path: Path, style: Literal["xface", "greta"]) -> None:
+def test_round_trip(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     faps = np.zeros((7, 68), dtype=np.float32)
     faps[:, 2:] = rng.normal(0.0, 300.0, (7, 66))
-    if style == "greta":
-        faps = faps.round()
     path = tmp_path / "some.fap"
-    write_fap(path, FapAnimation("a name", 29.97, faps), style)
+    write_fap(path, FapAnimation("a name", 29.97, faps))
     again = read_fap(path)
     assert (again.name, again.frame_rate_hz) == ("a name", 29.97)
     np.testing.assert_array_equal(again.faps, faps)
-    assert len(path.read_text().splitlines()[1].split()) == (69 if style == "greta" else 68)
+    assert len(path.read_text().splitlines()[1].split()) == 68
 
 
 def test_no_frames(tmp_path: Path) -> None:
@@ -97,11 +93,6 @@ def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.faps, faps)
     np.testing.assert_array_equal(again.visemes, visemes)
     np.testing.assert_array_equal(again.expressions, expressions)
-    write_fap(path, FapAnimation("x", 25.0, faps, visemes, expressions), "greta")
-    again = read_fap(path)
-    assert again.visemes is not None
-    assert again.visemes[:, 0].tolist() == [4, 0]
-    assert again.expressions is None
 
 
 def test_reads_joined_masks_and_infinite_values(tmp_path: Path) -> None:

@@ -12,12 +12,13 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.pcm import progress_of, zero_crossing_rate
 from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableSegmenter, segment_speech
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
-from kouxing.services.synthesizer.lips.ferguson.table import format_table, load_table, parse_table
+from kouxing.services.synthesizer.lips.ferguson.table import load_table, parse_table
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
+from kouxing.training.ferguson.table_file import format_table
 from tests.live_streams import LiveStream
 from tests.system import DEMO
 

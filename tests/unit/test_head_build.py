@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head import surface
-from kouxing.training.heads import hair, paint_parts, people, zones
+from kouxing.training.heads import hair, paint_parts, people, subdivision, zones
 
 pytestmark = pytest.mark.unit
 
@@ -29,7 +29,7 @@ def sheet(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.int6
 
 
 def test_catmull_clark_of_a_cube() -> None:
-    matrix, quads = surface.catmull_clark(CUBE_QUADS, 8)
+    matrix, quads = subdivision.catmull_clark(CUBE_QUADS, 8)
     fine = matrix @ CUBE
     assert len(quads) == 24
     assert len(fine) == 8 + 12 + 6
@@ -118,8 +118,8 @@ def test_hair_faces_outward(name: str) -> None:
 
 def test_clip_cuts_at_height_zero() -> None:
     vertices, quads = sheet(3, 3)
-    triangles = surface.triangles_of(quads)
-    cut, kept, rim = surface.clip(vertices[:, 1] - 1.25, triangles, vertices)
+    triangles = subdivision.triangles_of(quads)
+    cut, kept, rim = subdivision.clip(vertices[:, 1] - 1.25, triangles, vertices)
     a, b, c = (cut[kept[:, corner]] for corner in range(3))
     doubled = np.cross(b - a, c - a)[:, 2]
     assert (doubled > 0).all()  # no triangle is turned over

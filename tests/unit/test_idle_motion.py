@@ -75,8 +75,7 @@ def test_a_raised_pitch_is_stress() -> None:
     pitch_hz = levels((1.0, 200.0), (0.2, 280.0), (0.8, 200.0))
     raised, level = (
         [
-            show(make_face(idle_motion_seed=seed), levels_db, pitch_hz=voice)[:, BROW].max()
-            > 10.0
+            show(make_face(idle_motion_seed=seed), levels_db, pitch_hz=voice)[:, BROW].max() > 10.0
             for seed in range(1, 21)
         ]
         for voice in (pitch_hz, [200.0] * len(levels_db))

@@ -36,16 +36,13 @@ from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    clips_seen,
-    load_parameters,
-    save_parameters,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.training.visemes.parameters_file import save_parameters
 from tests.lips import INVENTORY, clip_of, utterance
 from tests.system import VOWELS_FILE
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory

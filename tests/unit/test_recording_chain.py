@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_live_model, load_model
 from kouxing.services.recognizer.alignment import align_text
@@ -18,7 +19,6 @@ from kouxing.services.recording_chain import AnalyzedRecording, analyze_recordin
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.system import VOWELS_FILE

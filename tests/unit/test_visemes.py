@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
@@ -16,7 +17,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     static_targets,
     visemes_of,
 )
-from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone

@@ -16,13 +16,14 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
-from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable, format_table
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.ferguson.lengths import AlignedSpeech, usual_times
 from kouxing.training.ferguson.openings import fit_openings, travel_of
+from kouxing.training.ferguson.table_file import format_table
 from kouxing.training.progress import Report
 
 _MIN_SYLLABLES = 3  # isolated words are slower than connected speech

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate
 
-from kouxing.services.driver.head import surface
-from kouxing.training.heads import paint, paint_parts, parts
+from kouxing.training.heads import paint, paint_parts, parts, subdivision
 from kouxing.training.heads.asset import Piece, write
 from kouxing.training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
 from kouxing.training.heads.feature_points import FEATURE_POINTS
@@ -94,7 +93,7 @@ class Builder:
         skin = subdivided(vertices, self._face)
         x, y, z = self._layout.T
         top = np.clip((y - 6.48) / 0.15, 0, 1)
-        normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
+        normals = subdivision.vertex_normals(skin.vertices, subdivision.triangles_of(skin.quads))
         # keep the mouth's lining away from its corners
         corner = np.clip((np.abs(x) - 0.13) / 0.05, 0, 1) * (z > 1.0) * self._cavity
         skin.vertices[:] -= 0.05 * top[:, None] * normals + 0.012 * corner[:, None] * [0, 0, 1]
@@ -137,7 +136,7 @@ class Builder:
         covered |= layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
 
         def visible(quads: Index) -> Index:
-            triangles = surface.triangles_of(quads)
+            triangles = subdivision.triangles_of(quads)
             uncovered: Index = triangles[~covered[triangles].all(axis=1)]
             return uncovered
 
@@ -159,10 +158,10 @@ class Builder:
         """Make a round-necked top: the torso, slightly enlarged, cut off around the neck."""
         torso, plain = (subdivided(shape, self._torso) for shape in (vertices, self._plain))
         smooth, layout = (skin.vertices[: len(skin.base)] for skin in (torso, plain))
-        triangles = surface.triangles_of(torso.coarse_quads)
-        normals = surface.vertex_normals(smooth, triangles)
+        triangles = subdivision.triangles_of(torso.coarse_quads)
+        normals = subdivision.vertex_normals(smooth, triangles)
         height = layout[:, 1] - neckline_height(layout[:, 2])
-        cut, triangles, rim = surface.clip(height, triangles, np.hstack([smooth, normals]))
+        cut, triangles, rim = subdivision.clip(height, triangles, np.hstack([smooth, normals]))
         points, normals = cut[:, :3], cut[:, 3:]
         # fold the edge toward the neck
         ring, local = np.unique(rim, return_inverse=True)
@@ -284,7 +283,7 @@ class Builder:
         """Lay out the texture of the skin on the reference head."""
         skin = self.reference
         uv = paint.skin_uv(skin.vertices)
-        normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
+        normals = subdivision.vertex_normals(skin.vertices, subdivision.triangles_of(skin.quads))
         outward = skin.vertices - [0, 0, paint.AXIS_Z]
         outward[:, 1] = 0
         outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.driver.head import surface
-from kouxing.training.heads import parts
+from kouxing.training.heads import parts, subdivision
 from kouxing.training.heads.asset import Piece
 from kouxing.training.heads.makehuman import BaseMesh
 from kouxing.training.heads.measures import eye_centers, eye_radius
@@ -53,7 +52,7 @@ def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
     sunk = 0.110 - 0.052 * to_tip**2 + groove + 0.02 * np.abs(x) / 0.19
     points = np.stack([1.28 * x, y - sunk, z - 0.03], axis=1)
     uv = np.clip(points[:, [0, 2]] * [1.8, 1.4] + [0.5, -0.65], 0, 1)
-    part = parts.Part(points, surface.triangles_of(tongue.quads), uv, np.ones_like(points))
+    part = parts.Part(points, subdivision.triangles_of(tongue.quads), uv, np.ones_like(points))
     return Piece(
         "tongue",
         part,
@@ -62,5 +61,5 @@ def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
         np.ones(len(points)),
         tongue_fields(tongue, fapu),
         coarse_vertices=len(tongue.base),
-        coarse_triangles=surface.triangles_of(tongue.coarse_quads),
+        coarse_triangles=subdivision.triangles_of(tongue.coarse_quads),
     )

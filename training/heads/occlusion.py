@@ -10,8 +10,8 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.driver.head import surface
 from kouxing.services.driver.render.renderer import standalone_context
+from kouxing.training.heads import subdivision
 from kouxing.training.heads.asset import Piece
 from kouxing.training.heads.hair_styles import Hair
 from kouxing.training.heads.measures import neckline_height
@@ -104,7 +104,9 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
     solid = [p for p in pieces if p.name != "lashes"]
     offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
     vertices = np.concatenate([_opened(p) for p in solid])
-    normals = np.concatenate([surface.vertex_normals(_opened(p), p.part.triangles) for p in solid])
+    normals = np.concatenate(
+        [subdivision.vertex_normals(_opened(p), p.part.triangles) for p in solid]
+    )
 
     def unhidden(with_hair: bool) -> Float:
         triangles = [

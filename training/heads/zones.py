@@ -25,6 +25,7 @@ from scipy import sparse
 from kouxing.services.driver.head import surface
 from kouxing.services.driver.head.import_fields import AXES, CORNER_SLOPE, INNER, OUTER
 from kouxing.shared.face.faps import FAPS
+from kouxing.training.heads import subdivision
 from kouxing.training.heads.feature_points import FEATURE_POINTS
 
 Float = NDArray[np.float64]
@@ -71,7 +72,7 @@ def subdivided(vertices: Float, quads: Index) -> Skin:
     coarse = compact.reshape(quads.shape)
     number = np.full(len(vertices), -1)
     number[base] = np.arange(len(base))
-    matrix, fine = surface.catmull_clark(coarse, len(base))
+    matrix, fine = subdivision.catmull_clark(coarse, len(base))
     return Skin(number, coarse, fine, matrix, matrix @ vertices[base], base)
 
 
@@ -109,7 +110,7 @@ def axis_of(fap: int) -> tuple[int, float]:
 
 def smoothest(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
     """Interpolate between points of the skin, see ``surface.smoothest``."""
-    return surface.smoothest(skin.vertices, surface.triangles_of(skin.quads), points, fixed)
+    return surface.smoothest(skin.vertices, subdivision.triangles_of(skin.quads), points, fixed)
 
 
 def _along(fap: int, weight: Float) -> Float:

@@ -46,7 +46,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import
     initial_parameters,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    NUM_MOUTH_FAPS,
     VisemeParameters,
     columns,
 )
@@ -57,7 +56,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     VISEMES,
 )
-from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.training.visemes.frames import Array, Frames
 
 _RIDGE = 10.0  # weight of the initial values, frames; adjacent frames are not independent

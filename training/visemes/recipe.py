@@ -13,11 +13,7 @@ from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    VisemeParameters,
-    columns,
-    save_parameters,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
 from kouxing.shared.errors import UserError
@@ -25,6 +21,7 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.visemes.fit import estimate
 from kouxing.training.visemes.frames import Array, frames_of
+from kouxing.training.visemes.parameters_file import save_parameters
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
 _SPOKEN_DB = 25.0  # audio this far below the loudest is not speech

@@ -22,8 +22,8 @@ from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 
 FORMAT = "kouxing viseme parameters 2"
 
-_PER_VISEME = ("alpha", "theta_minus", "theta_plus", "offset_s", "target", "closes")
-_PER_SILENCE = (
+PER_VISEME = ("alpha", "theta_minus", "theta_plus", "offset_s", "target", "closes")
+PER_SILENCE = (
     "alpha_left", "alpha_right", "theta_left", "theta_right", "offset_left_s", "offset_right_s",
     "neutral",
 )  # fmt: skip
@@ -71,9 +71,9 @@ class VisemeParameters:
         for field in fields(self):
             value = np.asarray(getattr(self, field.name), dtype=float)
             shape: tuple[int, ...] = ()
-            if field.name in _PER_VISEME:
+            if field.name in PER_VISEME:
                 shape = (len(VISEMES), NUM_MOUTH_FAPS)
-            elif field.name in _PER_SILENCE:
+            elif field.name in PER_SILENCE:
                 shape = (NUM_MOUTH_FAPS,)
             elif field.name == "level_db":
                 shape = (len(VISEMES),)
@@ -91,51 +91,6 @@ class VisemeParameters:
                 )
 
 
-def save_parameters(
-    parameters: VisemeParameters,
-    path: Path,
-    source: str,
-    *,
-    learnt_from: Sequence[str] = (),
-    chosen_with: Sequence[str] = (),
-) -> None:
-    """Write parameters as JSON, one line per viseme and array.
-
-    ``source`` describes their origin. ``learnt_from`` and ``chosen_with`` are names of clips that a
-    fair evaluation must exclude.
-    """
-
-    def line(name: str, values: NDArray[np.float64]) -> str:
-        # seven digits are precise enough and equal on all machines
-        return f"{json.dumps(name)}: [{', '.join(f'{value:.7g}' for value in values)}]"
-
-    visemes = ",\n".join(
-        f"  {json.dumps(viseme)}: {{\n"
-        + ",\n".join(f"   {line(name, getattr(parameters, name)[i])}" for name in _PER_VISEME)
-        + f',\n   "level_db": {parameters.level_db[i]:.4g}'
-        + "\n  }"
-        for i, viseme in enumerate(VISEMES)
-    )
-    silence = ",\n".join(f"  {line(name, getattr(parameters, name))}" for name in _PER_SILENCE)
-    head = "".join(
-        f" {json.dumps(name)}: {json.dumps(value)},\n"
-        for name, value in (
-            ("format", FORMAT),
-            ("source", source),
-            ("learnt_from", list(learnt_from)),
-            ("chosen_with", list(chosen_with)),
-            ("c", parameters.c),
-            ("closure_ratio", parameters.closure_ratio),
-            ("closure_reach_s", parameters.closure_reach_s),
-            ("faps", list(MOUTH_FAPS)),
-        )
-    )
-    path.write_text(
-        f'{{\n{head} "silence": {{\n{silence}\n }},\n "visemes": {{\n{visemes}\n }}\n}}\n',
-        encoding="utf-8",
-    )
-
-
 def load_parameters(path: Path | None = None) -> VisemeParameters:
     """Read parameters from a file, or the built-in ones.
 
@@ -151,9 +106,9 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
         _clips_of(data)
         arrays = {
             name: np.array([data["visemes"][viseme][name] for viseme in VISEMES], dtype=float)
-            for name in _PER_VISEME
+            for name in PER_VISEME
         }
-        arrays |= {name: np.array(data["silence"][name], dtype=float) for name in _PER_SILENCE}
+        arrays |= {name: np.array(data["silence"][name], dtype=float) for name in PER_SILENCE}
         return VisemeParameters(
             **arrays,
             level_db=np.array([data["visemes"][viseme]["level_db"] for viseme in VISEMES]),

@@ -89,20 +89,3 @@ def parse_table(text: str, inventory: PhoneInventory) -> PhoneTable:
     if not is_valid:
         raise UserError("the table of the lip model ferguson is damaged: a value is out of range")
     return table
-
-
-def format_table(table: PhoneTable, inventory: PhoneInventory, about: list[str]) -> str:
-    """Return a table as text, after comment lines about its origin."""
-    rows = [
-        (
-            phone,
-            f"{table.opening[phone]:.2f}",
-            f"{table.duration_s[phone]:.3f}",
-            f"{table.crossings[phone]:.2f}",
-            str(table.level.get(phone, "")),
-            f"{table.influence[phone]:.2f}" if phone in table.influence else "",
-        )
-        for phone in inventory.phones
-    ]
-    lines = [*(f"# {line}" for line in about), *("\t".join(row) for row in (COLUMNS, *rows))]
-    return "\n".join(lines) + "\n"

@@ -1,0 +1,134 @@
+"""Operations on the surfaces of the built-in heads: Catmull-Clark subdivision, normals, cuts.
+
+E. Catmull, J. Clark, "Recursively generated B-spline surfaces on arbitrary topological meshes",
+Computer-Aided Design 10(6), 1978.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from kouxing.services.driver.head.surface import Float, Index, edges_of
+
+
+def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, Index]:
+    """Subdivide once.
+
+    Returns ------- The matrix (V + E + F, V) from the old to the new vertices (moved old vertices,
+    edge points, face points), and the new quads (4 F, 4).
+    """
+    num_faces = len(quads)
+    edges, edge_of_corner = edges_of(quads)
+    num_edges = len(edges)
+    face_rows = np.repeat(np.arange(num_faces), 4)
+    faces = sparse.csr_array(
+        (np.full(4 * num_faces, 0.25), (face_rows, quads.ravel())), (num_faces, num_vertices)
+    )
+    midpoints = sparse.csr_array(
+        (np.full(2 * num_edges, 0.5), (np.repeat(np.arange(num_edges), 2), edges.ravel())),
+        (num_edges, num_vertices),
+    )
+    touching = sparse.csr_array(
+        (np.ones(4 * num_faces), (edge_of_corner.ravel(), face_rows)), (num_edges, num_faces)
+    )
+    interior = touching.sum(axis=1) == 2
+    inside = sparse.diags_array(interior.astype(float))
+    edge_points = inside @ (0.5 * midpoints + 0.25 * (touching @ faces)) + (
+        sparse.diags_array((~interior).astype(float)) @ midpoints
+    )
+
+    # (Q + 2 R + (n - 3) P) / n for an inner vertex, (1/8, 3/4, 1/8) along a border
+    around_faces = _incidence(quads.ravel(), face_rows, (num_vertices, num_faces))
+    edge_rows = np.repeat(np.arange(num_edges), 2)
+    around_edges = _incidence(edges.ravel(), edge_rows, (num_vertices, num_edges))
+    valence = np.maximum(around_edges.sum(axis=1), 1)
+    mean_faces = sparse.diags_array(1 / np.maximum(around_faces.sum(axis=1), 1)) @ around_faces
+    mean_edges = sparse.diags_array(1 / valence) @ around_edges
+    identity = sparse.eye_array(num_vertices)
+    inner = sparse.diags_array(1 / valence) @ (
+        mean_faces @ faces
+        + 2 * (mean_edges @ midpoints)
+        + sparse.diags_array(valence - 3.0) @ identity
+    )
+    border_edges = around_edges @ sparse.diags_array((~interior).astype(float))
+    on_border = border_edges.sum(axis=1) == 2
+    border = 0.5 * identity + 0.25 * (border_edges @ midpoints)
+    vertex_points = (
+        sparse.diags_array((~on_border).astype(float)) @ inner
+        + sparse.diags_array(on_border.astype(float)) @ border
+    )
+
+    before = np.roll(edge_of_corner, 1, axis=1) + num_vertices
+    after = edge_of_corner + num_vertices
+    middle = np.broadcast_to(np.arange(num_faces)[:, None] + num_vertices + num_edges, quads.shape)
+    fine = np.stack([quads, after, middle, before], axis=2).reshape(-1, 4)
+    matrix = sparse.csr_array(sparse.vstack([vertex_points, edge_points, faces]))
+    return matrix, fine
+
+
+def _incidence(rows: Index, columns: Index, shape: tuple[int, int]) -> sparse.csr_array:
+    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape)
+
+
+def triangles_of(quads: Index) -> Index:
+    """Split quads (F, 4) into triangles (2 F, 3)."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def vertex_normals(vertices: Float, triangles: Index) -> Float:
+    """Return the unit normals (V, 3): area-weighted means over the adjacent triangles."""
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    area = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], area)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
+
+
+def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, Index]:
+    """Remove everything above height 0.
+
+    Parameters
+    ----------
+    height
+        Height of every vertex (V,).
+    triangles
+        Vertex numbers (F, 3).
+    values
+        Values to interpolate at the cut (V, D).
+
+    Returns
+    -------
+    Values (W, D) of old and new vertices, triangles (G, 3), and the edges (E, 2) of the cut in the
+    direction of their triangles.
+    """
+    above = height[triangles] > 0
+    kept = triangles[~above.any(axis=1)].tolist()
+    rows = list(values)
+    new_rows: dict[tuple[int, int], int] = {}
+    rim = []
+
+    def cut(i: int, j: int) -> int:
+        key = (min(i, j), max(i, j))
+        if key not in new_rows:
+            share = height[i] / (height[i] - height[j])
+            new_rows[key] = len(rows)
+            rows.append(values[i] + share * (values[j] - values[i]))
+        return new_rows[key]
+
+    for corners, high in zip(triangles, above, strict=True):
+        if not high.any() or high.all():
+            continue
+        # rotate the corners so that the single corner on its side of the cut comes first
+        alone = int(np.argmax(high)) if high.sum() == 1 else int(np.argmin(high))
+        a, b, c = (int(vertex) for vertex in np.roll(corners, -alone))
+        p, q = cut(a, b), cut(a, c)
+        if high.sum() == 1:
+            kept += [[p, b, c], [p, c, q]]
+            rim.append([q, p])
+        else:
+            kept.append([a, p, q])
+            rim.append([p, q])
+    return np.array(rows), np.array(kept), np.array(rim)
