@@ -80,7 +80,7 @@ def test_opaque_videos_declare_their_colors(tmp_path: Path, name: str, codec: st
 
 
 def test_mp4_cannot_be_transparent(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="MP4 has cannot be transparent"):
+    with pytest.raises(UserError, match="MP4 cannot be transparent"):
         VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000, transparent=True)
 
 
