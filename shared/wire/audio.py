@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
@@ -28,5 +28,7 @@ class AcknowledgeAudio(Message):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sound(Message):
     """The session's audio as the recognizer reads it: 16 kHz mono."""
+
+    published_at: ClassVar[str | None] = "phones"
 
     pcm: Annotated[bytes, Meta(max_length=4 * MAX_AUDIO_BYTES)]  # int16, little-endian

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
@@ -84,6 +84,8 @@ class SetFace(Message):
 class FapFrame(Message):
     """The face that belongs to the audio at media_time."""
 
+    published_at: ClassVar[str | None] = "faps"
+
     values: FapValues  # 68 float32, little-endian, in FAP units
     mask: FapMask  # bit i of the little-endian integer: FAP i + 1 is set
     # The same face as weights of shapes, by set: float32, little-endian, 0 to 1, in the set's order
@@ -93,3 +95,5 @@ class FapFrame(Message):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndOfFaps(Message):
     """The session has no more FAP frames."""
+
+    published_at: ClassVar[str | None] = "faps"

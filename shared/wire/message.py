@@ -38,11 +38,15 @@ FapMask = Annotated[bytes, Meta(min_length=MASK_BYTES, max_length=MASK_BYTES)]
 LipValues = Annotated[bytes, Meta(min_length=4 * len(MOUTH_FAPS), max_length=4 * len(MOUTH_FAPS))]
 
 
+MESSAGES: dict[str, type[Message]] = {}  # every class by its kind, once its module is imported
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Message:
     """The fields that every message has."""
 
     kind: ClassVar[str]  # the class name in kebab-case
+    published_at: ClassVar[str | None] = None  # name of the endpoint
 
     version: Version = VERSION
     session: SessionName = ""  # empty: the message concerns no session
@@ -52,3 +56,4 @@ class Message:
 
     def __init_subclass__(cls) -> None:
         cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "-", cls.__name__).lower()
+        MESSAGES[cls.kind] = cls

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
@@ -34,12 +34,16 @@ class AudioState(StrEnum):
 class Speech(Message):
     """Voice activity started (active) or ended at media_time."""
 
+    published_at: ClassVar[str | None] = "phones"
+
     active: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Phone(Message):
     """A recognized phone; media_time is its onset. A message with the same index revises it."""
+
+    published_at: ClassVar[str | None] = "phones"
 
     index: Count
     symbol: PhoneSymbol  # one of the session's language
@@ -51,6 +55,8 @@ class Phone(Message):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lips(Message):
     """The mouth at media_time, from a lip model that works on the audio itself."""
+
+    published_at: ClassVar[str | None] = "phones"
 
     values: LipValues  # float32, little-endian, FAP units, in the order of MOUTH_FAPS
     delay: LipDelay  # how much audio after media_time the model has used; below 0: it predicts
