@@ -29,9 +29,9 @@ from kouxing.services.mouth_profiles.lip_tracks import lip_tracks
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.offline import recognize
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, columns
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
