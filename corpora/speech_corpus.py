@@ -117,7 +117,7 @@ def read_corpus(
     Raises
     ------
     UserError
-        If the folder has none of the layouts, or a list is missing or not UTF-8 text.
+        If the layout is unknown, or a list is missing or not UTF-8 text.
     """
     if folder.suffix == ".tsv" and folder.is_file():
         rows = _manifest_rows(folder, audio)
@@ -143,7 +143,7 @@ def read_corpus(
 
 
 def audio_files(folder: Path) -> list[Path]:
-    """Find the recordings in a folder, at any depth, sorted; UserError if there are none."""
+    """Find and sort the recordings in a folder, at any depth; UserError if it contains no audio."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
     if not files:
         raise UserError(f"{folder} contains no wav, flac, ogg or opus files; give another folder")

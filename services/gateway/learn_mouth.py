@@ -1,7 +1,7 @@
 """Learn my mouth: turn a browser's recording of a speaker's lips into a mouth profile.
 
-The browser sends a landmark file (``docs/my_mouth.md``). A worker process learns from it. Nothing
-is stored.
+The browser sends a landmark file (``docs/my_mouth.md``). A worker process learns the profile.
+Nothing is stored.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
           -> recurrent network with each speaker's units
           -> ridge regression in canonical units -> mean of the two
 
-The recipe trains on every clip that is not held out and whose license allows it. No setting is
-chosen with them. Each clip is used once as it is, and once augmented. A teacher may label further
-speech without video (:mod:`kouxing.training.lips.teacher`).
+The recipe trains on every clip that is not held out and whose license allows it. These clips do not
+determine any setting. Each clip is used once as it is, and once augmented. A teacher may label
+further speech without video (:mod:`kouxing.training.lips.teacher`).
 """
 
 from __future__ import annotations
@@ -196,8 +196,8 @@ def fit(
 ) -> tuple[LipPredictor, list[float]]:
     """Fit a model; return it and the mean loss of each epoch.
 
-    ``labeled`` are stretches that the teacher labeled. The ridge regression uses as many of their
-    positions as of the filmed ``examples``.
+    ``labeled`` are stretches that the teacher labeled. The ridge regression uses equal
+    numbers of labeled and filmed positions.
     """
     network, losses = train_network(examples, labeled, num_epochs=num_epochs, seed=seed)
     every = max(1, round(_num_positions(labeled) / _num_positions(examples)))

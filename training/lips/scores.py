@@ -3,9 +3,9 @@
 The correlations of opening, width and jaw pool the frames of all clips, after removing each clip's
 means. Outside speech the model gives no lips, and the mouth counts as at rest.
 
-The tracked lips close where their opening has a minimum within the lowest tenth of the speaker's
-range, next to an opening to half of it. The model predicts a closure where its probability is above
-one half. A tracked closure is found if one is predicted within 40 ms. A predicted closure is
+The tracked lips close at a minimum of their opening within the lowest tenth of the speaker's range,
+if they open to half of the range nearby. The model predicts a closure where its probability is
+above one half. A tracked closure is found if one is predicted within 40 ms. A predicted closure is
 correct if the tracked lips touch within 40 ms.
 """
 

@@ -1,4 +1,4 @@
-"""Forced alignment of the training set, and the HMM statistics from it."""
+"""Forced alignment of the training set, and its HMM statistics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The training curves, as a picture beside the model."""
+"""The training curves, as an image next to the model."""
 
 from __future__ import annotations
 

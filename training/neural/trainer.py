@@ -54,8 +54,8 @@ _OTHER_OUTPUT_WEIGHT = 0.5  # of the loss of the other output layer
 class Trainer:
     """Trains a network in place, step by step.
 
-    Every step trains the output layer ``main_output``, and another one in turn. ``seed`` determines
-    order and augmentation. Dropout draws from PyTorch's own generator.
+    Every step trains the output layer ``main_output`` and one other layer, which changes. ``seed``
+    determines order and augmentation. Dropout draws from PyTorch's own generator.
     """
 
     def __init__(

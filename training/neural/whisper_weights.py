@@ -61,7 +61,7 @@ _OF_LAYER = {
 
 
 def load_whisper(network: Encoder, folder: Path) -> None:
-    """Load the weights of Whisper's convolutions and of as many layers as the network has.
+    """Load the weights of Whisper's convolutions and of the network's layers.
 
     ``folder`` contains ``model.bin`` in CTranslate2's format. Raises UserError if the file is
     missing, invalid, or for another kind or size of model.

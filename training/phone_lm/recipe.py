@@ -78,7 +78,7 @@ def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> Phone
 def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
     """Read a file of :func:`train_phone_lm`, or the phone language model of a recognizer's model.
 
-    Raises UserError if there is none in the file, or it is for another language.
+    Raises UserError if the file contains no phone language model, or one for another language.
     """
     try:
         phone_lm = phone_lm_from(read_archive(path))
