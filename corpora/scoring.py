@@ -46,7 +46,7 @@ def matched_pairs(
     Returns
     -------
     list of tuple
-        Pairs of indices. The first is None for an insertion, the second for a deletion.
+        Pairs of indices. An insertion has no first index, a deletion no second one: they are None.
 
     Examples
     --------

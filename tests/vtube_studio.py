@@ -1,4 +1,4 @@
-"""A program that answers as VTube Studio does, after the public document of its API."""
+"""A server that answers like VTube Studio, according to the public document of its API."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import threading
-import time
 from types import TracebackType
 
 from aiohttp import WSMsgType, web
@@ -18,27 +17,24 @@ PARAMETERS = ("MouthOpen", "MouthSmile", "EyeOpenLeft", "FaceAngleX", "MousePosi
 
 
 class VTubeStudioStub:
-    """A server at a free port (or a given one), in a thread of its own.
+    """A server in a thread, at a free port or a given one.
 
     Attributes
     ----------
     requests
-        Kinds of the messages that came, without those of frames.
+        Kinds of the received messages, except frames.
     frames
-        The parameters of each frame, by name.
-    arrived_s
-        When each of them came, by ``time.perf_counter``.
+        Parameters of each frame, by name.
     token
-        The one that is valid; empty: none is, and whoever had one may do nothing any more.
+        The valid token. If it is empty, no token is valid.
     is_asking
-        Whether the user has not yet answered a question.
+        Whether a question to the user is open.
     """
 
     def __init__(self, port: int = 0, *, user_allows: bool = True, token: str = "") -> None:
         self.port = port
         self.requests: list[str] = []
         self.frames: list[dict[str, float]] = []
-        self.arrived_s: list[float] = []
         self._user_allows = user_allows
         self.token = token
         self.is_asking = False
@@ -119,7 +115,7 @@ class VTubeStudioStub:
             return _error(51, "A permission popup is already shown.")
         if not self._user_allows:
             return _error(50, "User has denied API access for your plugin.")
-        self.token = "a-token"  # noqa: S105 - the stub's own
+        self.token = "a-token"  # noqa: S105 - of the stub
         return "AuthenticationTokenResponse", {"authenticationToken": self.token}
 
     def _inject(self, data: dict[str, object]) -> Answer:
@@ -134,13 +130,12 @@ class VTubeStudioStub:
             return _error(451, "A value is out of range")
         if any(each["id"] not in PARAMETERS for each in values):
             return _error(453, "Parameter not found")
-        self.arrived_s.append(time.perf_counter())
         self.frames.append({each["id"]: each["value"] for each in values})
         return "InjectParameterDataResponse", {}
 
 
 def _fault(asked: dict[str, object]) -> Answer | None:
-    """Return what is wrong with a request of whatever kind."""
+    """Return the error of an invalid request."""
     for number, key in ((3, "apiName"), (4, "apiVersion")):
         if asked.get(key) != API[key]:
             return _error(number, f"{key} must be {API[key]}")
@@ -150,7 +145,7 @@ def _fault(asked: dict[str, object]) -> Answer | None:
 
 
 def _plugin_fault(kind: object, data: dict[str, object]) -> Answer | None:
-    """Return what is wrong with how a plugin presents itself, where it does."""
+    """Return the error of an invalid plugin name or token."""
     if kind not in ("AuthenticationTokenRequest", "AuthenticationRequest"):
         return None
     number = 52 if kind == "AuthenticationTokenRequest" else 101

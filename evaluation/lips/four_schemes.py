@@ -1,13 +1,13 @@
 """The experiment of Li et al. 2011, section 3.2: four ways to drive a face with the same sentences.
 
-1. phones from forced alignment of the text, all of them known;
-2. recognized phones, all of them known;
-3. live: what the services send;
-4. live, but a phone counts only once the next one starts.
+1. Phones from forced alignment of the text. All phones are known.
+2. Recognized phones. All phones are known.
+3. Live: what the services send.
+4. Live, but a phone counts only once the next one starts.
 
 Schemes 1 and 2 use the product's offline chain (``services.recording_chain``). Schemes 3 and 4 use
 its live chain with the default delay of each lip model. Scheme 1 always uses the default acoustic
-model, as in the paper, where the alignment does not depend on the recognizer.
+model. In the paper, too, the alignment does not depend on the recognizer.
 """
 
 from __future__ import annotations

@@ -238,16 +238,16 @@ def _near_opening(moments_s: Array, time_s: Array, opening: Array) -> Array:
 
 
 def is_closed_at(moments_s: Array, time_s: Array, opening: Array) -> Mask:
-    """Whether made lips close within 40 ms of each moment, and are open within 0.2 s of it."""
+    """Whether made lips close within 40 ms of each moment and are open within 0.2 s."""
     return _touches_at(moments_s, time_s, opening < _CLOSED, opening > _OPEN)
 
 
 def closures(real_s: Array, closed_s: Array, time_s: Array, opening: Array) -> Detections:
     """Compare closures of real and made lips.
 
-    A real closure is reproduced if the made lips close within 40 ms of it. A made closure starts
-    when lips that were open close. It is true if real lips are closed within 40 ms of it. Contacts
-    more than 0.2 s from open lips are rest, not closures.
+    The made lips reproduce a real closure if they close within 40 ms. A made closure starts when
+    open lips close. It is true if real lips are closed within 40 ms. Contacts more than 0.2 s from
+    open lips are rest, not closures.
 
     Parameters
     ----------

@@ -1,11 +1,11 @@
 """Measures of the four schemes (``four_schemes.py``) that need no judges.
 
-- Agreement of the mouth with that of scheme 1 with the same lip model, which is the paper's upper
-  bound, and with tracked lips if there are any: correlation, error, closures, and as the sync
-  offset the lag of the opening with the highest correlation (``scores.py``).
+- Agreement of the mouth with scheme 1 with the same lip model, which is the paper's upper bound,
+  and with tracked lips: correlation, error and closures (``scores.py``). The lag of the opening
+  with the highest correlation is the sync offset.
 - The jerk of the opening.
-- The phone delay: from a phone's onset in scheme 1 to the moment when the face receives it, in
-  steps of 20 ms, for phones whose first hypothesis is right. The face's own delay comes on top.
+- The phone delay: from a phone's onset in scheme 1 to the moment when the face receives the phone,
+  in steps of 20 ms. Only phones whose first hypothesis is right count. The face adds its own delay.
 
 Only the mouth moves, with an expressiveness of 1.
 """

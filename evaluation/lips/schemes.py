@@ -2,10 +2,10 @@
 
 The schemes of Li et al. 2011, section 3.2:
 
-1. phones from forced alignment of the transcript, all of them known (Mandarin clips only);
-2. recognized phones, all of them known;
-3. every lip model live, at several delays: the frames that the services would send;
-4. dynamic visemes live, but a phone counts only once the next one starts.
+1. Phones from forced alignment of the transcript. All phones are known. Mandarin clips only.
+2. Recognized phones. All phones are known.
+3. Every lip model live, at several delays: the frames that the services would send.
+4. Dynamic visemes live, but a phone counts only once the next one starts.
 
 Two baselines need no phones: a mouth that opens with the loudness, and a still mouth.
 """
@@ -80,7 +80,7 @@ def recognize_clip(
     lips: LipFrameModel | None,
     delays_s: Sequence[float] = DELAYS_S,
 ) -> RecognizedClip:
-    """Recognize a clip live and offline, and align its transcript if there is one."""
+    """Recognize a clip live and offline, and align its transcript, if it has one."""
     return RecognizedClip(
         clip=clip,
         num_frames=int(len(clip.samples) / SAMPLE_RATE_HZ * FRAME_RATE_HZ) + 1,
@@ -245,8 +245,8 @@ def is_speech(clip: RecognizedClip, time_s: Array) -> NDArray[np.bool_]:
 def pauses(clip: RecognizedClip) -> Array:
     """Return the starts and ends of pauses after speech, seconds, shape (num_pauses, 2).
 
-    A pause lasts at least half a second, from the last loud sound, while voice activity is on, to
-    the next one or to the end of the clip.
+    A pause lasts at least half a second. It extends from the last loud sound with voice activity to
+    the next one, or to the end of the clip.
     """
     loud_s = _loud_s(clip)
     speech_s = loud_s[_is_active(clip, loud_s)]

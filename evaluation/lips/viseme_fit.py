@@ -1,10 +1,10 @@
 """How well the visemes fit lips that they were not trained on.
 
 Source: Wang & Cai 2003, section 4. Their figure 4 shows measured and modeled curves of a single
-final and of a sentence. Here the full model runs over the phones of each clip (aligned if the text
-is known, else recognized), with the learnt parameters and with the initial ones, which were set by
-hand. The errors of a viseme are those of the frames nearest to it. The level of the voice is not
-used.
+final and of a sentence. Here the full model runs over the phones of each clip. The phones are
+aligned if the text is known, and recognized otherwise. The model runs with the learnt parameters
+and with the initial ones, which were set by hand. Each frame counts for the nearest viseme. The
+level of the voice is not used.
 """
 
 from __future__ import annotations

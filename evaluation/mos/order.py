@@ -27,7 +27,8 @@ def williams_design(num_conditions: int) -> NDArray[np.int64]:
 def places_of_judge(judge: int, study: Study) -> dict[int, tuple[str, str]]:
     """Return the sentence and condition at every place of a judge; practice is below 0.
 
-    As many judges in a row as the design has rows see every condition equally often at every place.
+    If the number of judges is a multiple of the design's number of rows, every condition is equally
+    frequent at every place.
     """
     sentences, conditions = study.sentences, study.conditions
     design = williams_design(len(conditions))

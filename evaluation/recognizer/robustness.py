@@ -180,7 +180,7 @@ def _phones_per_minute(
 
 
 def read_recordings(folder: Path) -> list[Samples]:
-    """Read up to forty recordings of a folder, evenly spread; raises UserError if it has none."""
+    """Read up to forty recordings of a folder, evenly spread; an empty folder is a UserError."""
     paths = audio_files(folder)
     step = max(1, len(paths) // _MAX_OTHER_RECORDINGS)
     return [read_audio(path) for path in paths[::step][:_MAX_OTHER_RECORDINGS]]

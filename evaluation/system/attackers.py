@@ -1,8 +1,8 @@
 """Attackers for `evaluate attacks`: ZeroMQ peers and web clients that break the rules.
 
 Some have no key and never get past the handshake. The others have a client key that control
-accepts. Each attack runs for a given time, and connects from a given loopback address, so that a
-service can tell it from the clients that it must keep serving.
+accepts. Each attack runs for a given time and connects from a given loopback address. A service can
+therefore distinguish the attacker from the clients that it must continue to serve.
 """
 
 from __future__ import annotations

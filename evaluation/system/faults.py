@@ -1,9 +1,9 @@
 """Measure what faults do to a live face: killed and frozen services, load, networks.
 
 For each fault the services run as under ``kouxing run``, on free ports, or on virtual hosts
-(``network.py``). A sentence is streamed in real time until something breaks. What a subscriber
-receives is compared with the same audio without a fault (``continuity.py``). A sudden fault happens
-at several instants, in one session each. The worst value of each figure counts.
+(``network.py``). A sentence is streamed in real time until something breaks. The results of a
+subscriber are compared with those without a fault (``continuity.py``). A sudden fault happens at
+several instants, in one session each. The worst value of each figure counts.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class Rendering:
 
 
 def measure() -> Rendering:
-    """Render the default head while it speaks and blinks.
+    """Render the default head with visemes, blinks and nods.
 
     Raises
     ------

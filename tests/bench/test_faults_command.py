@@ -1,4 +1,4 @@
-"""Services fail in the midst of a live session, and its face shows nothing of it but a pause."""
+"""Services crash during a live session; its face only pauses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.bench
 
 
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
-def test_a_crash_loses_nothing_and_the_command_says_so(
+def test_a_crash_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, service: str
 ) -> None:
     timing = Timing(length_s=6.0, fault_at_s=3.2, also_at_s=())
@@ -45,7 +45,7 @@ def test_a_crash_loses_nothing_and_the_command_says_so(
     assert face["largest_step"] < 2.0, face["largest_step_fap"]
 
 
-def test_an_unknown_fault_is_named() -> None:
+def test_rejects_an_unknown_fault() -> None:
     result = CliRunner().invoke(app, ["faults", "--fault", "flood"])
     assert result.exit_code != 0
     assert "no fault is named 'flood'" in str(result.exception)

@@ -1,4 +1,4 @@
-"""The bench command measures something and writes it; how fast is for its reader to judge."""
+"""The bench command prints and writes its figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.system import VOWELS_FILE
 pytestmark = pytest.mark.bench
 
 
-def test_it_prints_a_table_and_writes_the_same_figures(
+def test_prints_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.rendering.NUM_IMAGES", 10)

@@ -1,4 +1,4 @@
-"""The load command speaks into many sessions and says what they cost."""
+"""The load command prints, writes and plots its figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.system import VOWELS_FILE
 pytestmark = pytest.mark.bench
 
 
-def test_it_prints_a_table_writes_the_same_figures_and_draws_them(
+def test_prints_writes_and_plots_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.load.SETTLE_S", 1.0)

@@ -1,4 +1,4 @@
-"""What the figures of a fault count, on made-up frames and phones."""
+"""The figures of a fault, for artificial frames and phones."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ UNDISTURBED = seen(
 )
 
 
-def test_an_undisturbed_session_has_lost_nothing() -> None:
+def test_a_session_without_a_fault_loses_nothing() -> None:
     face = compare(UNDISTURBED, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert (face.phones, face.phones_lost, face.phones_doubled, face.phones_changed) == (3, 0, 0, 0)
     assert (face.frames_lost, face.frames_doubled, face.rest_frames) == (0, 0, 0)
@@ -58,7 +58,7 @@ def test_an_undisturbed_session_has_lost_nothing() -> None:
     assert face.late_p95_ms == pytest.approx(0.0, abs=1e-6)
 
 
-def test_frames_that_fail_to_come_and_come_twice_are_told_from_rest() -> None:
+def test_distinguishes_lost_and_repeated_frames_from_rest() -> None:
     broken = seen(
         *in_time(*range(10)),
         (0.30, frame(9)),  # at rest
@@ -75,13 +75,13 @@ def test_frames_that_fail_to_come_and_come_twice_are_told_from_rest() -> None:
     assert face.largest_step == pytest.approx(16.0)  # from 9 to 25
 
 
-def test_a_face_that_never_moves_again_stands_to_the_end() -> None:
+def test_a_face_that_stops_counts_to_the_end() -> None:
     assert compare(
         seen(*in_time(*range(10))), UNDISTURBED, "sil", 0.06, fault_s=0.2
     ).stood_s == pytest.approx(1.0 - 0.24)
 
 
-def test_phones_of_two_epochs_make_one_row() -> None:
+def test_joins_the_phones_of_two_epochs() -> None:
     broken = seen(
         *in_time(*range(47)),
         phones=(
@@ -100,7 +100,7 @@ def test_phones_of_two_epochs_make_one_row() -> None:
     assert compare(revised, UNDISTURBED, "sil", 0.06, fault_s=0.2).phones_lost == 1
 
 
-def test_phones_that_a_new_recognizer_says_again_count_once() -> None:
+def test_counts_phones_repeated_by_a_new_recognizer_once() -> None:
     broken = seen(
         *in_time(*range(47)),
         phones=(
@@ -115,14 +115,14 @@ def test_phones_that_a_new_recognizer_says_again_count_once() -> None:
     assert (face.phones_lost, face.phones_doubled, face.phones_changed) == (0, 0, 0)
 
 
-def test_frames_are_in_time_again_once_none_is_late_for_a_second() -> None:
+def test_lateness_ends_with_a_second_without_late_frames() -> None:
     late = seen(*in_time(*range(10)), *((0.9, frame(number)) for number in range(10, 42)))
     face = compare(late, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert face.late_s == pytest.approx(0.7)
     assert compare(late, UNDISTURBED, "sil", 0.06, fault_s=-2.0).late_s == 0.0, "it was no fault"
 
 
-def test_the_worst_of_several_sessions_has_the_worst_of_each_figure() -> None:
+def test_takes_the_worst_of_each_figure() -> None:
     one = compare(seen(*in_time(*range(20, 47))), UNDISTURBED, "sil", 0.06, fault_s=0.2)
     other = compare(UNDISTURBED, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     both = worst([other, one])
@@ -130,6 +130,6 @@ def test_the_worst_of_several_sessions_has_the_worst_of_each_figure() -> None:
     assert both.late_p50_ms == max(one.late_p50_ms, other.late_p50_ms)
 
 
-def test_frames_are_as_stale_as_they_come_after_those_in_time() -> None:
+def test_staleness_is_relative_to_a_subscriber_without_delay() -> None:
     late = [(0.01, 0), (0.9, 320), (0.9, 320 * 40)]
     assert staleness(late, UNDISTURBED, since_s=0.5) == pytest.approx([0.82, 0.04])

@@ -83,7 +83,7 @@ def test_turns_ignore_trembling() -> None:
 
 def test_real_closures_are_minima_near_an_opening() -> None:
     curve = mouth((1.0, 1.0), (2.0, 3.0))
-    # the rest of a second counts where it ends: what lies within is no minimum
+    # a rest of a second counts at its end: its other frames are not a minimum
     np.testing.assert_allclose(real_closures(TIME_S, curve), [1.0, 3.0])
     curve[(TIME_S > 0.9) & (TIME_S < 1.1)] = np.nan
     np.testing.assert_allclose(real_closures(TIME_S, curve), [3.0])

@@ -256,7 +256,7 @@ def test_finds_the_quietest_moment_of_a_phone() -> None:
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
     found = phones_with_viseme(recognized(clip, phones), "b")
     np.testing.assert_allclose(quietest_moments(clip, found), quiet_s, atol=0.011)
-    # phones count in the language of the model alone, whichever that is
+    # only phones in the model's language count
     english = replace(clip, language="en")
     assert phones_with_viseme(recognized(english, phones), "b") == []
     theirs = replace(INVENTORY, code="en", visemes={**INVENTORY.visemes, "d": (("b", 1.0),)})
@@ -342,7 +342,7 @@ def test_learnt_parameters_fit_their_own_curves_best() -> None:
     assert {error.measure for error in errors} == {"opening", "width", "jaw"}
     assert {"all", "rest", "a", "i", "u", "b"} <= {error.viseme for error in errors}
     whole = next(each for each in errors if (each.viseme, each.measure) == ("all", "jaw"))
-    assert whole.learnt < 0.25 * whole.guessed  # what remains is the rate
+    assert whole.learnt < 0.25 * whole.guessed  # the frame rate causes the remaining error
     assert whole.num_frames == len(time_s)
     assert len(fit_figure(fitted).axes) == 8
     clip.faps[:, MOUTH_FAPS.index(3)] = np.nan

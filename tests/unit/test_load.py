@@ -1,4 +1,4 @@
-"""What the load's figures are made of, without sockets."""
+"""The figures of the load benchmark, without sockets."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def _spoken(arrived_s: dict[int, float]) -> Spoken:
     return Spoken(cast(Session, _Session()), b"", start_s=100.0, arrived_s=arrived_s)
 
 
-def test_a_frame_is_due_with_the_last_chunk_that_it_needs() -> None:
+def test_a_frame_is_due_with_its_last_chunk() -> None:
     # with a delay of 60 ms the frame at 20 ms needs 80 ms of sound: due at 100.08 s
     spoken = _spoken({0: 100.065, 320: 100.090})
     assert list(spoken.delays_s(0.06, 100.0, 100.085)) == pytest.approx([0.005, 0.005])
 
 
-def test_frames_that_do_not_come_count_as_late() -> None:
+def test_missing_frames_count_as_late() -> None:
     assert list(_spoken({0: 100.065}).delays_s(0.06, 100.07, 100.2)) == pytest.approx(
         [0.12, 0.10, 0.08, 0.06, 0.04, 0.02], abs=1e-6
     )
 
 
-def test_a_frame_of_rest_is_no_arrival() -> None:
+def test_ignores_frames_at_rest() -> None:
     spoken = _spoken({})
     frame = FapFrame(media_time=320, values=array("f", bytes(272)))
     spoken.record(frame)
@@ -49,7 +49,7 @@ def test_a_frame_of_rest_is_no_arrival() -> None:
     assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
 
 
-def test_rest_before_a_speaker_begins_is_not_counted() -> None:
+def test_ignores_rest_before_the_speaker_starts() -> None:
     spoken = _spoken({})
     frame = FapFrame(media_time=0, values=array("f", bytes(272)))
     for _ in range(3):
@@ -57,14 +57,14 @@ def test_rest_before_a_speaker_begins_is_not_counted() -> None:
     assert spoken.num_rest == 0
 
 
-def test_every_speaker_has_a_voice_and_a_place_of_its_own() -> None:
+def test_speakers_differ_in_voice_and_position() -> None:
     text = np.sin(np.cumsum(np.linspace(0.01, 1.0, 16_000))).astype(np.float32)
     sounds = [voiced(text, number) for number in range(12)]
     assert np.array_equal(sounds[0], text)
     assert len({sound.tobytes() for sound in sounds}) == len(sounds)
 
 
-def test_steps_rise_to_the_last_number() -> None:
+def test_step_sizes() -> None:
     assert step_sizes(24) == [1, 3, 6, 9, 12, 15, 18, 21, 24]
     assert step_sizes(3) == [1, 2, 3]
 
@@ -84,7 +84,7 @@ def _step(number: int, worst_p95_ms: float) -> Step:
     )
 
 
-def test_the_summary_is_of_the_most_sessions_in_time() -> None:
+def test_summarizes_the_best_step() -> None:
     refused = replace(_step(12, 20.0), num_asked=16, refusals={"busy": 4})
     load = Load([_step(1, 5.0), _step(8, 10.0), refused, _step(20, 900.0)], 2, 0.0, 60.0)
     assert load.summary == pytest.approx(
@@ -99,7 +99,7 @@ def test_the_summary_is_of_the_most_sessions_in_time() -> None:
     assert Load([_step(1, 61.0)], 2, 0.0, 60.0).summary == {"sessions": 0}
 
 
-def test_bench_of_a_file_measures_the_chain(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_with_a_file_measures_the_chain(monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[tuple[Path, int]] = []
 
     def measure(path: Path, repeats: int, _console: object) -> None:

@@ -1,4 +1,4 @@
-"""Mouths are told apart on mute pictures at viewing distance."""
+"""Mouths can be distinguished in pictures at viewing distance."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def draw(head: Head, visemes: list[str], view: Camera) -> list[NDArray[np.int32]
     return pictures
 
 
-def test_each_two_mouths_differ(head: Head) -> None:
+def test_any_two_mouths_differ(head: Head) -> None:
     pictures = dict(zip(VISEMES, draw(head, VISEMES, camera(head)), strict=True))
     for one, other in combinations(VISEMES, 2):
         change = np.abs(pictures[one] - pictures[other])[240:420, 220:420].max(axis=2)
@@ -57,7 +57,7 @@ def test_each_two_mouths_differ(head: Head) -> None:
         assert (change > MIN_CHANGE * brightness).sum() > MIN_PIXELS, (one, other)
 
 
-def test_rounded_lips_stand_out_in_profile(head: Head) -> None:
+def test_rounded_lips_protrude_in_profile(head: Head) -> None:
     """The lips' outline in u and in ü is further to the front (left) than in i."""
     fronts = []
     for picture in draw(head, ["u", "v", "i"], camera(head, Framing.MOUTH, 90.0)):
