@@ -2,10 +2,7 @@
 
 export const TEXTS = {
   // Main view
-  canvas: {
-    en: "talking head; the arrow keys turn it, Home returns it to the front",
-    zh: "说话的头像：方向键转动，Home 键回到正面",
-  },
+  canvas: { en: "talking head; the arrow keys turn it, Home returns it to the front", zh: "说话的头像：方向键转动，Home 键回到正面" },
   loading: { en: "Loading the head …", zh: "正在加载头像…" },
   phonesLabel: { en: "recognized speech", zh: "识别结果" },
   phones: { en: "Phones", zh: "声韵母" },
@@ -14,10 +11,7 @@ export const TEXTS = {
   microphone: { en: "Microphone", zh: "麦克风" },
   sample: { en: "Sample", zh: "播放示例" },
   file: { en: "File", zh: "文件" },
-  fileHelp: {
-    en: "Speak a sound file; you can also drop it on the page",
-    zh: "播放音频文件，也可直接拖到页面上",
-  },
+  fileHelp: { en: "Speak a sound file; you can also drop it on the page", zh: "播放音频文件，也可直接拖到页面上" },
   record: { en: "Record", zh: "录制" },
   recordHelp: { en: "Record face and sound as a video", zh: "把人脸和声音录成视频" },
   learn: { en: "Learn my mouth", zh: "学我的口型" },
@@ -44,9 +38,7 @@ export const TEXTS = {
     zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
   },
   connectionRefused: {
-    en:
-      "The gateway refused the connection. Open the whole address that “kouxing run” printed, " +
-      "including #token=… if it has one.",
+    en: "The gateway refused the connection. Open the whole address that “kouxing run” printed, including #token=… if it has one.",
     zh: "网关拒绝了连接。请打开 kouxing run 显示的完整地址（包括其中的 #token=…）。",
   },
   controlMissing: {
@@ -54,20 +46,12 @@ export const TEXTS = {
     zh: "控制服务（control）没有运行。请运行 kouxing run，本页会自动重新连接。",
   },
   servicesMissing: {
-    en:
-      "Not running: {services}. “kouxing run” restarts services by itself; without it, start " +
-      "them with: {commands}",
+    en: "Not running: {services}. “kouxing run” restarts services by itself; without it, start them with: {commands}",
     zh: "没有运行：{services}。kouxing run 会自动重启服务；否则请运行：{commands}",
   },
-  microphoneInterrupted: {
-    en: "The microphone was interrupted. It resumes by itself.",
-    zh: "麦克风中断，会自动恢复。",
-  },
+  microphoneInterrupted: { en: "The microphone was interrupted. It resumes by itself.", zh: "麦克风中断，会自动恢复。" },
   microphoneResumed: { en: "The microphone is on again.", zh: "麦克风已恢复。" },
-  serviceRestarted: {
-    en: "A service crashed and was restarted. The session continues.",
-    zh: "一个服务崩溃后已重启，会话继续。",
-  },
+  serviceRestarted: { en: "A service crashed and was restarted. The session continues.", zh: "一个服务崩溃后已重启，会话继续。" },
 
   // Errors
   headMissing: {
@@ -75,9 +59,7 @@ export const TEXTS = {
     zh: "无法加载 {file}：{reason}。请用 kouxing head export 生成该文件。",
   },
   webGlMissing: {
-    en:
-      "This browser cannot draw 3-D images (WebGL). Turn on hardware acceleration in its " +
-      "settings, or use another browser.",
+    en: "This browser cannot draw 3-D images (WebGL). Turn on hardware acceleration in its settings, or use another browser.",
     zh: "浏览器无法绘制 3-D 图像（WebGL）。请在浏览器设置中打开硬件加速，或换一个浏览器。",
   },
   microphoneInsecure: {
@@ -126,10 +108,7 @@ export const TEXTS = {
   expressiveness: { en: "Movement of the mouth", zh: "口型幅度" },
   expression: { en: "Expression", zh: "表情" },
   senders: { en: "Other programs", zh: "其他程序" },
-  senderAddress: {
-    en: "Address of a program that shows the face",
-    zh: "显示这张脸的程序的地址",
-  },
+  senderAddress: { en: "Address of a program that shows the face", zh: "显示这张脸的程序的地址" },
   send: { en: "Send", zh: "发送" },
   stop: { en: "Stop", zh: "停止" },
   start: { en: "Start", zh: "开始" },
@@ -138,14 +117,9 @@ export const TEXTS = {
     en: "{contents}, {rate} frames/s, delayed {delay} ms",
     zh: "{contents}，每秒 {rate} 帧，延迟 {delay} ms",
   },
-  delaySenders: {
-    en: "Delay them by {ms} ms to match this sound",
-    zh: "延迟 {ms} ms 以配合此声音",
-  },
+  delaySenders: { en: "Delay them by {ms} ms to match this sound", zh: "延迟 {ms} ms 以配合此声音" },
   playoutDelays: {
-    en:
-      "Sound is delayed by {soundMs} ms to match the picture. To match another program's face to " +
-      "this sound, add delay={frameMs} to the address.",
+    en: "Sound is delayed by {soundMs} ms to match the picture. To match another program's face to this sound, add delay={frameMs} to the address.",
     zh: "声音延迟 {soundMs} ms 以配合画面。要让其他程序的脸与此声音同步，请在地址中加 delay={frameMs}。",
   },
   language: { en: "Language", zh: "语言" },
@@ -168,15 +142,11 @@ export const TEXTS = {
 
   // Learn my mouth
   lessonIntro: {
-    en:
-      "Read a text aloud in front of your camera for 40 seconds. When you use the microphone, the " +
-      "head then moves its lips as you do.",
+    en: "Read a text aloud in front of your camera for 40 seconds. When you use the microphone, the head then moves its lips as you do.",
     zh: "对着摄像头朗读 40 秒，之后用麦克风时，头像就会学着你的口型说话。",
   },
   lessonPrivacy: {
-    en:
-      "No picture leaves this browser. The gateway receives your voice and the positions of 43 " +
-      "points of your face. It deletes both when it has learned.",
+    en: "No picture leaves this browser. The gateway receives your voice and the positions of 43 points of your face. It deletes both when it has learned.",
     zh: "图像不会离开浏览器。网关只收到你的声音和脸上 43 个点的位置，学完即删除。",
   },
   lessonLearned: {
@@ -196,10 +166,7 @@ export const TEXTS = {
   yourLips: { en: "your lips", zh: "你的" },
   before: { en: "before", zh: "之前" },
   after: { en: "after", zh: "之后" },
-  lessonSimilarity: {
-    en: "How closely the head's lips follow yours (1: exactly)",
-    zh: "与你的相似度（1 为完全一致）",
-  },
+  lessonSimilarity: { en: "How closely the head's lips follow yours (1: exactly)", zh: "与你的相似度（1 为完全一致）" },
   lessonHeldOut: {
     en: "Measured on the last quarter of your reading, which was not used for learning.",
     zh: "用未参与学习的最后四分之一测得。",
@@ -215,28 +182,14 @@ export const TEXTS = {
   "measure.opening": { en: "Opening", zh: "张口" },
   "measure.width": { en: "Width", zh: "宽度" },
   "measure.jaw": { en: "Jaw", zh: "下颌" },
-  lessonBetter: {
-    en: "The head's lips now follow yours more closely.",
-    zh: "现在头像的口型更像你了。",
-  },
-  lessonSame: {
-    en: "The head's lips follow yours about as well as before.",
-    zh: "效果和以前差不多。",
-  },
+  lessonBetter: { en: "The head's lips now follow yours more closely.", zh: "现在头像的口型更像你了。" },
+  lessonSame: { en: "The head's lips follow yours about as well as before.", zh: "效果和以前差不多。" },
   lessonWorse: {
-    en:
-      "The head's lips do not follow yours. Discard this and try again, with light on your face " +
-      "and without other voices.",
+    en: "The head's lips do not follow yours. Discard this and try again, with light on your face and without other voices.",
     zh: "效果不好。建议放弃，换个光线好、安静的地方再试。",
   },
-  noFace: {
-    en: "No face is visible. Sit in front of the camera, with light on your face.",
-    zh: "看不到脸。请正对摄像头，脸部要有光。",
-  },
-  tooQuiet: {
-    en: "The sound is too quiet. Speak louder, or turn the microphone up.",
-    zh: "声音太小。请大声一点，或调高麦克风音量。",
-  },
+  noFace: { en: "No face is visible. Sit in front of the camera, with light on your face.", zh: "看不到脸。请正对摄像头，脸部要有光。" },
+  tooQuiet: { en: "The sound is too quiet. Speak louder, or turn the microphone up.", zh: "声音太小。请大声一点，或调高麦克风音量。" },
   tooSlow: {
     en: "This computer analyzes too few pictures per second. Close other programs and try again.",
     zh: "这台电脑处理画面太慢。请关闭其他程序再试。",
@@ -249,18 +202,12 @@ export const TEXTS = {
     en: "Camera or microphone are blocked. Allow them for this page and try again.",
     zh: "未允许使用摄像头和麦克风。请允许后重试。",
   },
-  cameraMissing: {
-    en: "No camera or no microphone was found. Plug one in and try again.",
-    zh: "没有摄像头或麦克风。请接上后重试。",
-  },
+  cameraMissing: { en: "No camera or no microphone was found. Plug one in and try again.", zh: "没有摄像头或麦克风。请接上后重试。" },
   cameraBusy: {
     en: "Another program uses the camera or the microphone. Close it and try again.",
     zh: "摄像头或麦克风被其他程序占用。请关闭后重试。",
   },
-  cameraUnplugged: {
-    en: "Camera or microphone was unplugged. Plug it in and try again.",
-    zh: "摄像头或麦克风断开了。请接上后重试。",
-  },
+  cameraUnplugged: { en: "Camera or microphone was unplugged. Plug it in and try again.", zh: "摄像头或麦克风断开了。请接上后重试。" },
   trackerFailed: { en: "Cannot find faces in this browser: {reason}", zh: "浏览器无法识别人脸：{reason}" },
   gatewaySilent: {
     en: "The gateway does not answer. Start it with “kouxing run” and send again.",
