@@ -16,8 +16,8 @@ export async function openCaptureContext() {
 /**
  * Capture a stream's audio.
  *
- * @param onChunk (samples: Int16Array of 20 ms, rms: level from 0 to 1, recordedMs: when they were
- *   recorded, on the page's clock). recordedMs is right even if the page was busy since then.
+ * @param onChunk (samples: Int16Array of 20 ms, rms: level from 0 to 1, recordedMs: time of
+ *   recording on the page's clock, correct even if the page was busy)
  */
 export function capture(context, stream, onChunk) {
   const node = new AudioWorkletNode(context, "capture", {

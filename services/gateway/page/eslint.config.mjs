@@ -1,4 +1,4 @@
-// What the page's code is checked for; its name keeps it from being served.
+// Rules for the page's code. Because of its suffix, the gateway does not serve this file.
 
 import js from "@eslint/js";
 import globals from "globals";
