@@ -332,7 +332,7 @@ def faces(
 def test_the_web_component_knows_what_moves_a_model(faces: Browser) -> None:
     sets = faces.evaluate("[arkit, oculus, vrm, old, own].map((face) => face.set)")
     assert sets == ["arkit", "oculus", "vrm", "vrm", "faps"]
-    faces.wait_for("none.failure?.includes('no morph targets')")
+    faces.wait_for("none.failure?.includes('cannot speak')")
 
 
 @pytest.mark.parametrize(
@@ -401,7 +401,7 @@ def test_the_web_component_shows_a_session_and_keeps_its_sound_in_step(
         "import('/node_modules/kouxing-client/page/playout.js').then(({ Playout }) => {"
         " const { adjust } = Playout.prototype;"
         " Playout.prototype.adjust = function (nowMs) {"
-        "   if (this.isHeard) window.heard = { ...this, count: (window.heard?.count ?? 0) + 1 };"
+        "   if (this.isAudible) window.heard = { ...this, count: (window.heard?.count ?? 0) + 1 };"
         "   adjust.call(this, nowMs); }; })"
     )
     faces.evaluate(
@@ -414,7 +414,7 @@ def test_the_web_component_shows_a_session_and_keeps_its_sound_in_step(
     with speech(system):
         faces.wait_for("most > 200 && widest > 0.1")
         faces.wait_for("probe.clicks.size > 0")  # loud samples leave the page
-        faces.wait_for("heard.pictureMs > 0")  # for so long they wait for their picture
+        faces.wait_for("heard.imageDelayMs > 0")  # the delay of images
         faces.evaluate(
             "window.tick = requestAnimationFrame; window.ticks = [];"
             "window.requestAnimationFrame = (act) => ticks.push(act)"
