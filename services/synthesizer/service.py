@@ -145,15 +145,15 @@ class SynthesizerService(Service):
         """Create a face at rest; a session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
-            session = _Session(start, self._new_face(start), self._input)
-            session.shapes = self._known_settings(start.session, start.face).shapes or []
+            settings = self._known_settings(start.session, start.face)
+            session = _Session(start, self._new_face(start, settings), self._input)
+            session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
         self.session_started(start, to_samples(session.final.time_s))
         return False
 
-    def _new_face(self, start: StartSession) -> FaceAnimator:
-        settings = self._known_settings(start.session, start.face)
+    def _new_face(self, start: StartSession, settings: FaceSettings) -> FaceAnimator:
         face = FaceAnimator(
             load_lip_model(
                 start.facts.language or DEFAULT_LANGUAGE, settings.lips or self._config.lips
@@ -200,19 +200,22 @@ class SynthesizerService(Service):
 
     def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
         """Return the settings without unknown names; report unknown names."""
+        unknown = {settings.lips} - {None, *lip_models()}
+        unknown |= (settings.expressions or {}).keys() - EXPRESSIONS
+        unknown |= {*(settings.shapes or ())} - SHAPE_SETS.keys()
+        if not unknown:
+            return settings
+        text = f"ignored unknown face settings: {', '.join(sorted(map(str, unknown)))}"
+        self.warn(ErrorCode.BAD_FACE, text, session)
+        self.publish_event(EventName.ERROR, session, f"{ErrorCode.BAD_FACE}: {text}")
         strengths = (settings.expressions or {}).items()
-        known = replace(
+        return replace(
             settings,
-            lips=settings.lips if settings.lips in lip_models() else None,
+            lips=None if settings.lips in unknown else settings.lips,
             expressions=settings.expressions
-            and {name: strength for name, strength in strengths if name in EXPRESSIONS},
-            shapes=settings.shapes and [name for name in settings.shapes if name in SHAPE_SETS],
+            and {name: strength for name, strength in strengths if name not in unknown},
+            shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
         )
-        if known != settings:
-            text = f"unknown names in {settings}"
-            self.warn(ErrorCode.BAD_FACE, text, session)
-            self.publish_event(EventName.ERROR, session, f"{ErrorCode.BAD_FACE}: {text}")
-        return known
 
     def on_tick(self, now_s: float) -> None:
         """Acknowledge, lead faces of stalled live streams to rest, drop old frames."""

@@ -13,7 +13,7 @@ from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED, Synthe
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame
+from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port
@@ -64,6 +64,21 @@ def service() -> Iterator[Watched]:
         service.start_session(replace(START, session=name, face=FaceSettings()))
     yield service
     service.bus.close()
+
+
+def test_ignores_and_reports_unknown_face_settings(
+    service: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[tuple[str, ...]] = []
+    monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
+    face = FaceSettings(
+        lips="muscles", expressions={"glee": 1.0, "joy": 0.5}, shapes=["clay", "vrm"]
+    )
+    service._on_set_face(SetFace(session="gap", face=face), Peer())
+    text = "bad-face: ignored unknown face settings: clay, glee, muscles"
+    assert events == [("error", "gap", text)]
+    service.take("gap", 1, 1.0)
+    assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
 
 
 def test_a_gap_does_not_delay_other_sessions(service: Watched) -> None:
