@@ -1,4 +1,4 @@
-"""npz files of plain arrays: what they unpack to is known before anything is unpacked."""
+"""Reads npz files of plain arrays. Their unpacked size is checked before they are unpacked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 MAX_ARRAYS = 1000
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others unpack with much memory
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others need much memory
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
@@ -25,11 +25,11 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
     OSError
         If the file cannot be read.
     ValueError
-        If it is no such file, or holds more than ``max_bytes``.
+        If it is not an npz file of plain arrays, or has more than ``max_bytes``.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        raise ValueError("it is no file")
+        raise ValueError("it is not a file")
     if status.st_size > max_bytes:
         raise ValueError(f"it is larger than {max_bytes // 2**20} MiB")
     try:
@@ -48,13 +48,13 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one array, after its header: it must not ask for more memory than the file has bytes."""
+    """Read one array, if its header asks for no more memory than the file has bytes."""
     if entry.compress_type not in _METHODS:
-        raise ValueError(f"{entry.filename} is packed in an unknown way")
+        raise ValueError(f"{entry.filename} uses an unsupported compression")
     with archive.open(entry) as stream:
         version = npy.read_magic(stream)
         if version not in _HEADERS:
-            raise ValueError(f"{entry.filename} is an array of the unknown version {version}")
+            raise ValueError(f"{entry.filename} is an array of unknown version {version}")
         shape, _, kind = _HEADERS[version](stream)
         if stream.tell() + prod(shape) * kind.itemsize > entry.file_size:
             raise ValueError(f"{entry.filename} is cut off")

@@ -19,40 +19,40 @@ from kouxing.shared.wav_header import read_wav_header
 if TYPE_CHECKING:
     from kouxing.shared.media_file import MediaSound
 
-LOWEST_RATE_HZ = 8_000
-HIGHEST_RATE_HZ = 48_000  # what the wire carries; files above are resampled to it
+MIN_RATE_HZ = 8_000
+MAX_RATE_HZ = 48_000  # of a session; files above are resampled to it
 CLIPPED_LEVEL = 0.999
-CLIPPED_SHARE = 0.01  # of the samples; above it a user is told
+CLIPPED_SHARE = 0.01  # of the samples; the user is warned about more
 Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
-LEAST_MISSING_S = 0.05  # of a file that is called cut off
+MIN_MISSING_S = 0.05  # of a file that is reported as cut off
 _MISSING = re.compile(r"^data : (\d+) \(should be (\d+)\)", re.MULTILINE)
-_NO_LENGTH = 2**31 - 2**16  # a writer to a pipe says so much or more
+_UNKNOWN_LENGTH = 2**31 - 2**16  # writers to pipes state this length or more
 
 
 @dataclass(frozen=True, slots=True)
 class AudioSource:
-    """Audio as it comes: a rate, one or two channels, and blocks of shape ``(n, channels)``."""
+    """Audio as an iterator of blocks, with one or two channels."""
 
     name: str
     sample_rate_hz: int
     num_channels: int
-    duration_s: float | None  # None where the end is not known
+    duration_s: float | None  # None: not known
     blocks: Iterator[Samples]
-    remarks: list[str] = field(default_factory=list)  # what is wrong; complete after the last block
-    is_live: bool = False  # it comes in real time by itself
+    remarks: list[str] = field(default_factory=list)  # problems; complete after the last block
+    is_live: bool = False  # it arrives in real time
 
 
 def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
-    """Open an audio file, or the sound of a video, for reading block by block.
+    """Open an audio file, or the audio of a video, for reading block by block.
 
-    libsndfile reads wav, flac and ogg, FFmpeg all others (mp3, m4a, mp4, webm, ...). Files above
-    48 kHz are resampled to 48 kHz, and channels beyond the second are left out or mixed in.
+    libsndfile reads wav, flac and ogg. FFmpeg reads all others (mp3, m4a, mp4, webm, ...). Files
+    above 48 kHz are resampled to 48 kHz. Channels after the second are dropped or mixed in.
 
     Raises
     ------
     UserError
-        If the file is missing, empty, no audio, below 8 kHz, or (while reading) holds samples
-        that are no numbers.
+        If the file is missing, empty, not audio, or below 8 kHz; while reading, if samples are not
+        finite.
     """
     file = None
     try:
@@ -60,20 +60,20 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
             raise UserError(f"{path}: this is a folder; give an audio file")
         if path.stat().st_size == 0:
             raise UserError(f"{path}: the file is empty")
-        if path.suffix.lower() != ".mp3":  # for which libsndfile writes to the terminal
+        if path.suffix.lower() != ".mp3":  # libsndfile prints messages for it
             file = soundfile.SoundFile(path)
     except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file") from None
+        raise UserError(f"{path}: no such file") from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
     except soundfile.LibsndfileError:
         pass
     if file is None:
         return _open_media(path, block_s)
     if file.frames == 0:
-        raise UserError(f"{path}: the file holds no samples; was the recording cut off?")
+        raise UserError(f"{path}: the file contains no samples; record it again")
     _check_rate(path, file.samplerate)
-    rate_hz = min(file.samplerate, HIGHEST_RATE_HZ)
+    rate_hz = min(file.samplerate, MAX_RATE_HZ)
     remarks: list[str] = []
     return AudioSource(
         name=path.name,
@@ -86,17 +86,15 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
 
 
 def _check_rate(path: Path, rate_hz: int) -> None:
-    if rate_hz < LOWEST_RATE_HZ:
-        raise UserError(
-            f"{path}: {rate_hz} Hz is too low for speech; give {LOWEST_RATE_HZ} Hz or more"
-        )
+    if rate_hz < MIN_RATE_HZ:
+        raise UserError(f"{path}: {rate_hz} Hz is too low for speech; use {MIN_RATE_HZ} Hz or more")
 
 
 def _open_media(path: Path, block_s: float) -> AudioSource:
-    """Open what libsndfile does not read."""
-    from kouxing.shared.media_file import open_media  # noqa: PLC0415 - 0.1 s; few files need it
+    """Open a file that libsndfile cannot read."""
+    from kouxing.shared.media_file import open_media  # noqa: PLC0415 - takes 0.1 s, and few files need it
 
-    sound = open_media(path, HIGHEST_RATE_HZ, 2)
+    sound = open_media(path, MAX_RATE_HZ, 2)
     remarks: list[str] = []
     _check_rate(path, sound.sample_rate_hz)
     return AudioSource(
@@ -112,24 +110,24 @@ def _open_media(path: Path, block_s: float) -> AudioSource:
 def _media_blocks(
     path: Path, sound: MediaSound, size: int, remarks: list[str]
 ) -> Iterator[Samples]:
-    """Cut the sound anew into blocks of a size; the last one is shorter."""
+    """Cut the audio into blocks of one size; the last block may be shorter."""
     rest: list[Samples] = []
-    num_waiting = num_read = 0
+    num_rest = num_read = 0
     for piece in sound.blocks:
         if not np.isfinite(piece).all():
             raise UserError(f"{path}: NaN or infinite samples; export the file again")
         rest.append(np.clip(piece, -1.0, 1.0))
-        num_waiting += len(piece)
+        num_rest += len(piece)
         num_read += len(piece)
-        if num_waiting >= size:
+        if num_rest >= size:
             samples = np.concatenate(rest)
-            whole = num_waiting - num_waiting % size
+            whole = num_rest - num_rest % size
             yield from np.split(samples[:whole], whole // size)
-            rest, num_waiting = [samples[whole:]], num_waiting - whole
-    if num_waiting:
+            rest, num_rest = [samples[whole:]], num_rest - whole
+    if num_rest:
         yield np.concatenate(rest)
     if num_read == 0:
-        raise UserError(f"{path}: the file holds no samples; was the recording cut off?")
+        raise UserError(f"{path}: the file contains no samples; record it again")
     if sound.duration_s is not None:
         remarks += _missing(path, num_read / sound.sample_rate_hz, sound.duration_s)
 
@@ -147,35 +145,34 @@ def read_audio(path: Path) -> tuple[Samples, int]:
 
 
 def num_clipped(samples: Samples) -> int:
-    """Return how many samples are at full scale."""
+    """Return the number of samples at full scale."""
     return int(np.count_nonzero(np.abs(samples) >= CLIPPED_LEVEL))
 
 
 def clipping_remarks(name: str, share: float) -> list[str]:
-    """Return what to tell the user if so large a share of the samples is clipped."""
+    """Return a remark for the user if too large a share of the samples is clipped."""
     if share <= CLIPPED_SHARE:
         return []
     return [f"{name}: {share:.0%} of the samples are clipped; record at a lower level"]
 
 
 def raw_audio(stream: IO[bytes], sample_rate_hz: int, num_channels: int) -> AudioSource:
-    """Read little-endian int16 samples from a pipe; a WAV header says how they are instead.
+    """Read little-endian int16 samples from a pipe, or the format that a WAV header states.
 
     Raises
     ------
     UserError
-        If the header states another encoding than 16-bit integers or 32-bit floats, a rate below
-        8 kHz or above 48 kHz, or more than two channels.
+        If the header states an encoding, a rate or a number of channels that is not supported.
     """
     rest = stream.read(2 * num_channels * sample_rate_hz // 50)
     header = read_wav_header(rest)
     kind, scale = "<i2", 1 / 32768
     if header is not None:
         sample_rate_hz, num_channels = header.sample_rate_hz, header.num_channels
-        if not LOWEST_RATE_HZ <= sample_rate_hz <= HIGHEST_RATE_HZ or num_channels not in (1, 2):
+        if not MIN_RATE_HZ <= sample_rate_hz <= MAX_RATE_HZ or num_channels not in (1, 2):
             raise UserError(
-                f"the WAV header says {sample_rate_hz} Hz and {num_channels} channels; expected "
-                f"{LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ} Hz and 1 or 2"
+                f"the WAV header states {sample_rate_hz} Hz and {num_channels} channels; use "
+                f"{MIN_RATE_HZ} to {MAX_RATE_HZ} Hz and 1 or 2 channels"
             )
         if header.encoding == "f32le":
             kind, scale = "<f4", 1.0
@@ -232,14 +229,14 @@ def _file_blocks(
 
 
 def _cut_off(file: soundfile.SoundFile, path: Path, num_read: int) -> list[str]:
-    """Return a remark if the file says that it is longer than it is."""
+    """Return a remark if the file is shorter than its header states."""
     num_stated = file.frames
-    if (match := _MISSING.search(file.extra_info)) and int(match[1]) < _NO_LENGTH:
+    if (match := _MISSING.search(file.extra_info)) and int(match[1]) < _UNKNOWN_LENGTH:
         num_stated = int(match[1]) * num_read // int(match[2])
     return _missing(path, num_read / file.samplerate, num_stated / file.samplerate)
 
 
 def _missing(path: Path, read_s: float, stated_s: float) -> list[str]:
-    if stated_s < read_s + LEAST_MISSING_S:
+    if stated_s < read_s + MIN_MISSING_S:
         return []
-    return [f"{path}: the file is cut off: {read_s:.1f} s of {stated_s:.1f} s are there"]
+    return [f"{path}: the file is cut off after {read_s:.1f} s of {stated_s:.1f} s"]

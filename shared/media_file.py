@@ -1,4 +1,4 @@
-"""Media files of any format that FFmpeg knows (m4a, mp4, webm, mkv, mov), above all their sound."""
+"""The audio of media files in any format that FFmpeg reads: m4a, mp4, webm, mkv, mov."""
 
 from __future__ import annotations
 
@@ -14,47 +14,38 @@ from numpy.typing import NDArray
 from kouxing.shared.errors import UserError
 
 _MAX_STREAMS = 64
-# What a file itself may hold, and nothing that it names elsewhere: no network, no playlist's files.
+# Read only the file itself: no network, and no files that a playlist names.
 _OPTIONS = {"protocol_whitelist": "file"}
 
 
 @dataclass(frozen=True, slots=True)
 class MediaSound:
-    """The first sound track of a media file."""
+    """The first audio track of a media file."""
 
     sample_rate_hz: int
     num_channels: int
-    duration_s: float | None  # as the file tells it
+    duration_s: float | None  # as the file states it
     blocks: Iterator[NDArray[np.float32]]  # (n, channels), until the end
 
 
 def open_media(path: Path, max_rate_hz: int, max_channels: int) -> MediaSound:
-    """Open the sound of a media file for reading piece by piece.
-
-    Parameters
-    ----------
-    path
-        The file.
-    max_rate_hz
-        Faster sound is resampled to this rate.
-    max_channels
-        1 or 2: more channels are mixed down.
+    """Open the audio of a media file, with a limited rate and 1 or 2 channels.
 
     Raises
     ------
     UserError
-        If FFmpeg does not know the file, or it has no sound; while reading, if it is damaged.
+        If FFmpeg cannot read the file or it has no audio; while reading, if the file is damaged.
     """
     try:
         container = av.open(path, options=_OPTIONS)
     except (av.error.FFmpegError, OSError, ValueError) as error:
         raise UserError(
-            f"{path}: this is no audio that can be read ({_reason(error)}); give wav, flac, mp3, "
+            f"{path}: cannot read audio from this file ({_reason(error)}); use wav, flac, mp3, "
             "m4a, mp4, webm or ogg"
         ) from None
     if not container.streams.audio or len(container.streams) > _MAX_STREAMS:
         container.close()
-        raise UserError(f"{path}: there is no sound in it")
+        raise UserError(f"{path}: the file has no audio")
     stream = container.streams.audio[0]
     rate_hz = min(stream.rate, max_rate_hz)
     num_channels = min(max_channels, stream.channels)
@@ -72,20 +63,14 @@ def open_media(path: Path, max_rate_hz: int, max_channels: int) -> MediaSound:
 
 
 def check_video(path: Path) -> None:
-    """See whether a file is a video with sound.
-
-    Raises
-    ------
-    UserError
-        If it is not.
-    """
+    """Raise ``UserError`` if a file is not a video with audio."""
     try:
         with av.open(path, options=_OPTIONS) as container:
             has_both = bool(container.streams.video and container.streams.audio)
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise UserError(f"{path}: this is no video that can be read ({_reason(error)})") from None
+        raise UserError(f"{path}: cannot read this as a video ({_reason(error)})") from None
     if not has_both:
-        raise UserError(f"{path}: it needs pictures and sound")
+        raise UserError(f"{path}: the video must have pictures and audio")
 
 
 def _blocks(

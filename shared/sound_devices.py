@@ -1,4 +1,4 @@
-"""Microphones, and what this machine plays: sound that comes in real time, without end."""
+"""Live audio from microphones, and from outputs and programs of this machine."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from kouxing.shared.audio_file import AudioSource, Samples, raw_audio
 from kouxing.shared.errors import UserError
 
 _RATE_HZ = 16_000
-_LATENCY_MS = 20  # of what is recorded of other programs
-_ANSWER_LIMIT_S = 5.0  # of the sound server
+_LATENCY_MS = 20  # of recordings of outputs and programs
+_TIMEOUT_S = 5.0
 _NO_SOUND_SERVER = (
-    "what this machine plays is recorded by PulseAudio or PipeWire, which does not answer; type: "
-    "sudo apt install pulseaudio-utils. Elsewhere install a loopback device, such as BlackHole "
-    "(macOS) or VB-CABLE (Windows), and name it: kouxing speak mic --device BlackHole"
+    "recording what this machine plays needs PulseAudio or PipeWire, which does not answer; type: "
+    "sudo apt install pulseaudio-utils. On macOS or Windows install a loopback device, such as "
+    "BlackHole or VB-CABLE, and select it: kouxing speak mic --device BlackHole"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class SoundDevice:
-    """Something whose sound can be spoken."""
+    """A source of live audio."""
 
-    kind: str  # mic, monitor (all that an output plays) or program (what one program plays)
+    kind: str  # mic, monitor (everything that an output plays) or program
     name: str
-    target: str = ""  # how the sound server calls it, if it is no microphone
+    target: str = ""  # parec's option for it; empty for a microphone
 
 
 def sound_devices() -> list[SoundDevice]:
-    """Return all devices; those that cannot be asked for are left out."""
+    """Return all devices, without kinds that this machine does not support."""
     devices: list[SoundDevice] = []
     for list_kind in (_microphones, _monitors):
         try:
@@ -46,12 +46,12 @@ def sound_devices() -> list[SoundDevice]:
 
 
 def microphone(name: str = "") -> AudioSource:
-    """Read a microphone until interrupted: the default one, or whose name has this part.
+    """Read the default microphone, or the one whose name contains ``name``, until interrupted.
 
     Raises
     ------
     UserError
-        If the system has no sound library, no microphone or none of that name.
+        If the sound library or the microphone is missing.
     """
     sounddevice = _sound_library()
     if name:
@@ -67,7 +67,7 @@ def microphone(name: str = "") -> AudioSource:
             callback=lambda data, *_: recorded.put(data.copy()),
         )
     except (sounddevice.PortAudioError, ValueError) as error:
-        raise UserError(f"no microphone can be opened: {error}") from None
+        raise UserError(f"cannot open the microphone: {error}") from None
 
     def blocks() -> Iterator[Samples]:
         with stream:
@@ -78,17 +78,17 @@ def microphone(name: str = "") -> AudioSource:
 
 
 def monitor(name: str = "") -> AudioSource:
-    """Read what this machine plays until interrupted, or until the program that plays it ends.
+    """Record what this machine plays until interrupted, or until the recorded program ends.
 
     Parameters
     ----------
     name
-        Part of the name of an output or of a program; empty: the default output.
+        Part of the name of an output or a program; empty: the default output.
 
     Raises
     ------
     UserError
-        If there is no sound server, or nothing of that name.
+        If the sound server, the output or the program is missing.
     """
     devices = _monitors()
     device = _choose(name, devices) if name else None
@@ -100,17 +100,17 @@ def monitor(name: str = "") -> AudioSource:
 
     def blocks() -> Iterator[Samples]:
         with (
-            tempfile.TemporaryFile() as told,
-            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=told) as parec,  # noqa: S603 - no shell
+            tempfile.TemporaryFile() as errors,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors) as parec,  # noqa: S603 - no shell
         ):
             try:
-                has_come = False
+                has_audio = False
                 for block in raw_audio(parec.stdout, _RATE_HZ, 1).blocks:  # type: ignore[arg-type]
-                    has_come = True
+                    has_audio = True
                     yield block
-                if not has_come:
-                    told.seek(0)
-                    raise UserError(f"nothing can be recorded: {told.read().decode().strip()}")
+                if not has_audio:
+                    errors.seek(0)
+                    raise UserError(f"cannot record: {errors.read().decode().strip()}")
             finally:
                 parec.terminate()
 
@@ -121,7 +121,7 @@ def monitor(name: str = "") -> AudioSource:
 
 def _sound_library() -> ModuleType:
     try:
-        import sounddevice  # noqa: PLC0415 - fails to import where PortAudio is missing
+        import sounddevice  # noqa: PLC0415 - fails to import without PortAudio
     except OSError:
         raise UserError(
             "the microphone needs the PortAudio library; type: sudo apt install libportaudio2"
@@ -130,26 +130,22 @@ def _sound_library() -> ModuleType:
 
 
 def _microphones() -> list[SoundDevice]:
-    inputs = (each for each in _sound_library().query_devices() if each["max_input_channels"])
-    return [SoundDevice("mic", each["name"]) for each in inputs]
+    devices = _sound_library().query_devices()
+    return [
+        SoundDevice("mic", device["name"]) for device in devices if device["max_input_channels"]
+    ]
 
 
 def _monitors() -> list[SoundDevice]:
-    """Ask the sound server for its outputs, and for the programs that play something now.
-
-    Raises
-    ------
-    UserError
-        If there is none.
-    """
+    """Return the sound server's outputs and the programs that play audio now."""
     outputs = [
         SoundDevice("monitor", source["description"], f"--device={source['name']}")
-        for source in _ask_sound_server("sources")
+        for source in _list_from_sound_server("sources")
         if source["properties"].get("device.class") == "monitor"
     ]
     programs = [
         SoundDevice("program", _program(playing), f"--monitor-stream={playing['index']}")
-        for playing in _ask_sound_server("sink-inputs")
+        for playing in _list_from_sound_server("sink-inputs")
     ]
     return outputs + programs
 
@@ -159,20 +155,20 @@ def _program(playing: dict[str, Any]) -> str:
     return name
 
 
-def _ask_sound_server(what: str) -> list[dict[str, Any]]:
+def _list_from_sound_server(kind: str) -> list[dict[str, Any]]:
     try:
-        command = ["pactl", "--format=json", "list", what]
-        answer = subprocess.run(command, capture_output=True, check=True, timeout=_ANSWER_LIMIT_S)  # noqa: S603 - no shell
-        found: list[dict[str, Any]] = json.loads(answer.stdout)
+        command = ["pactl", "--format=json", "list", kind]
+        answer = subprocess.run(command, capture_output=True, check=True, timeout=_TIMEOUT_S)  # noqa: S603 - no shell
+        entries: list[dict[str, Any]] = json.loads(answer.stdout)
     except (OSError, subprocess.SubprocessError, ValueError):
         raise UserError(_NO_SOUND_SERVER) from None
-    return found
+    return entries
 
 
 def _choose(name: str, devices: list[SoundDevice]) -> SoundDevice:
-    """Return the first device whose name has a part, in any case."""
+    """Return the first device whose name contains a text, ignoring case."""
     for device in devices:
         if name.lower() in device.name.lower():
             return device
-    names = ", ".join(repr(device.name) for device in devices) or "none at all"
-    raise UserError(f"no device is called {name!r}; there are {names}")
+    names = ", ".join(repr(device.name) for device in devices) or "nothing"
+    raise UserError(f"no device is called {name!r}; this machine has {names}")

@@ -118,7 +118,7 @@ def _phone_lines(
             confidence=message.confidence,
             final=message.final,
         )
-        changed = track.accept(phone) if shown is Shown.SYLLABLES else [phone]
+        changed = track.update(phone) if shown is Shown.SYLLABLES else [phone]
         for item in changed:
             text = item.symbol if isinstance(item, events.Phone) else item.text
             if item.final and item.duration_s > 0 and text != inventory.silence:

@@ -316,7 +316,7 @@ class GatewayService(Service):
             final=phone.final,
         )
         self._viewers.forward(phone.session, MessageKind.TEXT, message)
-        for syllable in self._sessions[phone.session].syllables.accept(phone_of(phone)):
+        for syllable in self._sessions[phone.session].syllables.update(phone_of(phone)):
             message = wire.text(
                 "syllable",
                 index=syllable.index,

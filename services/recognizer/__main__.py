@@ -1,4 +1,4 @@
-"""Runs a recognizer as a process of its own."""
+"""Runs a recognizer in its own process."""
 
 from kouxing.services.process import run_module
 

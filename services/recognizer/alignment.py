@@ -1,10 +1,10 @@
 """Forced alignment: the times of the phones of a known text.
 
-The best path of the recognizer's own model through the text's phones, with optional pauses at
-syllable boundaries (Li et al. 2011, section 3.2, scheme 1, used HTK for this).
+The alignment is the acoustic model's best path through the text's phones, with optional pauses at
+syllable boundaries. Li et al. 2011, section 3.2, scheme 1, used HTK for this.
 
-The path is found for any text. How well the text fits, its *fit*, tells whether it is what was
-said: what the path loses against the best phone of every frame, of what an average phone loses.
+There is a path for any text. Its *fit* shows whether the text was spoken: one minus the score that
+the path loses to the best phone of every frame, relative to the loss of an average phone.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
-# Calibrated with the block model on the corpus' dev sentences and conversation: see
-# docs/recognition.md.
+# Calibrated with the block model on dev sentences and conversation; see docs/recognition.md.
 MIN_FIT = 0.85
 
 
@@ -40,19 +39,19 @@ MIN_FIT = 0.85
 class Alignment:
     """A text in a recording."""
 
-    phones: list[Phone]  # all phones and the pauses, in order, from the beginning to the end
-    fit: float  # 1: the phones are the best ones everywhere; 0: any others fit as well
+    phones: list[Phone]  # all phones and pauses in order, from start to end
+    fit: float  # 1: every phone is the best one; 0: any other phones fit as well
 
     @property
     def fits(self) -> bool:
-        """Whether the text is likely what was said."""
+        """Whether the text was probably spoken."""
         return self.fit >= MIN_FIT
 
 
 def align_text(
     model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int, text: str
 ) -> list[Phone]:
-    """Find the onset and duration of each phone of a text.
+    """Find the onset and duration of each phone and pause of a text.
 
     Parameters
     ----------
@@ -61,23 +60,18 @@ def align_text(
     samples
         Shape (n,) or (n, channels), in [-1, 1].
     sample_rate_hz
-        Their rate, 8000 to 48000.
+        Rate of the samples, 8000 to 48000.
     text
-        What is spoken, in a spelling that the model's language reads.
-
-    Returns
-    -------
-    list of Phone
-        All phones and the pauses (silence) in order, from the beginning to the end.
+        The spoken words, in a spelling that the model's language can read.
 
     Raises
     ------
     UserError
-        If the text is empty or cannot be read, or the recording is too short for it.
+        If the text is empty or unreadable, or the recording is too short for the text.
     """
     syllables = model.inventory.pronounce(text)
     if not syllables:
-        raise UserError("the text is empty; give the words that are spoken")
+        raise UserError("the text is empty; enter the spoken words")
     return align_phones(model, samples, sample_rate_hz, syllables)
 
 
@@ -97,7 +91,7 @@ def align_syllables(
     sample_rate_hz: int,
     syllables: Sequence[Syllable],
 ) -> Alignment:
-    """Like :func:`align_phones`, with how well they fit."""
+    """Like :func:`align_phones`, with the fit."""
     inventory, topology = model.inventory, model.topology
     frames = model.create_front_end().accept_waveform(to_16_khz(samples, sample_rate_hz))
     scores = score_segment(model, frames)
@@ -114,14 +108,14 @@ def align_syllables(
         path, _ = viterbi_path(on_graph, graph, topology.log_stay, topology.log_leave)
     if len(path) == 0:
         raise UserError(
-            f"{len(frames) * HOP_S:.2f} s of sound are too short for "
-            f"{sum(map(len, syllables))} phones; check that text and recording belong together"
+            f"{len(frames) * HOP_S:.2f} s of audio are too short for "
+            f"{sum(map(len, syllables))} phones; check that the text belongs to the recording"
         )
     best_of_phones = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
     phones: list[Phone] = []
     for segment in segments_of_path(path, graph):
         onset_s = frame_time_s(segment.start)
-        # posterior of the phone, had any one phone filled these frames
+        # posterior of the phone, if one phone fills these frames
         evidence = best_of_phones[segment.start : segment.end].sum(axis=0, dtype=np.float64)
         likelihood = np.exp(evidence - evidence.max())
         phones.append(
@@ -146,7 +140,7 @@ def _fit(
 ) -> float:
     """Compare a path's states with the best phone of each frame, (frames, phones).
 
-    Frames that are silent by path and sound are left out, so that pauses hide nothing.
+    Frames that are silent in the path and in the audio are excluded, so that pauses do not count.
     """
     lost = best_of_phones.max(axis=1) - scores[np.arange(len(path)), graph.states[path]]
     lost_on_average = best_of_phones.max(axis=1) - best_of_phones.mean(axis=1)
@@ -159,20 +153,18 @@ def _fit(
 
 
 def spoken(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Phone]:
-    """Return the phones without the pauses."""
+    """Return the phones without pauses."""
     return [phone for phone in phones if phone.symbol != inventory.silence]
 
 
 def timed_syllables(
     phones: Sequence[Phone], transcript: Transcript, inventory: PhoneInventory
 ) -> list[TimedSyllable]:
-    """Return the syllables of a text at the times of its aligned phones."""
+    """Return the syllables of a text with the times of its aligned phones."""
     rest = iter(spoken(phones, inventory))
     timed = []
     for syllable in transcript.syllables:
-        own = list(islice(rest, len(syllable.phones)))
-        end_s = own[-1].onset_s + own[-1].duration_s
-        timed.append(
-            TimedSyllable(syllable.text, syllable.spelling, own[0].onset_s, end_s - own[0].onset_s)
-        )
+        aligned = list(islice(rest, len(syllable.phones)))
+        onset_s, end_s = aligned[0].onset_s, aligned[-1].onset_s + aligned[-1].duration_s
+        timed.append(TimedSyllable(syllable.text, syllable.spelling, onset_s, end_s - onset_s))
     return timed

@@ -128,7 +128,7 @@ class LipPredictor:
 
     @cached_property
     def digest(self) -> bytes:
-        """SHA-256 of the weights; a mouth profile names its model by it."""
+        """SHA-256 of the weights, which a mouth profile contains."""
         hasher = hashlib.sha256()
         for field in fields(self):
             hasher.update(getattr(self, field.name).tobytes())

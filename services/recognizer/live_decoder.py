@@ -3,11 +3,11 @@
 Source: Li et al. 2011, sections 1 and 2.2.
 
 The shortest delay from a phone's onset to its first hypothesis is
-25 ms window + L * 10 ms + (N - 1) * 10 ms, where L is the acoustic model's look-ahead in frames and
-N is ``num_stable_frames``: 35 ms with L = 1 and N = 1. A neural model scores two frames at a time,
-so half of the frames come 10 ms sooner. The paper has N = 3 and differences that look 40 ms ahead,
-so its delay is 85 ms; it ignores the window and the look-ahead and states 45 ms. When speech
-starts, the VAD adds up to 32 ms. For input above 16 kHz, the resampler adds 2 ms.
+25 ms window + L * 10 ms + (N - 1) * 10 ms. L is the acoustic model's look-ahead in frames, and N is
+``num_stable_frames``. With L = 1 and N = 1, it is 35 ms. A neural model scores two frames at a
+time, so half of the frames come 10 ms sooner. When speech starts, the VAD adds up to 32 ms. For
+input above 16 kHz, the resampler adds 2 ms. The paper has N = 3 and differences that look 40 ms
+ahead, so its delay is 85 ms. It states 45 ms, without the differences.
 """
 
 from __future__ import annotations

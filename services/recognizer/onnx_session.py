@@ -1,4 +1,4 @@
-"""Networks are opened in one place: ONNX files, run by onnxruntime on one thread."""
+"""Opens ONNX files with onnxruntime, on one thread."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import onnxruntime
 
 
 def open_network(file: bytes) -> Any:
-    """Return the ``onnxruntime.InferenceSession`` of an ONNX file; its errors have no base."""
+    """Return an ``onnxruntime.InferenceSession``; its errors have no common base class."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.enable_cpu_mem_arena = False  # it keeps what the largest batch took, 2.4 MB a session
+    options.enable_cpu_mem_arena = False  # an arena would keep 2.4 MB per session
     return onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])

@@ -21,7 +21,7 @@ from kouxing.services.recognizer.speech_scorer import score_streams
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
-_WARM_UP_ROWS = 200  # of equal scores: they keep so many paths alive that the search drops records
+_WARM_UP_ROWS = 200  # of equal scores: enough live paths for the search to drop records
 
 
 class Recognizer:
@@ -68,8 +68,8 @@ class Recognizer:
         lips
             Predicts lip frames; the acoustic model must have positions. None: no lip frames.
         face_delay_s
-            How much later than its audio a frame of the face is made. The lip frames have the
-            longest delay that is in time for it.
+            Delay of the face behind the audio. The lip frames get the longest delay that is in
+            time for the face.
         speech_time
             Media time at which current speech started, samples at 16 kHz, if another recognizer
             processed its start. The networks' blocks then align with those of the other one.

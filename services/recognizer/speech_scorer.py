@@ -2,7 +2,7 @@
 
     samples -> VAD, front end -> [speech only] acoustic model -> events
 
-Time is media time, counted from the first sample of the scorer. Feature frame ``t`` stands for the
+Time is media time, counted from the first sample of the scorer. Feature frame ``t`` covers the
 10 ms around the middle of its window. Any chunking of the same audio gives the same result, because
 every step processes whole frames and whole VAD blocks, in order.
 """

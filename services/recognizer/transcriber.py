@@ -1,7 +1,7 @@
-"""Speech to text: the words of a sound, where nobody gives them.
+"""Speech to text, for audio without a transcript.
 
-What a lip model is told with its text, it can have from any speech recogniser behind
-``Transcriber``. The one here is sherpa-onnx, with a model that the user names.
+Any speech recognizer can implement ``Transcriber``. This module uses sherpa-onnx with a model that
+the user provides.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from kouxing.shared.errors import UserError, install_command
 
 
 class Transcriber(Protocol):
-    """Any speech recogniser."""
+    """Any speech recognizer."""
 
     def transcribe(self, samples: NDArray[np.float32]) -> str:
-        """Return what is said in a sound, 16 kHz mono, shape (n,); empty if nothing is."""
+        """Return the text of audio, 16 kHz mono, shape (n,); empty without speech."""
 
 
 class SherpaTranscriber:
@@ -29,15 +29,14 @@ class SherpaTranscriber:
     Parameters
     ----------
     folder
-        As sherpa-onnx gives models away: ``tokens.txt``, and either an encoder, a decoder and a
-        joiner (a transducer), or one model, of the kind that the folder's name tells:
-        ``paraformer`` or ``sense-voice``. Of several files the smallest is taken, which is the one
-        with 8-bit weights.
+        A model as sherpa-onnx distributes it: ``tokens.txt``, and either encoder, decoder and
+        joiner (a transducer), or one model in a folder whose name contains ``paraformer`` or
+        ``sense-voice``. Of several files, the smallest is used, which has 8-bit weights.
 
     Raises
     ------
     UserError
-        If sherpa-onnx is not installed, or the folder holds no such model, or a damaged one.
+        If sherpa-onnx is not installed, or the folder does not contain a valid model.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,7 +46,7 @@ class SherpaTranscriber:
             raise UserError(f"{folder}: sherpa-onnx cannot load the model: {error}") from None
 
     def transcribe(self, samples: NDArray[np.float32]) -> str:
-        """Return what is said in a sound, 16 kHz mono, shape (n,); empty if nothing is."""
+        """Return the text of audio, 16 kHz mono, shape (n,); empty without speech."""
         stream = self._recognizer.create_stream()
         stream.accept_waveform(MEDIA_RATE_HZ, samples)
         self._recognizer.decode_stream(stream)
@@ -64,7 +63,7 @@ def _recognizer_in(folder: Path) -> Any:
     tokens = folder / "tokens.txt"
     parts = {name: _model_in(folder, name) for name in ("encoder", "decoder", "joiner", "model")}
     if not tokens.is_file():
-        raise UserError(f"{folder} holds no tokens.txt; name the folder of a sherpa-onnx model")
+        raise UserError(f"{folder} contains no tokens.txt; give the folder of a sherpa-onnx model")
     given = {"tokens": str(tokens), "num_threads": 1}
     if parts["encoder"] and parts["decoder"] and parts["joiner"]:
         names = ("encoder", "decoder", "joiner")
@@ -74,12 +73,12 @@ def _recognizer_in(folder: Path) -> Any:
     if parts["model"] and "sense-voice" in folder.name:
         return OfflineRecognizer.from_sense_voice(**given, model=parts["model"], language="zh")
     raise UserError(
-        f"{folder} holds no model of a known kind; name the folder of a sherpa-onnx transducer, "
-        "or one whose name has 'paraformer' or 'sense-voice' in it"
+        f"{folder} contains no model of a known kind; give the folder of a sherpa-onnx transducer, "
+        "or one whose name contains 'paraformer' or 'sense-voice'"
     )
 
 
 def _model_in(folder: Path, name: str) -> str | None:
-    """Return the smallest file of a name, which may go on after it."""
-    found = sorted(folder.glob(f"{name}*.onnx"), key=lambda path: path.stat().st_size)
-    return str(found[0]) if found else None
+    """Return the smallest file whose name starts with a name."""
+    paths = sorted(folder.glob(f"{name}*.onnx"), key=lambda path: path.stat().st_size)
+    return str(paths[0]) if paths else None

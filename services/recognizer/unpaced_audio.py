@@ -1,4 +1,4 @@
-"""Audio of sessions that are not paced. It waits until live audio leaves time for it."""
+"""Audio of sessions that are not paced. It waits while there is live audio to decode."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Languages as values: phone inventories, their lexicons and visemes, and timed phones."""
+"""Languages (phone inventories, lexicons and visemes) and timed phones."""

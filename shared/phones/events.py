@@ -1,4 +1,4 @@
-"""What a recognizer tells about a sound as it comes: phones, lips, voice activity, level.
+"""A recognizer's live results: phones, lip frames, voice activity, level.
 
 Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
 """
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Phone:
-    """One recognised phone.
+    """One recognized phone.
 
     A live recognizer emits the same ``index`` at least twice: first with an estimated duration
-    (``final`` false), then with the measured onset and duration (``final`` true). A phone that
-    proves one too many is withdrawn: it comes last as silence without duration.
+    (``final`` false), then with the measured onset and duration (``final`` true). A surplus phone
+    is withdrawn: its last emission is silence without duration.
     """
 
     index: int  # counts the phones of a session from 0
@@ -29,16 +29,16 @@ class Phone:
 
     @property
     def is_withdrawn(self) -> bool:
-        """Whether there was no such phone after all."""
+        """Whether the phone was emitted by mistake."""
         return self.final and self.duration_s == 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LipFrame:
-    """The mouth as the sound itself tells it."""
+    """The mouth as predicted from the audio."""
 
     time_s: float  # seconds from the session's first sample
-    delay_s: float  # the sound was known up to time_s + delay_s; below 0: it is foretold
+    delay_s: float  # audio was known up to time_s + delay_s; negative: a forecast
     faps: NDArray[np.float32]  # (28,) FAP units, in the order of MOUTH_FAPS; 0 where not tracked
     closure: float  # probability that the lips touch, 0 to 1
     lip_to_teeth: float  # probability that the lower lip touches the teeth, 0 to 1
@@ -46,7 +46,7 @@ class LipFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeechChange:
-    """Voice activity began or ended."""
+    """Voice activity started or ended."""
 
     active: bool
     time_s: float  # seconds from the session's first sample
@@ -54,17 +54,17 @@ class SpeechChange:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """The sound is known up to ``time_s``: nothing that ended before it will still be emitted."""
+    """Audio is processed up to ``time_s``; no later phone ends before that."""
 
     time_s: float
     level_db: float  # RMS of the newest 20 ms, full scale = 0
-    zero_crossing_rate: float = 0.0  # sign changes a sample in the newest 20 ms, 0 to 1
-    pitch_hz: float = 0.0  # of the voice there; 0: it has none
+    zero_crossing_rate: float = 0.0  # sign changes per sample in the newest 20 ms, 0 to 1
+    pitch_hz: float = 0.0  # in the newest 20 ms; 0: unvoiced
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndOfSound:
-    """No more sound will come."""
+    """The audio has ended."""
 
     time_s: float
 

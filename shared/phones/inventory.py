@@ -1,25 +1,27 @@
-"""The phones of a language: one value, made from the tables in the language's own folder.
+"""The phones of a language, loaded from the language's package.
 
-A language is a Python package with ``phones.tsv`` and a function ``pronounce``. A function
-``transcribe`` may tell more: a text's syllables with their spelling, and what it cannot read. A
-pattern ``READABLE`` may say which stretches of a line of text to pronounce; without it, words
-between spaces. A function ``spell`` may write a syllable's phones as its readers do; without it,
-the symbols in a row. ``CODE`` may be the language's two letters in ISO 639-1, by which recordings
-name it. The languages that come with kouxing are listed in ``BUILT_IN``; any installed distribution
-adds one by an entry point of the group ``kouxing.languages`` (its name is the language's, its value
-the package).
+A language is a Python package with ``phones.tsv`` and a function ``pronounce``. It may also have:
 
-``phones.tsv`` has one phone a row, in the order of the acoustic models' outputs:
+- ``transcribe``, a function that returns a text's syllables with their spelling, and the parts that
+  it cannot read
+- ``READABLE``, a pattern for the parts of a line of text to pronounce; by default words
+- ``spell``, a function that spells a syllable's phones; by default the symbols in a row
+- ``CODE``, the ISO 639-1 code that recordings use for the language
+
+``BUILT_IN`` lists the languages of kouxing. An installed distribution adds a language with an entry
+point in the group ``kouxing.languages``: the language's name, and the package.
+
+``phones.tsv`` has one phone per row, in the order of the acoustic models' outputs:
 
 =============== ===================================================================================
 column          meaning
 =============== ===================================================================================
 phone           symbol, 1 to 4 lower-case letters
-kind            ``initial`` (a consonant that begins a syllable), ``vowel`` (a syllable's vowel with
-                what follows it) or ``silence`` (exactly one row)
-visemes         the mouth shapes the phone goes through, ``name:share`` separated by spaces; the
-                shares of its duration add up to 1
-before_rounded  the phone's viseme before a rounded one, if it has another there; may be empty
+kind            ``initial`` (a consonant that begins a syllable), ``vowel`` (the rest of a syllable)
+                or ``silence`` (exactly one row)
+visemes         the phone's mouth shapes in order, ``name:share`` separated by spaces; the shares of
+                its duration add up to 1
+before_rounded  the phone's viseme before a rounded one, if different; may be empty
 =============== ===================================================================================
 """
 
@@ -52,35 +54,37 @@ VisemeShares = tuple[tuple[str, float], ...]  # (viseme, share of the phone's du
 
 @dataclass(frozen=True, kw_only=True)
 class PhoneInventory:
-    """A language as everything outside its folder sees it.
+    """The phones, visemes and lexicon of a language.
 
     Raises
     ------
     UserError
-        If the phones do not make an inventory.
+        If the phones or visemes are not valid.
     """
 
     language: str
     phones: tuple[str, ...]  # (num_phones,) in the order of the acoustic models' outputs
     kinds: tuple[str, ...]  # (num_phones,) of KINDS
     visemes: dict[str, VisemeShares]  # by phone
-    before_rounded: dict[str, str]  # viseme of a phone before a rounded one, where it has another
+    before_rounded: dict[str, str]  # different viseme of a phone before a rounded one
     pronounce: Callable[[str], list[Syllable]]  # text to syllables of phones; the lexicon
-    transcribe: Callable[[str], Transcript] | None = None  # as pronounce, with the spelling
-    readable: re.Pattern[str] = _WORDS  # finds the stretches of a line that may be pronounced
-    spell: Callable[[Syllable], str] = "".join  # the phones of a syllable to its spelling
-    code: str = ""  # ISO 639-1, "zh"; empty: recordings are never in this language
+    transcribe: Callable[[str], Transcript] | None = None  # like pronounce, with the spelling
+    readable: re.Pattern[str] = _WORDS  # finds the parts of a line to pronounce
+    spell: Callable[[Syllable], str] = "".join  # phones of a syllable to its spelling
+    code: str = ""  # ISO 639-1, such as "zh"; empty: no recordings have it
 
     def __post_init__(self) -> None:
         wrong = [phone for phone in self.phones if not _SYMBOL.fullmatch(phone)]
         if wrong or len(set(self.phones)) != len(self.phones):
-            raise UserError(f"language {self.language}: phones are distinct, 1 to 4 letters a-z")
+            raise UserError(
+                f"language {self.language}: phones must be distinct and have 1 to 4 letters a-z"
+            )
         if len(self.phones) > MAX_PHONES:
-            raise UserError(f"language {self.language}: there are at most {MAX_PHONES} phones")
+            raise UserError(f"language {self.language}: more than {MAX_PHONES} phones")
         if self.kinds.count("silence") != 1 or not set(self.kinds) <= set(KINDS):
             raise UserError(
-                f"language {self.language}: a kind is one of {', '.join(KINDS)}, and exactly one "
-                "phone is silence"
+                f"language {self.language}: each phone's kind must be one of {', '.join(KINDS)}, "
+                "and exactly one phone must be silence"
             )
         for phone in self.phones:
             total = sum(share for _, share in self.visemes.get(phone, ()))
@@ -99,7 +103,7 @@ class PhoneInventory:
 
     @cached_property
     def silence(self) -> str:
-        """The phone that stands for a pause."""
+        """The phone for a pause."""
         return self.phones[self.kinds.index("silence")]
 
     @cached_property
@@ -109,16 +113,16 @@ class PhoneInventory:
 
     @cached_property
     def vowels(self) -> frozenset[str]:
-        """Vowels, each with what follows it in its syllable."""
+        """Vowels, including the rest of the syllable."""
         return self._of_kind("vowel")
 
     def read(self, text: str) -> Transcript:
-        """Return a text's syllables with their spelling, and what cannot be read.
+        """Return a text's syllables with their spelling, and the parts that cannot be read.
 
         Raises
         ------
         UserError
-            If the text cannot be read at all.
+            If the text cannot be read.
         """
         if self.transcribe is not None:
             return self.transcribe(text)
@@ -128,9 +132,9 @@ class PhoneInventory:
         )
         return Transcript(tuple(syllables))
 
-    def _of_kind(self, wanted: str) -> frozenset[str]:
+    def _of_kind(self, kind: str) -> frozenset[str]:
         return frozenset(
-            phone for phone, kind in zip(self.phones, self.kinds, strict=True) if kind == wanted
+            phone for phone, other in zip(self.phones, self.kinds, strict=True) if other == kind
         )
 
 
@@ -146,7 +150,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
     Raises
     ------
     UserError
-        If no such language is installed, or its table is wrong.
+        If the language is not installed, or its table is not valid.
     """
     package = BUILT_IN.get(language)
     if package is None:
@@ -154,7 +158,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
         package = installed.get(language)
         if package is None:
             known = ", ".join(sorted({*BUILT_IN, *installed}))
-            raise UserError(f"language {language!r} is not installed; known: {known}")
+            raise UserError(f"language {language!r} is not installed; choose from: {known}")
     try:
         text = resources.files(package).joinpath("phones.tsv").read_text("utf-8")
         lines = [line for line in text.splitlines() if not line.startswith("#")]
@@ -175,7 +179,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
             code=getattr(lexicon, "CODE", ""),
         )
     except (OSError, ImportError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"language {language}: package {package} cannot be read: {error}") from None
+        raise UserError(f"language {language}: cannot read package {package}: {error}") from None
 
 
 def _viseme_shares(text: str) -> VisemeShares:

@@ -1,7 +1,7 @@
 """Timed phones as text: a readable table, CSV, JSON, and TextGrid for Praat.
 
 The TextGrid layout is Praat's long text format (Boersma and Weenink, Praat manual, "TextGrid file
-formats"): intervals cover the whole time without gaps, so pauses are intervals with empty text.
+formats"). Intervals cover the whole time without gaps, so pauses are intervals with empty text.
 """
 
 from __future__ import annotations
@@ -37,20 +37,15 @@ def format_phones(
     total_s
         Length of the recording, seconds.
     syllables
-        Those of a known text: further tiers of a TextGrid, a further list in JSON.
-
-    Returns
-    -------
-    str
-        The whole file, ending with a newline.
+        Syllables of a known text, which a TextGrid and JSON also contain.
 
     Raises
     ------
     UserError
-        If there is no such style.
+        If the style is unknown.
     """
     if style not in _STYLES:
-        raise UserError(f"unknown format {style!r}; choose {', '.join(_STYLES)}")
+        raise UserError(f"unknown format {style!r}; choose from {', '.join(_STYLES)}")
     return _STYLES[style](phones, total_s, syllables)
 
 
@@ -82,14 +77,14 @@ def _csv(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -
 
 def _json(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]) -> str:
     rows = [dict(zip(_COLUMNS, _cells(phone), strict=True)) for phone in phones]
-    found: dict[str, object] = {"total_s": round(total_s, 4), "phones": rows}
+    content: dict[str, object] = {"total_s": round(total_s, 4), "phones": rows}
     if syllables:
-        found["syllables"] = [
+        content["syllables"] = [
             asdict(syllable)
             | {"onset_s": round(syllable.onset_s, 4), "duration_s": round(syllable.duration_s, 4)}
             for syllable in syllables
         ]
-    return json.dumps(found, indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
 _Interval: TypeAlias = tuple[float, float, str]  # start and end in seconds, text
@@ -144,7 +139,7 @@ def _tier(number: int, name: str, intervals: list[_Interval], total_s: float) ->
 
 
 def _without_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]:
-    """Return intervals that cover the whole time: gaps become empty ones, overlaps are cut."""
+    """Return intervals that cover the whole time: empty ones fill gaps, overlaps are cut."""
     intervals: list[_Interval] = []
     now_s = 0.0
     for number, (onset_s, offset_s, text) in enumerate(given):

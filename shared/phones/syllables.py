@@ -1,4 +1,4 @@
-"""Captions of live speech: phones put together to syllables as they come and are revised."""
+"""Captions of live speech: combines phones and their revisions to syllables."""
 
 from __future__ import annotations
 
@@ -10,46 +10,46 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.known_text import Characters, place_in_text
 
-MAX_PHONES = 40  # that may still be revised; older ones are taken for granted
+MAX_PHONES = 40  # that may still be revised; older ones are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Syllable:
-    """One syllable, or a pause. The same ``index`` again revises it, as with phones."""
+    """One syllable, or a pause. As with phones, the same ``index`` again is a revision."""
 
     index: int  # of its first phone
-    text: str  # "shi", or its character; of a pause, the inventory's silence
+    text: str  # "shi", or the character; the inventory's silence for a pause
     onset_s: float  # seconds from the session's first sample
-    duration_s: float  # seconds; 0 if it is final: there was no such syllable after all
+    duration_s: float  # seconds; 0 withdraws the syllable
     final: bool
 
 
 class SyllableTrack:
-    """Makes syllables of phones: an initial alone at first, then with the vowel that follows it.
+    """Combines phones to syllables: first the initial only, then with its vowel.
 
     Parameters
     ----------
     inventory
-        The language; its ``spell`` writes the syllables.
+        The language, which spells the syllables.
     characters
-        What is spoken, if it is known: syllables become characters where they fit.
+        The spoken text, if known: matching syllables are shown as its characters.
     """
 
     def __init__(self, inventory: PhoneInventory, characters: Characters = ()) -> None:
         self._inventory = inventory
         self._characters = characters
-        self._num_said = 0  # characters before those of the phones that are kept
+        self._num_dropped = 0  # characters before the first kept phone
         self._phones: dict[int, Phone] = {}
         self._syllables: dict[int, Syllable] = {}
 
     def reset(self) -> None:
-        """Forget all phones, as when a session begins anew."""
+        """Forget all phones when a session restarts."""
         self._phones.clear()
         self._syllables.clear()
-        self._num_said = 0
+        self._num_dropped = 0
 
-    def accept(self, phone: Phone) -> list[Syllable]:
-        """Take a phone, or a revision of one; return the syllables that it changes."""
+    def update(self, phone: Phone) -> list[Syllable]:
+        """Add or revise a phone; return the syllables that change."""
         if phone.is_withdrawn:
             self._phones.pop(phone.index, None)
         else:
@@ -58,10 +58,10 @@ class SyllableTrack:
         places = self._places(groups)
         if len(self._phones) > MAX_PHONES:
             oldest, place = groups.pop(0), places.pop(0)
-            self._num_said = self._num_said if place is None else place + 1
+            self._num_dropped = self._num_dropped if place is None else place + 1
             self._syllables.pop(oldest[0].index, None)
-            for each in oldest:
-                del self._phones[each.index]
+            for dropped in oldest:
+                del self._phones[dropped.index]
         syllables = {
             group[0].index: self._syllable(group, place, following)
             for place, (group, following) in zip(places, pairwise([*groups, []]), strict=True)
@@ -91,17 +91,18 @@ class SyllableTrack:
         return groups
 
     def _places(self, groups: list[list[Phone]]) -> list[int | None]:
-        """Return the position of each syllable among the characters; None: at none."""
-        heard = [tuple(phone.symbol for phone in group) for group in groups]
-        spoken = [each for each in heard if each != (self._inventory.silence,)]
-        left = [phones for _, phones in self._characters[self._num_said :]]
-        found = iter(place_in_text(spoken, left) if left else [None] * len(spoken))
-        places = (None if each == (self._inventory.silence,) else next(found) for each in heard)
-        return [None if place is None else place + self._num_said for place in places]
+        """Return the index of each syllable's character; None: it has no character."""
+        silence = (self._inventory.silence,)
+        symbols = [tuple(phone.symbol for phone in group) for group in groups]
+        spoken = [syllable for syllable in symbols if syllable != silence]
+        text = [phones for _, phones in self._characters[self._num_dropped :]]
+        indices = iter(place_in_text(spoken, text) if text else [None] * len(spoken))
+        places = (None if syllable == silence else next(indices) for syllable in symbols)
+        return [None if place is None else place + self._num_dropped for place in places]
 
     def _syllable(self, phones: list[Phone], place: int | None, following: list[Phone]) -> Syllable:
         first, last = phones[0], phones[-1]
-        # The vowel of an initial may still come, or prove to be one.
+        # The vowel of an initial may still follow.
         is_complete = last.symbol not in self._inventory.initials or any(
             phone.final for phone in following[:1]
         )

@@ -1,4 +1,4 @@
-"""A text as it is spoken: syllables with their spelling, and what could not be read."""
+"""A text as it is spoken: syllables with their spelling, and the parts that cannot be read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class SpokenSyllable:
     """A syllable of a text."""
 
-    text: str  # what is written: a character, or the syllable itself
+    text: str  # as written: a character, or the syllable
     spelling: str  # with its tone, such as "ni3"
     phones: tuple[str, ...]
 
@@ -19,7 +19,7 @@ class Transcript:
     """A text, syllable by syllable."""
 
     syllables: tuple[SpokenSyllable, ...]
-    dropped: tuple[str, ...] = ()  # stretches of the text whose reading is unknown
+    dropped: tuple[str, ...] = ()  # parts of the text that cannot be read
 
     @property
     def phones(self) -> list[tuple[str, ...]]:
@@ -29,7 +29,7 @@ class Transcript:
 
 @dataclass(frozen=True, slots=True)
 class TimedSyllable:
-    """A syllable of a text where it is spoken."""
+    """A syllable of a text and when it is spoken."""
 
     text: str
     spelling: str

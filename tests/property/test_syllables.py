@@ -34,7 +34,7 @@ def test_what_is_shown_is_of_the_phones_that_stand(phones: list[Phone], text: st
         standing.add(phone.index)
         if phone.is_withdrawn:
             standing.remove(phone.index)
-        for syllable in track.accept(phone):
+        for syllable in track.update(phone):
             shown[syllable.index] = syllable
             if syllable.duration_s == 0.0:
                 del shown[syllable.index]

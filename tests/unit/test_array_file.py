@@ -88,5 +88,5 @@ def test_an_array_that_is_not_there_is_refused(tmp_path: Path, content: bytes, m
 
 
 def test_what_is_no_file_is_refused() -> None:
-    with pytest.raises(ValueError, match="no file"):
+    with pytest.raises(ValueError, match="not a file"):
         read_arrays(Path("/dev/zero"), MIB)

@@ -153,18 +153,18 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no acoustic model at"):
         load_model(path)
     path.write_bytes(b"not a model")
-    with pytest.raises(UserError, match="is no acoustic model"):
+    with pytest.raises(UserError, match="is not an acoustic model"):
         load_model(path)
     whole = NEURAL_PATH.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UserError, match="is no acoustic model"):
+    with pytest.raises(UserError, match="is not an acoustic model"):
         load_model(path)
     np.savez(path, format=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(UserError, match="is no acoustic model"):
+    with pytest.raises(UserError, match="is not an acoustic model"):
         load_model(path)
     np.save(tmp_path / "array.npz", np.zeros(3))
     (tmp_path / "array.npz.npy").rename(path)
-    with pytest.raises(UserError, match="is no acoustic model"):
+    with pytest.raises(UserError, match="is not an acoustic model"):
         load_model(path)
 
 
@@ -174,12 +174,12 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
         ({"format": np.array("gmm 99")}, "gmm 99"),
         ({"phones": np.array(MANDARIN.phones[::-1])}, "phones are not those"),
         ({"language": np.array("klingon")}, "language 'klingon' is not installed"),
-        ({"first_state": np.zeros(NUM_PHONES + 1, np.int64)}, "not numbered upwards"),
+        ({"first_state": np.zeros(NUM_PHONES + 1, np.int64)}, "not in order"),
         ({"means": np.zeros((3, 3, 3), np.float32)}, r"means has shape \(3, 3, 3\)"),
         ({"log_stay": np.full(NUM_STATES, np.nan, np.float32)}, "not finite"),
-        ({"lm_children": np.zeros(99, np.uint8)}, "its phone language model is no tree"),
+        ({"lm_children": np.zeros(99, np.uint8)}, "its phone language model is not a tree"),
         ({"lm_phone": np.zeros(3, np.uint8)}, r"lm_phone has shape \(3,\)"),
-        ({"lm_scale": np.array(np.inf)}, "lm_scale holds values that are not finite"),
+        ({"lm_scale": np.array(np.inf)}, "lm_scale contains values that are not finite"),
         ({"phone_penalty": np.zeros(2)}, r"phone_penalty has shape \(2,\)"),
         ({"covars": np.zeros((NUM_STATES, 3, NUM_FEATURES), np.float32)}, "negative"),
         ({"weights": np.zeros((NUM_STATES, 0), np.float32)}, "0 mixture components"),

@@ -60,7 +60,9 @@ def test_devices_are_listed(server: Path) -> None:
 
 
 def test_a_name_that_no_device_has_is_told_which_there_are(server: Path) -> None:
-    with pytest.raises(UserError, match="no device is called 'vlc'; there are 'HDMI', 'Firefox'"):
+    with pytest.raises(
+        UserError, match="no device is called 'vlc'; this machine has 'HDMI', 'Firefox'"
+    ):
         monitor("vlc")
 
 
@@ -80,5 +82,5 @@ def test_a_recorder_that_complains_much_is_still_heard(server: Path) -> None:
 
 def test_what_cannot_be_recorded_says_why(server: Path) -> None:
     (server / "parec").write_text("#!/bin/sh\necho Connection refused >&2; exit 1\n")
-    with pytest.raises(UserError, match="nothing can be recorded: Connection refused"):
+    with pytest.raises(UserError, match="cannot record: Connection refused"):
         next(monitor().blocks)

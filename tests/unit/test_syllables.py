@@ -63,34 +63,34 @@ def test_spelling(phones: tuple[str, ...], spelling: str) -> None:
 
 def test_an_initial_is_shown_at_once_and_completed_by_its_vowel() -> None:
     track = SyllableTrack(MANDARIN)
-    (first,) = track.accept(phone(0, "sh", final=False))
+    (first,) = track.update(phone(0, "sh", final=False))
     assert (first.index, first.text, first.final) == (0, "sh", False)
-    (second,) = track.accept(phone(1, "iii", final=False))
+    (second,) = track.update(phone(1, "iii", final=False))
     assert (second.index, second.text, second.onset_s) == (0, "shi", 0.0)
     assert second.duration_s == pytest.approx(0.2)
-    assert track.accept(phone(1, "iii", final=False)) == []
-    track.accept(phone(0, "sh"))
-    (final,) = track.accept(phone(1, "iii"))
+    assert track.update(phone(1, "iii", final=False)) == []
+    track.update(phone(0, "sh"))
+    (final,) = track.update(phone(1, "iii"))
     assert final.final
 
 
 def test_an_initial_alone_is_final_only_once_no_vowel_can_follow() -> None:
     track = SyllableTrack(MANDARIN)
-    assert not track.accept(phone(0, "d"))[0].final
-    (pause,) = track.accept(phone(1, "sil", final=False))  # it may prove to be a vowel
+    assert not track.update(phone(0, "d"))[0].final
+    (pause,) = track.update(phone(1, "sil", final=False))  # it may prove to be a vowel
     assert pause.text == "sil"
-    initial, _ = track.accept(phone(1, "sil"))
+    initial, _ = track.update(phone(1, "sil"))
     assert (initial.text, initial.final) == ("d", True)
 
 
 def test_what_proves_to_be_one_syllable_is_withdrawn_as_two() -> None:
     track = SyllableTrack(MANDARIN)
     for index, symbol in enumerate(("a", "ou", "sil")):
-        track.accept(phone(index, symbol, final=False))
-    withdrawn, joined = track.accept(phone(0, "m", final=False))
+        track.update(phone(index, symbol, final=False))
+    withdrawn, joined = track.update(phone(0, "m", final=False))
     assert (withdrawn.index, withdrawn.duration_s, withdrawn.final) == (1, 0.0, True)
     assert joined.text == "mou"
-    (alone,) = track.accept(phone(1, "sil", duration_s=0.0))  # the vowel was none
+    (alone,) = track.update(phone(1, "sil", duration_s=0.0))  # the vowel was none
     assert alone.text == "m"
 
 
@@ -98,7 +98,7 @@ def test_a_long_stream_keeps_its_syllables() -> None:
     track = SyllableTrack(MANDARIN)
     texts: dict[int, str] = {}
     for index in range(4 * MAX_PHONES):
-        for syllable in track.accept(phone(index, ("b", "a", "sil")[index % 3])):
+        for syllable in track.update(phone(index, ("b", "a", "sil")[index % 3])):
             texts[syllable.index] = syllable.text
             assert syllable.duration_s > 0.0
     assert list(texts.values()) == ["ba", "sil"] * (4 * MAX_PHONES // 3) + ["b"]
@@ -116,7 +116,7 @@ def test_the_characters_of_a_known_text_are_shown_though_phones_are_wrong() -> N
         if number % 10 == 7:
             continue  # missed
         for symbol in symbols:
-            for syllable in track.accept(phone(index, symbol)):
+            for syllable in track.update(phone(index, symbol)):
                 texts[syllable.index] = syllable.text
             index += 1
     shown = [each for each in texts.values() if each != "sil"]
@@ -135,13 +135,13 @@ def test_what_is_not_in_the_text_is_spelled() -> None:
     track = SyllableTrack(MANDARIN, characters_of("好。", MANDARIN))
     texts: dict[int, str] = {}
     for index, symbol in enumerate(("n", "i", "h", "ao")):
-        texts |= {each.index: each.text for each in track.accept(phone(index, symbol))}
+        texts |= {each.index: each.text for each in track.update(phone(index, symbol))}
     assert texts == {0: "ni", 2: "好"}
 
 
 def test_a_phone_that_nobody_knows_is_withdrawn_without_a_trace() -> None:
     track = SyllableTrack(MANDARIN)
-    assert track.accept(phone(3, "sil", duration_s=0.0)) == []
-    track.accept(phone(0, "sh"))
-    (withdrawn,) = track.accept(phone(0, "sh", duration_s=0.0))
+    assert track.update(phone(3, "sil", duration_s=0.0)) == []
+    track.update(phone(0, "sh"))
+    (withdrawn,) = track.update(phone(0, "sh", duration_s=0.0))
     assert withdrawn.duration_s == 0.0

@@ -42,7 +42,7 @@ def test_of_several_files_the_smallest_is_taken(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"holds no tokens\.txt"):
+    with pytest.raises(UserError, match=r"contains no tokens\.txt"):
         SherpaTranscriber(tmp_path)
     with pytest.raises(UserError, match="no model of a known kind"):
         SherpaTranscriber(paraformer(tmp_path / "other"))

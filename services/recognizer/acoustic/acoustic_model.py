@@ -1,4 +1,4 @@
-"""What the recognizer needs from an acoustic model, Gaussian or neural."""
+"""The interface of acoustic models, Gaussian and neural."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class AcousticModel(Protocol):
         """Create the stream of one speaker. Only a causal network has positions to keep."""
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
-        """Score several streams in one batch; each gets the scores that it gets alone."""
+        """Score several streams in one batch, with the same scores as one by one."""
 
 
 def score_segment(model: AcousticModel, frames: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Load an acoustic model of any kind."""
+"""Loads acoustic models of any kind."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ def model_path(name: str) -> Path:
 
 
 def load_model(path: Path = NEURAL_PATH, *, look_ahead_ms: float | None = None) -> AcousticModel:
-    """Read a model file.
+    """Read a model file, by default the shipped causal network.
 
     Parameters
     ----------
     path
-        A file that the ``save`` of a model wrote; by default the shipped causal network.
+        A file that a model's ``save`` wrote.
     look_ahead_ms
-        How far a neural model looks ahead, one of those it was trained for; None is the model's
-        default. Other models have a fixed look-ahead and ignore this.
+        A look-ahead that the neural model was trained for; None: the model's default. Other models
+        ignore it.
 
     Raises
     ------
     UserError
         If the file is missing, broken or of another format, its language is not installed, or the
-        model was not trained for the look-ahead.
+        neural model does not offer the look-ahead.
     """
     archive = read_archive(path)
     try:
@@ -51,11 +51,11 @@ def load_model(path: Path = NEURAL_PATH, *, look_ahead_ms: float | None = None) 
         model = _READERS[form](archive)
     except KeyError:
         raise UserError(
-            f"acoustic model {path} has the format {form!r}; this program reads "
-            f"{' and '.join(_READERS)}: train again"
+            f"acoustic model {path} has the format {form!r}, but this version reads "
+            f"{' and '.join(_READERS)}; train the model again"
         ) from None
     except ValueError as error:
-        raise UserError(f"acoustic model {path}: {error}; train it again") from error
+        raise UserError(f"acoustic model {path}: {error}; train the model again") from error
     except UserError as error:
         raise UserError(f"acoustic model {path}: {error}") from error
     if look_ahead_ms is not None and isinstance(model, neural.NeuralModel):
@@ -66,13 +66,7 @@ def load_model(path: Path = NEURAL_PATH, *, look_ahead_ms: float | None = None) 
 def load_live_model(
     name: str = DEFAULT_MODEL, *, look_ahead_ms: float | None = None
 ) -> AcousticModel:
-    """Read a model, by its name or path, as the recognizer runs it.
-
-    Raises
-    ------
-    UserError
-        As :func:`load_model`.
-    """
+    """Read a model by its name or path, as the recognizer runs it; raises as ``load_model``."""
     model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
     return with_early_network(model, look_ahead_ms=look_ahead_ms)
 
@@ -80,13 +74,7 @@ def load_live_model(
 def with_early_network(
     model: AcousticModel, *, look_ahead_ms: float | None = None
 ) -> AcousticModel:
-    """Let the shipped causal network, with its look-ahead, run beside a block model.
-
-    Raises
-    ------
-    UserError
-        If it was not trained for the look-ahead.
-    """
+    """Combine a block model with the shipped causal network; return other models unchanged."""
     if not isinstance(model, blocks.BlockModel):
         return model
     early = load_model(look_ahead_ms=look_ahead_ms)

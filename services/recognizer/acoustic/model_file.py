@@ -1,4 +1,4 @@
-"""Model files: npz archives of plain arrays, never pickle, every size checked."""
+"""Model files: npz archives of plain arrays, without pickle. Every size is checked."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
-# Of the models whose files have no phone language model.
+# For model files without a phone language model.
 PHONE_LM_PATH = Path(__file__).parents[1] / "models" / "phone_lm.npz"
 
 MAX_BYTES = 256 * 1024 * 1024  # of a file, packed or not
@@ -39,19 +39,19 @@ class Archive:
         return name in self.arrays
 
     def array(self, name: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
-        """Return an array of a given shape (None: any); ValueError says what does not fit."""
+        """Return an array of a given shape (None: any); ValueError if it does not fit."""
         if name not in self.arrays:
             raise ValueError(f"{name} is missing")
-        found = self.arrays[name]
-        if shape is not None and found.shape != shape:
-            raise ValueError(f"{name} has shape {found.shape}, expected {shape}")
-        return found
+        array = self.arrays[name]
+        if shape is not None and array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+        return array
 
     def floats(self, name: str, *shape: int) -> NDArray[np.float32]:
-        """Return finite numbers of a given shape."""
+        """Return an array of finite numbers of a given shape; ValueError if it does not fit."""
         values = self.array(name, shape).astype(np.float32)
         if not np.isfinite(values).all():
-            raise ValueError(f"{name} holds values that are not finite")
+            raise ValueError(f"{name} contains values that are not finite")
         return values
 
 
@@ -61,16 +61,18 @@ def read_archive(path: Path) -> Archive:
     Raises
     ------
     UserError
-        If the file is missing or no model file.
+        If the file is missing or is not a model file.
     """
     try:
         return Archive(read_arrays(path, MAX_BYTES))
     except OSError as error:
         raise UserError(
-            f"no acoustic model at {path}; write neural, blocks, gmm, or a model file's name"
+            f"there is no acoustic model at {path}; use blocks, neural, gmm, or a model file"
         ) from error
     except ValueError as error:
-        raise UserError(f"{path} is no acoustic model ({error}); train one or reinstall") from error
+        raise UserError(
+            f"{path} is not an acoustic model ({error}); reinstall or train one"
+        ) from error
 
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -81,8 +83,8 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the HMMs and of their phone language model, unless that is shipped."""
-    arrays, shipped = (phone_lm_arrays(each) for each in (topology.phone_lm, shipped_phone_lm()))
+    """Return the arrays of the HMMs, and of their phone language model if it is not shipped."""
+    arrays, shipped = map(phone_lm_arrays, (topology.phone_lm, shipped_phone_lm()))
     if all(np.array_equal(array, shipped[name]) for name, array in arrays.items()):
         arrays = {name: arrays[name] for name in _LANGUAGE}
     return {
@@ -111,7 +113,7 @@ def topology_from(archive: Archive) -> Topology:
     num_phones = len(phone_lm.inventory)
     first_state = archive.array("first_state", (num_phones + 1,)).astype(np.int64)
     if first_state[0] != 0 or (np.diff(first_state) < 1).any() or first_state[-1] > _MAX_STATES:
-        raise ValueError("its states are not numbered upwards")
+        raise ValueError("its states are not in order")
     num_states = int(first_state[-1])
     lm_scale = float(archive.floats("lm_scale"))
     phone_penalty = float(archive.floats("phone_penalty"))
@@ -131,20 +133,20 @@ def topology_from(archive: Archive) -> Topology:
 
 @cache
 def shipped_phone_lm() -> PhoneLanguageModel:
-    """Return the phone language model that ships."""
+    """Return the shipped phone language model."""
     return phone_lm_from(read_archive(PHONE_LM_PATH))
 
 
 def _shipped_for(archive: Archive) -> PhoneLanguageModel:
-    """Return the phone language model that ships, if it is of the archive's language."""
+    """Return the shipped phone language model, if it is for the archive's language."""
     language, shipped = inventory_from(archive).language, shipped_phone_lm()
     if language != shipped.inventory.language:
-        raise ValueError(f"it has no phone language model, and none ships for {language}")
+        raise ValueError(f"it has no phone language model, and {language} has no shipped one")
     return shipped
 
 
 def phone_lm_arrays(phone_lm: PhoneLanguageModel) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a phone language model, with the language they belong to."""
+    """Return the arrays of a phone language model, with the name and phones of its language."""
     log_prob, log_backoff = (
         np.rint(log / _LOG_STEP) for log in (phone_lm.log_prob, phone_lm.log_backoff)
     )
@@ -181,7 +183,7 @@ def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
         or children.sum() != len(children) - 1
         or (first_child <= at)[children > 0].any()
     ):
-        raise ValueError("its phone language model is no tree")
+        raise ValueError("its phone language model is not a tree")
     phone = archive.array("lm_phone", children.shape).astype(np.int64)
     is_first = np.zeros(len(phone) + 1, dtype=bool)
     is_first[first_child] = True
@@ -200,7 +202,7 @@ def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
 
 
 def inventory_from(archive: Archive) -> PhoneInventory:
-    """Load the inventory of the file's language; check that the file was made with its phones."""
+    """Load the inventory of the file's language, and check that the file has the same phones."""
     inventory = load_inventory(str(archive.array("language", ())))
     if tuple(archive.array("phones", None).tolist()) != inventory.phones:
         raise ValueError(f"its phones are not those of the installed language {inventory.language}")

@@ -193,7 +193,7 @@ class NeuralModel:
         Raises
         ------
         UserError
-            If the network was not trained for it.
+            If the network was not trained with this look-ahead.
         """
         offered = [float(frames * HOP_S * 1000) for frames in self.look_aheads]
         if look_ahead_ms not in offered:

@@ -360,7 +360,7 @@ def _start_phones(
 def _look_up_phones(
     context: int, graph: Graph, log_prob: NDArray[np.float32], next_context: NDArray[np.int32]
 ) -> None:
-    """Fill in the log-probability of each phone after a context, and the context then."""
+    """Fill in the log-probability of each phone after a context, and the context it leads to."""
     chain = np.empty(_MAX_CHAIN, np.int32)
     length = 0
     while True:

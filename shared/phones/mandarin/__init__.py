@@ -1,11 +1,13 @@
 """Mandarin: the 60 phones of Li et al. 2011, pinyin as its lexicon, and the visemes of each phone.
 
-``phones.tsv`` follows Li et al. 2011, section 3.1 (21 initials, 38 finals and silence; ``ii`` after
-z c s, ``iii`` after zh ch sh r, ``v`` for ü) and table 1: the visemes of initials and of finals
-with a single shape; compound finals are split ("iao = i + ao"). The table lacks the finals with
-``v``. Their split, and the second, rounded viseme of an initial before a rounded final, follow
-Crystal.TTVS (Tsinghua University, Apache-2.0). Deviations: ``eng`` is table 1's {e, eng}, where
-Crystal has {ei, en, eng}; the vowels ``ii`` and ``iii`` keep the shape of the initials before them.
+The phones in ``phones.tsv`` follow Li et al. 2011, section 3.1: 21 initials, 38 finals and silence.
+``ii`` is the final after z c s, ``iii`` the final after zh ch sh r, and ``v`` is ü. The visemes
+follow table 1, which has initials and finals with a single shape, and splits compound finals ("iao
+= i + ao"). The table lacks the finals with ``v``. Their split, and the rounded viseme of an initial
+before a rounded final, follow Crystal.TTVS (Tsinghua University, Apache-2.0).
+
+Deviations: ``eng`` is table 1's {e, eng}, where Crystal has {ei, en, eng}. The vowels ``ii`` and
+``iii`` keep the shape of the initials before them.
 """
 
 import re

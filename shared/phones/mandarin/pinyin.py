@@ -1,19 +1,19 @@
-"""Mandarin's lexicon: Chinese text to pinyin (the Latin spelling of Mandarin), pinyin to phones.
+"""The lexicon of Mandarin: Chinese text to pinyin (its Latin spelling), and pinyin to phones.
 
 Source of the phones: Li et al. 2011, section 3.1 (21 initials, 38 finals). Spelling rules: the
 Scheme for the Chinese Phonetic Alphabet (1958) and ISO 7098:2015.
 
 Decisions beyond these sources:
 
-- A syllable is legal if its final belongs to a row that its initial may take (``j q x`` only
-  before i and ü, and so on). This accepts the rare readings (``biang``, ``fiao``, ``den``) on which
-  word lists differ, and still refuses typing errors (``muo``, ``ja``).
-- Er-hua (an r-coloured ending) written apart (``hua1 er5``) is the phone ``er``; written together
-  (``huar1``) it is the syllable's own final followed by ``er``.
-- The bare ``ê`` (also ``eh``) is ``ei``, the nearest phone by mouth shape; ``yo`` is ``iou``;
-  ``wong`` is ``ueng``; ``yai`` (an old reading of 崖) is ``ia`` + ``i``.
+- A syllable is valid if its final belongs to a row that its initial allows (``j q x`` only before i
+  and ü, and so on). This accepts rare readings (``biang``, ``fiao``, ``den``) on which word lists
+  differ, and rejects typing errors (``muo``, ``ja``).
+- Er-hua (an r-colored ending) as a separate syllable (``hua1 er5``) is the phone ``er``. Within a
+  syllable (``huar1``), ``er`` follows the syllable's final.
+- The syllable ``ê`` (also ``eh``) is ``ei``, the nearest phone by mouth shape. ``yo`` is ``iou``,
+  and ``wong`` is ``ueng``. ``yai`` (an old reading of 崖) is ``ia`` + ``i``.
 - The interjections ``m n ng hm hng`` have no final. They are the nasal initials with the same mouth
-  shape (``n`` for ``ng``), after ``h`` where it is written.
+  shape (``n`` for ``ng``), after ``h`` if it is written.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 # Longest first, so that zh is not read as z + h.
 _INITIALS_BY_LENGTH = tuple("zh ch sh b p m f d t n l g k h j q x r z c s".split())
 
-# Rows of finals: spelling after an initial -> phone, and the initials that may take the row.
+# Rows of finals: spelling after an initial -> phone, and the initials that the row follows.
 _OPEN_ROW = {phone: phone for phone in "a o e ai ei ao ou an en ang eng ong".split()}
 _OPEN_INITIALS = set("b p m f d t n l g k h zh ch sh r z c s".split())
 _I_ROW = {phone: phone for phone in "i ia ie iao ian in iang ing iong".split()} | {"iu": "iou"}
@@ -52,7 +52,7 @@ _WITHOUT_INITIAL = {
     **{"m": ("m",), "n": ("n",), "ng": ("n",), "hm": ("h", "m"), "hng": ("h", "n")},
 }
 
-# How finals are written: alone (the first spelling above), after an initial, and after j q x.
+# Spelling of finals: without initial (the first spelling above), after an initial, after j q x.
 _SPELLED_ALONE = {
     phones[0]: spelling
     for spelling, phones in reversed(_WITHOUT_INITIAL.items())
@@ -68,23 +68,18 @@ _PUNCTUATION = ',.;!?"()“”，。！？、；：…—'
 
 
 def phones_of_syllable(syllable: str) -> tuple[str, ...]:
-    """Split a pinyin syllable into phones.
+    """Split a pinyin syllable into an initial and a final, or only a final; er-hua adds ``er``.
 
     Parameters
     ----------
     syllable
-        One syllable, with or without a tone digit (1-5, 0) or a tone mark; ü may be written
-        ``ü``, ``v`` or ``u:``. Case is ignored.
-
-    Returns
-    -------
-    tuple of str
-        An initial and a final, a final alone, or an interjection's phones; er-hua adds ``er``.
+        One syllable, with or without a tone digit (1-5, 0) or a tone mark. ü may be written ``ü``,
+        ``v`` or ``u:``. Case is ignored.
 
     Raises
     ------
     UserError
-        If Mandarin has no such syllable.
+        If the syllable does not exist in Mandarin.
 
     Examples
     --------
@@ -111,18 +106,18 @@ def pronounce(text: str) -> list[tuple[str, ...]]:
     Raises
     ------
     UserError
-        If the text cannot be read, as a whole.
+        If a part of the text cannot be read.
     """
     transcript = transcribe(text)
     if transcript.dropped:
         raise UserError(
-            f"cannot read {transcript.dropped[0]!r} as Mandarin; write it out in Chinese characters"
+            f"cannot read {transcript.dropped[0]!r} as Mandarin; use Chinese characters instead"
         )
     return transcript.phones
 
 
 def spell(phones: tuple[str, ...]) -> str:
-    """Return the pinyin of a syllable's phones, without its tone; of an initial alone, the initial.
+    """Return the pinyin of a syllable's phones, without tone; an initial is its own spelling.
 
     Examples
     --------
@@ -140,10 +135,10 @@ def spell(phones: tuple[str, ...]) -> str:
 
 
 def transcribe(text: str) -> Transcript:
-    """Read a text aloud: characters or pinyin, numbers and dates.
+    """Convert a text to syllables: characters or pinyin, with numbers and dates.
 
-    Spaces between Chinese characters, as in segmented texts, and punctuation mean nothing. Letters
-    and symbols among the characters are dropped.
+    Punctuation, and spaces between Chinese characters, are ignored. Letters and symbols among the
+    characters are dropped.
 
     Raises
     ------
@@ -179,31 +174,31 @@ def transcribe(text: str) -> Transcript:
 
 
 def _pinyin_of(characters: str) -> list[str]:
-    """Return the pinyin of each character of a text, "" where it has none."""
-    from pypinyin import Style, lazy_pinyin  # noqa: PLC0415 (0.3 s; not all that know phones read)
+    """Return the pinyin of each character of a text; "" for other characters."""
+    from pypinyin import Style, lazy_pinyin  # noqa: PLC0415 (takes 0.3 s, and few callers read text)
 
-    found: list[str] = lazy_pinyin(
+    syllables: list[str] = lazy_pinyin(
         characters,
         style=Style.TONE3,
         errors=lambda unknown: [""] * len(unknown),  # type: ignore[arg-type,return-value]
         neutral_tone_with_five=True,
         v_to_u=False,
     )
-    return found
+    return syllables
 
 
 def _read_numbers(text: str) -> str:
-    """Write numbers, dates, times and units as they are read: 3.5% -> 百分之三点五."""
+    """Replace numbers, dates, times and units by their reading: 3.5% -> 百分之三点五."""
     if not re.search(r"\d", text):
         return text
-    from wetext import Normalizer  # noqa: PLC0415 (0.3 s)
+    from wetext import Normalizer  # noqa: PLC0415 (takes 0.3 s)
 
     read: str = Normalizer(lang="zh", operator="tn").normalize(text)
     return read.replace("第两", "第二")  # ordinals: wetext 0.1 reads every 2 before a measure as 两
 
 
 def _is_spoken(letter: str) -> bool:
-    """Whether a character is no punctuation."""
+    """Whether a character is neither punctuation, a separator nor a control character."""
     return unicodedata.category(letter)[0] not in "PZC"
 
 
@@ -225,7 +220,7 @@ def _plain(syllable: str) -> str:
 
 @lru_cache(maxsize=1024)
 def _whole(plain: str) -> tuple[str, ...] | None:
-    """Return the phones of a syllable without er-hua, or None if there is no such syllable."""
+    """Return the phones of a syllable without er-hua, or None if it does not exist."""
     if plain in _WITHOUT_INITIAL:
         return _WITHOUT_INITIAL[plain]
     initial = next((phone for phone in _INITIALS_BY_LENGTH if plain.startswith(phone)), None)
