@@ -11,13 +11,10 @@ import weakref
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from kouxing.services.kinds import WORKERS
 from kouxing.shared.service import PARENT_VARIABLE, PULSE_VARIABLE
 
 POLL_S = 0.2  # between two checks of a process
-# A loop that sends no heartbeat for longer hangs. Other services may work longer at a time.
-WORKER_HANG_S = 2.0
-HANG_S = 5.0
+HANG_S = 5.0  # a loop that sends no heartbeat for longer hangs
 
 
 class HangDetector:
@@ -54,6 +51,8 @@ class ServiceProcess(subprocess.Popen[bytes]):
         Command-line arguments of the service.
     environment
         The complete environment. This class adds two variables.
+    hang_limit_s
+        A loop that sends no heartbeat for longer hangs.
     options
         Options of ``subprocess.Popen``.
     """
@@ -64,6 +63,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         arguments: Iterable[str] = (),
         *,
         environment: Mapping[str, str],
+        hang_limit_s: float = HANG_S,
         **options: Any,
     ) -> None:
         self._pulse, write_end = os.pipe()
@@ -80,8 +80,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
             )
         finally:
             os.close(write_end)
-        limit_s = WORKER_HANG_S if kind in WORKERS else HANG_S
-        self._detector = HangDetector(limit_s, time.monotonic())
+        self._detector = HangDetector(hang_limit_s, time.monotonic())
 
     def hangs(self) -> bool:
         """Return whether the service's loop hangs. Call this about every ``POLL_S``."""

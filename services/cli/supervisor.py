@@ -17,14 +17,15 @@ from typing import IO
 from kouxing_client import KouxingError
 from rich.console import Console
 
-from kouxing.services.cli.service_process import POLL_S, ServiceProcess
-from kouxing.services.kinds import KINDS, kind_of
+from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
+from kouxing.services.kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
 STEADY_S = 30.0  # a service that has run for longer restarts without delay
+WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
 USER_ERROR = 2  # exit status of a service with a wrong configuration
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
@@ -190,6 +191,7 @@ class Supervisor:
             kind_of(name),
             self._arguments,
             environment={**self._environment, **self._more.get(name, {})},
+            hang_limit_s=self._hang_limit_s(name),
             stdin=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C must reach only the supervisor
@@ -197,6 +199,11 @@ class Supervisor:
         self._processes[name] = process
         self._started_s[name] = time.monotonic()
         threading.Thread(target=self._follow, args=(name, process), daemon=True).start()
+
+    def _hang_limit_s(self, name: str) -> float:
+        """Return the hang limit: short for a worker, unless it has already been restarted twice."""
+        is_fresh = self._backoff_s[name] <= MIN_BACKOFF_S
+        return WORKER_HANG_S if kind_of(name) in WORKERS and is_fresh else HANG_S
 
     def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
         """Copy a service's log until it ends, then wake the watcher."""

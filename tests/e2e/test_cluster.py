@@ -1,4 +1,4 @@
-"""Workers on a Ray cluster of three nodes: placed, started again elsewhere, taken away."""
+"""Workers on a Ray cluster of three nodes: placed, restarted elsewhere, and stopped."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def workers(report: Status) -> dict[str, str]:
     return {state.instance: state.service for state in report.services if state.service in kinds}
 
 
-@pytest.mark.timeout(400)  # of a busy machine
-def test_workers_are_placed_started_again_elsewhere_and_taken_away(
+@pytest.mark.timeout(400)  # on a busy machine
+def test_workers_are_placed_restarted_elsewhere_and_stopped(
     nodes: Cluster, control: System
 ) -> None:
     def scale(**numbers: int) -> str:
@@ -61,7 +61,7 @@ def test_workers_are_placed_started_again_elsewhere_and_taken_away(
     samples = samples_of_file(VOWELS_FILE)
     assert stream(control.control, samples).frames
 
-    nodes.remove_node(nodes.worker_nodes.copy().pop())  # one of them was there: Ray spreads them
+    nodes.remove_node(nodes.worker_nodes.copy().pop())  # Ray put one of the workers there
     control.wait_until(
         lambda report: (
             sorted(workers(report).values()) == ["recognizer", "synthesizer"]
@@ -75,7 +75,7 @@ def test_workers_are_placed_started_again_elsewhere_and_taken_away(
     control.wait_until(lambda report: not workers(report))
 
 
-def test_without_a_cluster_on_this_host_the_way_to_one_is_told() -> None:
+def test_reports_how_to_start_a_cluster() -> None:
     refused = kouxing("cluster")
     assert refused.returncode == 2
-    assert "'ray start --head' begins one" in refused.stderr
+    assert "start one with 'ray start --head'" in refused.stderr

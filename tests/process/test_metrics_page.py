@@ -1,4 +1,4 @@
-"""What real services serve for Prometheus is what the documents and the dashboard name."""
+"""The metrics of running services are those of the documents and of the dashboard."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.system import ROOT, VOWELS_FILE, System, free_port
 pytestmark = pytest.mark.process
 
 SERVICES = ("control", "recognizer", "synthesizer")
-ELSEWHERE = {"frames_missed", "videos", "video_seconds"}  # of services that do not run here
+ELSEWHERE = {"frames_missed", "videos", "video_seconds"}  # metrics of services that do not run here
 NUM_CHUNKS = 8  # each fits into one message
 SUFFIXES = ("_total", "_bucket", "_count", "_sum")
 
 
 @pytest.fixture(scope="module")
 def families(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Metric]]]:
-    """What each service serves while a session of its own is open."""
+    """Metrics of each service while a session is open."""
     ports = {service: free_port() for service in SERVICES}
     settings = {variable(name, "metrics_port"): str(port) for name, port in ports.items()}
     folder = tmp_path_factory.mktemp("metrics")
@@ -76,7 +76,9 @@ def _names(families: dict[str, list[Metric]]) -> set[str]:
     return {family.name for each in families.values() for family in each}
 
 
-def test_a_session_is_seen_in_the_figures_of_all(families: dict[str, list[Metric]]) -> None:
+def test_a_session_appears_in_all_metrics(
+    families: dict[str, list[Metric]],
+) -> None:
     for service in SERVICES:
         assert _value(families[service], "kouxing_sessions", service=service) == 1
         assert 0 <= _value(families[service], "kouxing_load") <= 1
@@ -91,7 +93,7 @@ def test_a_session_is_seen_in_the_figures_of_all(families: dict[str, list[Metric
     assert _value(families["control"], "kouxing_services") == len(SERVICES)
 
 
-def test_the_page_names_every_metric(families: dict[str, list[Metric]]) -> None:
+def test_every_metric_is_documented(families: dict[str, list[Metric]]) -> None:
     page = (ROOT / "docs" / "metrics.md").read_text("utf-8")
     documented = {
         re.sub("_total$", "", name) for name in re.findall(r"`((?:kouxing|process)_\w+)`", page)
@@ -100,7 +102,7 @@ def test_the_page_names_every_metric(families: dict[str, list[Metric]]) -> None:
     assert documented == {re.sub("_total$", "", name) for name in _names(families)} | elsewhere
 
 
-def test_every_metric_of_the_dashboard_is_served(families: dict[str, list[Metric]]) -> None:
+def test_the_dashboard_uses_only_known_metrics(families: dict[str, list[Metric]]) -> None:
     dashboard = json.loads((ROOT / "deploy" / "grafana.json").read_text("utf-8"))
     served = {name for each in families.values() for family in each for name in _forms(family)}
     for panel in dashboard["panels"]:
@@ -115,7 +117,7 @@ def _forms(family: Metric) -> set[str]:
     return {f"{family.name}{suffix}" for suffix in suffixes[family.type]}
 
 
-def test_the_dashboard_is_one_that_grafana_imports() -> None:
+def test_grafana_can_import_the_dashboard() -> None:
     dashboard: dict[str, Any] = json.loads((ROOT / "deploy" / "grafana.json").read_text("utf-8"))
     panels = dashboard["panels"]
     assert dashboard["uid"]
@@ -128,7 +130,7 @@ def test_the_dashboard_is_one_that_grafana_imports() -> None:
     assert used == variables
 
 
-def test_nothing_is_served_unasked(tmp_path: Path) -> None:
+def test_metrics_are_off_by_default(tmp_path: Path) -> None:
     with System(["control"], tmp_path) as system:
         number = system.processes["control"].pid
         sockets = set()

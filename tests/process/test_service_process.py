@@ -1,4 +1,4 @@
-"""Each service as a process: ready, SIGTERM, exit 0; a wrong configuration, exit 2."""
+"""A service process: SIGTERM ends it with status 0, a wrong configuration with status 2."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_service_stops_cleanly_on_sigterm(tmp_path: Path) -> None:
         assert "traceback" not in system.log(service).lower()
 
 
-def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
+def test_ctrl_c_during_startup_prints_no_traceback() -> None:
     addresses = own_addresses(["recognizer"])
     port = int(addresses[variable("recognizer", "audio")].rpartition(":")[2])
     process = subprocess.Popen(
@@ -68,7 +68,7 @@ def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
 @pytest.mark.parametrize(
     ("module", "slow_import"), [("kouxing.services.recognizer", "pydantic"), ("kouxing", "typer")]
 )
-def test_ctrl_c_amid_the_imports_is_no_error(tmp_path: Path, module: str, slow_import: str) -> None:
+def test_ctrl_c_in_imports_prints_nothing(tmp_path: Path, module: str, slow_import: str) -> None:
     ctrl_c = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / f"{slow_import}.py").write_text(ctrl_c)
     result = ended(module, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
@@ -80,7 +80,7 @@ def test_ctrl_c_amid_the_imports_is_no_error(tmp_path: Path, module: str, slow_i
     ("service", "key"),
     [("control", "control"), ("recognizer", "audio"), ("synthesizer", "phone_input")],
 )
-def test_a_port_in_use_is_named(service: str, key: str) -> None:
+def test_reports_a_port_in_use(service: str, key: str) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -92,14 +92,14 @@ def test_a_port_in_use_is_named(service: str, key: str) -> None:
 
 
 @pytest.mark.parametrize("service", KINDS)
-def test_a_wrong_setting_is_named_before_anything_is_opened(service: str) -> None:
+def test_reports_a_wrong_setting_before_it_binds_anything(service: str) -> None:
     result = ended(f"kouxing.services.{service}", "--set", "log_level=loud")
     assert result.returncode == 2
     assert f"{service}.log_level" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_a_hung_loop_is_seen_as_a_lost_service(tmp_path: Path) -> None:
+def test_a_stopped_service_is_lost_until_it_continues(tmp_path: Path) -> None:
     settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
     services = ("control", "recognizer", "synthesizer")
     with System(services, tmp_path, settings=settings) as system:

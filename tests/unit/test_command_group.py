@@ -27,7 +27,7 @@ def wave(name: str) -> None:
 
 @pytest.fixture
 def added(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Add the command above as another package would; return the groups that are asked for."""
+    """Add the command above like another package would, and return the requested groups."""
     groups: list[str] = []
 
     def entry_points(*, group: str) -> list[EntryPoint]:
@@ -47,25 +47,25 @@ def test_an_added_command_runs_and_is_listed(added: list[str]) -> None:
     assert set(added) == {"kouxing.commands"}
 
 
-def test_a_misspelt_added_command_is_suggested(added: list[str]) -> None:
+def test_suggests_an_added_command_for_a_misspelled_one(added: list[str]) -> None:
     result = CliRunner().invoke(command_line.app, ["wafe"])
     assert result.exit_code == 2
     assert "wave" in result.output
 
 
-def test_a_command_of_this_package_starts_without_the_added_ones(added: list[str]) -> None:
+def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> None:
     assert CliRunner().invoke(command_line.app, ["phones", "--help"]).exit_code == 0
     assert added == []
 
 
 @pytest.mark.parametrize("command", [[], ["speak"], ["head", "export"], ["wave"]])
-def test_h_asks_for_help(added: list[str], command: list[str]) -> None:
+def test_h_prints_help(added: list[str], command: list[str]) -> None:
     result = CliRunner().invoke(command_line.app, [*command, "-h"])
     assert result.exit_code == 0
     assert "Usage:" in result.output
 
 
-def test_the_version_is_told() -> None:
+def test_prints_the_version() -> None:
     result = CliRunner().invoke(command_line.app, ["--version"])
     assert result.output == f"kouxing {version('kouxing')}\n"
 
@@ -81,7 +81,7 @@ def test_the_command_line_imports_neither_training_nor_evaluation_nor_services()
     assert done.stdout == "[]\n"
 
 
-def test_without_ray_the_command_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_how_to_install_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "kouxing.services.cli.ray_workers", raising=False)
     ended = CliRunner().invoke(command_line.app, ["cluster"])

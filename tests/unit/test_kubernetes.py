@@ -1,4 +1,4 @@
-"""The Kubernetes manifests: valid, consistent, locked in, and understood by the services."""
+"""The Kubernetes manifests are valid, consistent and restricted, and their settings are known."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ pytestmark = pytest.mark.unit
 FOLDER = ROOT / "deploy" / "kubernetes"
 KUSTOMIZATION = yaml.safe_load((FOLDER / "kustomization.yaml").read_text("utf-8"))
 OBJECTS: dict[tuple[str, str], Any] = {
-    (each["kind"], each["metadata"]["name"]): each
+    (item["kind"], item["metadata"]["name"]): item
     for name in KUSTOMIZATION["resources"]
-    for each in yaml.safe_load_all((FOLDER / name).read_text("utf-8"))
+    for item in yaml.safe_load_all((FOLDER / name).read_text("utf-8"))
 }
 WORKLOADS = {
-    name: each for (kind, name), each in OBJECTS.items() if kind in ("Deployment", "StatefulSet")
+    name: item for (kind, name), item in OBJECTS.items() if kind in ("Deployment", "StatefulSet")
 }
 SECRETS = {
-    each["name"]: {file.rpartition("/")[2] for file in each["files"]}
-    for each in KUSTOMIZATION["secretGenerator"]
+    item["name"]: {file.rpartition("/")[2] for file in item["files"]}
+    for item in KUSTOMIZATION["secretGenerator"]
 }
 per_service = pytest.mark.parametrize("name", WORKLOADS)
 
@@ -37,15 +37,15 @@ def container(name: str) -> Any:
 
 
 def settings(name: str) -> Settings:
-    """Return what a container's environment says."""
+    """Return the settings in a container's environment."""
     variables = dict(OBJECTS["ConfigMap", "kouxing"]["data"])
-    variables |= {each["name"]: each.get("value", "") for each in container(name)["env"]}
+    variables |= {item["name"]: item.get("value", "") for item in container(name)["env"]}
     types = {kind.name: kind.config_type for kind in KINDS.values()}
     return Settings(types, environment=variables)
 
 
 def ports(name: str) -> dict[str, int]:
-    return {each["name"]: each["containerPort"] for each in container(name)["ports"]}
+    return {port["name"]: port["containerPort"] for port in container(name)["ports"]}
 
 
 @pytest.mark.parametrize("key", OBJECTS, ids="-".join)
@@ -54,14 +54,14 @@ def test_an_object_is_valid(key: tuple[str, str]) -> None:
     kubernetes_validate.validate(OBJECTS[key], newest, strict=True)
 
 
-def test_all_services_but_the_driver_run() -> None:
+def test_all_services_except_the_driver_run() -> None:
     assert WORKLOADS.keys() == KINDS.keys() - {"driver"}
     files = {path.name for path in FOLDER.glob("*.yaml")}
     assert files == {*KUSTOMIZATION["resources"], "kustomization.yaml", "prometheus-adapter.yaml"}
 
 
 @per_service
-def test_a_service_understands_its_environment(name: str) -> None:
+def test_the_settings_of_a_service_are_valid(name: str) -> None:
     config = settings(name).load(KINDS[name].config_type)
     assert container(name)["args"] == [name]
     assert not config.insecure
@@ -76,7 +76,7 @@ def test_a_service_understands_its_environment(name: str) -> None:
 
 
 @per_service
-def test_a_service_is_locked_in(name: str) -> None:
+def test_a_service_has_no_privileges(name: str) -> None:
     pod = WORKLOADS[name]["spec"]["template"]["spec"]
     assert pod["securityContext"]["runAsNonRoot"]
     assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
@@ -92,41 +92,41 @@ def test_a_service_is_locked_in(name: str) -> None:
 
 
 @per_service
-def test_a_service_gets_its_own_key_alone(name: str) -> None:
+def test_a_service_gets_only_its_own_key(name: str) -> None:
     pod = WORKLOADS[name]["spec"]["template"]["spec"]
-    volumes = {each["name"]: each for each in pod["volumes"]}
-    mounts = {each["name"]: each["mountPath"] for each in container(name)["volumeMounts"]}
+    volumes = {volume["name"]: volume for volume in pod["volumes"]}
+    mounts = {mount["name"]: mount["mountPath"] for mount in container(name)["volumeMounts"]}
     assert mounts.keys() == volumes.keys()
     assert mounts["keys"] == OBJECTS["ConfigMap", "kouxing"]["data"]["CREDENTIALS_DIRECTORY"]
     assert volumes["keys"]["secret"]["defaultMode"] == 0o440
     given = SECRETS[volumes["keys"]["secret"]["secretName"]]
-    assert {each for each in given if each.endswith(".key")} == {f"{name}.key"}
+    assert {file for file in given if file.endswith(".key")} == {f"{name}.key"}
     assert ("allowed" in given) == (name == "control")
 
 
 @per_service
-def test_objects_find_each_other(name: str) -> None:
+def test_labels_and_ports_match(name: str) -> None:
     labels = WORKLOADS[name]["spec"]["template"]["metadata"]["labels"]
     assert WORKLOADS[name]["spec"]["selector"]["matchLabels"].items() <= labels.items()
     service = OBJECTS["Service", name]["spec"]
     assert service["selector"].items() <= labels.items()
     names = ports(name)
-    assert {each["name"] for each in service["ports"]} == names.keys() - {"metrics"}
+    assert {port["name"] for port in service["ports"]} == names.keys() - {"metrics"}
     policy = OBJECTS["NetworkPolicy", name]["spec"]
     assert policy["podSelector"]["matchLabels"].items() <= labels.items()
-    opened = {each["port"] for rule in policy["ingress"] for each in rule["ports"]}
+    opened = {port["port"] for rule in policy["ingress"] for port in rule["ports"]}
     assert opened == names.keys()
 
 
 @pytest.mark.parametrize("name", ["recognizer", "synthesizer"])
-def test_workers_are_scaled_by_a_metric_that_they_have(name: str) -> None:
+def test_workers_are_scaled_by_a_metric_that_they_export(name: str) -> None:
     assert OBJECTS["Service", name]["spec"]["clusterIP"] == "None"
     assert WORKLOADS[name]["spec"]["serviceName"] == name
     scaler = OBJECTS["HorizontalPodAutoscaler", name]["spec"]
     target = WORKLOADS[scaler["scaleTargetRef"]["name"]]
     assert target["kind"] == scaler["scaleTargetRef"]["kind"]
     assert "replicas" not in target["spec"], "the autoscaler's"
-    (metric,) = (each["pods"]["metric"]["name"] for each in scaler["metrics"])
+    (metric,) = (item["pods"]["metric"]["name"] for item in scaler["metrics"])
     assert f"| `{metric}` |" in (ROOT / "docs" / "metrics.md").read_text("utf-8")
     adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text("utf-8"))
     (rule,) = adapter["rules"]["custom"]

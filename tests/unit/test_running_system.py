@@ -1,4 +1,4 @@
-"""How commands find the system that their user runs."""
+"""Commands find the running system of their user."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def announcing(control: str) -> subprocess.Popen[str]:
     return process
 
 
-def test_the_newest_running_system_is_found_however_others_ended() -> None:
+def test_finds_the_newest_running_system_even_if_others_were_killed() -> None:
     assert find_control() == ""
     first, second, third = (announcing(f"tcp://127.0.0.1:{port}") for port in (1, 2, 3))
     assert find_control() == "tcp://127.0.0.1:3"
@@ -55,7 +55,7 @@ def test_the_newest_running_system_is_found_however_others_ended() -> None:
     assert find_control() == ""
 
 
-def test_an_address_that_is_told_counts_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:
     default = control_address("")
     with announce("tcp://127.0.0.1:1"):
         assert control_address("") == "tcp://127.0.0.1:1"
@@ -70,7 +70,7 @@ def test_an_address_that_is_told_counts_more(monkeypatch: pytest.MonkeyPatch) ->
     assert control_address("") == default
 
 
-def test_a_folder_that_others_can_write_to_is_not_believed(tmp_path: Path) -> None:
+def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
     with announce("tcp://127.0.0.1:1"):
         (folder,) = tmp_path.iterdir()
         folder.chmod(0o777)

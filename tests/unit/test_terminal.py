@@ -1,4 +1,4 @@
-"""What commands share."""
+"""Checking and writing output files."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from kouxing.shared.terminal import check_output, write_text
 pytestmark = pytest.mark.unit
 
 
-def test_outputs_are_checked_before_the_work_and_left_as_they_are(tmp_path: Path) -> None:
+def test_check_output_changes_no_file(tmp_path: Path) -> None:
     old, new = tmp_path / "old.json", tmp_path / "new.json"
     old.write_text("kept")
     check_output(None, old, new)
@@ -21,7 +21,7 @@ def test_outputs_are_checked_before_the_work_and_left_as_they_are(tmp_path: Path
             check_output(None, new, wrong)
 
 
-def test_no_folder_is_made_for_an_output(tmp_path: Path) -> None:
+def test_creates_no_folder_for_an_output(tmp_path: Path) -> None:
     missing = tmp_path / "folder"
     for write in (check_output, lambda path: write_text(path, "text")):
         with pytest.raises(UserError, match=f"mkdir -p {missing}"):
