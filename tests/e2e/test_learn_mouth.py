@@ -74,13 +74,13 @@ def text_of(browser: Browser, name: str) -> str:
 
 
 def read_aloud(browser: Browser) -> None:
-    """Record for two seconds, on however busy a machine, and wait for what comes of it."""
+    """Record for two seconds, also on a busy machine, and wait for the outcome."""
     browser.evaluate(
         "(async () => {"
-        " const { FaceRecording, TOO_SLOW } = await import('/recording.js');"
+        " const { FaceRecording } = await import('/face-recording.js');"
         " const problem = FaceRecording.prototype.problem;"
         " FaceRecording.prototype.problem = function () {"
-        "   const found = problem.call(this); return found === TOO_SLOW ? null : found; };"
+        "   const key = problem.call(this); return key === 'tooSlow' ? null : key; };"
         "})()"
     )
     browser.evaluate("window.kouxing.readingS = 2")
@@ -91,7 +91,7 @@ def read_aloud(browser: Browser) -> None:
 
 
 def longer(recording: bytes) -> bytes:
-    """Return a longer recording of the same face, whose lips open with the sound's loudness."""
+    """Make a longer recording of the same face, whose lips open with the loudness."""
     size = 4 + int.from_bytes(recording[:4], "little")
     num_frames = json.loads(recording[4:size])["times"]
     points = np.frombuffer(recording, "<f4", 3 * len(LANDMARKS), size + 8 * num_frames)
@@ -107,7 +107,7 @@ def longer(recording: bytes) -> bytes:
 
 
 @pytest.mark.timeout(400)  # of a busy machine
-def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Browser) -> None:
+def test_learns_keeps_uses_and_forgets_a_mouth(system: System, browser: Browser) -> None:
     browser.evaluate(
         "window.realFetch = fetch; window.fetch = (url, options) => realFetch(url,"
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
@@ -153,7 +153,7 @@ def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Brow
     assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
 
 
-def test_a_recording_that_could_not_be_sent_is_not_lost(browser: Browser) -> None:
+def test_keeps_a_recording_that_could_not_be_sent(browser: Browser) -> None:
     browser.evaluate(
         "window.bodies = []; window.fetch ="
         " async (_, { body }) => { bodies.push(body); throw new Error('offline'); };"
@@ -166,12 +166,12 @@ def test_a_recording_that_could_not_be_sent_is_not_lost(browser: Browser) -> Non
     browser.evaluate("document.getElementById('learn-mouth').close()")
 
 
-def test_the_page_keeps_the_landmarks_that_are_learnt_from(browser: Browser) -> None:
-    kept = browser.evaluate("(async () => (await import('/recording.js')).LANDMARKS)()")
+def test_the_page_records_the_same_landmarks(browser: Browser) -> None:
+    kept = browser.evaluate("(async () => (await import('/face-recording.js')).LANDMARKS)()")
     assert tuple(kept) == LANDMARKS
 
 
-def test_without_a_camera_it_says_so(browser: Browser) -> None:
+def test_reports_a_missing_camera(browser: Browser) -> None:
     browser.evaluate(
         "navigator.mediaDevices.getUserMedia ="
         " () => Promise.reject(new DOMException('none', 'NotFoundError'))"
@@ -179,11 +179,11 @@ def test_without_a_camera_it_says_so(browser: Browser) -> None:
     browser.click("learn")
     browser.click("lesson-start")
     browser.wait_for("window.kouxing.state.lesson === 'problem'")
-    assert "no camera" in text_of(browser, "lesson-problem")
+    assert "No camera" in text_of(browser, "lesson-problem")
     browser.evaluate("document.getElementById('learn-mouth').close()")
 
 
-def test_where_no_camera_may_be_used_it_says_what_is_needed(browser: Browser) -> None:
+def test_explains_that_cameras_need_https(browser: Browser) -> None:
     browser.evaluate("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
     browser.click("learn")
     assert "https" in text_of(browser, "lesson-insecure")
