@@ -1,7 +1,7 @@
 """Media time, clock offsets and stalls.
 
-Media time is a sample index at 16 kHz, never a wall clock: it survives pauses, drift and hosts
-whose clocks disagree. Wall clocks are compared only to report latencies between hosts.
+Media time is a sample index at 16 kHz, never a wall clock. Pauses, drift and the clocks of other
+hosts do not affect it. Wall clocks are compared only to report latencies between hosts.
 """
 
 from __future__ import annotations
@@ -10,50 +10,50 @@ import math
 import time
 from collections import deque
 
-MEDIA_RATE_HZ = 16_000  # media time counts samples at this rate
-MAX_GAP_S = 10.0  # of media time without sound that is filled with frames
-STALL_LIMIT_S = 0.5  # longer than a busy machine keeps a process waiting
+MEDIA_RATE_HZ = 16_000
+MAX_GAP_S = 10.0  # a longer gap in media time gets no frames
+STALL_LIMIT_S = 0.5  # longer than a process waits for the processor of a busy machine
 
 
 def to_samples(time_s: float) -> int:
-    """Return media time in samples for seconds; negative times become 0."""
+    """Convert seconds to samples of media time; negative times become 0."""
     return max(0, round(time_s * MEDIA_RATE_HZ))
 
 
 def duration_to_samples(duration_s: float) -> int:
-    """Return a duration in samples for seconds; it may be negative."""
+    """Convert a duration, which may be negative, from seconds to samples."""
     return round(duration_s * MEDIA_RATE_HZ)
 
 
 def to_seconds(samples: int) -> float:
-    """Return seconds for media time in samples."""
+    """Convert samples of media time to seconds."""
     return samples / MEDIA_RATE_HZ
 
 
 class ClockOffset:
-    """Offset of a remote clock by four-timestamp exchange.
+    """Estimates the offset of a remote clock from four timestamps per exchange.
 
-    Of the last exchanges the one with the least round trip counts, since its error is bounded by
-    half of that round trip (Mills, RFC 5905, section 8).
+    It uses the recent exchange with the shortest round trip: half of the round trip bounds the
+    error (Mills, RFC 5905, section 8).
     """
 
     def __init__(self, num_exchanges: int = 16) -> None:
         self._exchanges: deque[tuple[int, int]] = deque(maxlen=num_exchanges)
 
     def update(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
-        """Take one exchange: sent and returned by our clock, received and replied by theirs."""
+        """Add one exchange: sent and returned on our clock, received and replied on theirs."""
         round_trip_ns = (returned_ns - sent_ns) - (replied_ns - received_ns)
         offset_ns = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
         self._exchanges.append((round_trip_ns, offset_ns))
 
     @property
     def offset_ms(self) -> float:
-        """Their clock minus ours, 0 before the first exchange."""
+        """Their clock minus ours; 0 before the first exchange."""
         return min(self._exchanges)[1] / 1e6 if self._exchanges else 0.0
 
 
 def now_ns() -> int:
-    """Return this host's wall clock."""
+    """Return the wall clock of this host, ns."""
     return time.time_ns()
 
 

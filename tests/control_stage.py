@@ -1,4 +1,4 @@
-"""Control between services that only say that they start what it asks for."""
+"""Control with two services that start every session at once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "f
 
 
 def beat(kind: str, address: str = "tcp://127.0.0.1:1", **fields: object) -> Heartbeat:
-    """Return what a service of some kind, with all its sockets at an address, says at that time."""
+    """Return the heartbeat of a service whose sockets all have one address."""
     return Heartbeat(
         service=kind, instance=kind, role="worker", state="ready", sent_ns=0,
         endpoints=dict.fromkeys(PROVIDED[kind], address), **fields,  # type: ignore[arg-type]
@@ -31,7 +31,7 @@ def beat(kind: str, address: str = "tcp://127.0.0.1:1", **fields: object) -> Hea
 
 
 class Stage:
-    """Control, and two services that start whatever it says."""
+    """Control and two services that start every session."""
 
     def __init__(self, *, insecure: bool) -> None:
         self.control = ControlService(
@@ -60,7 +60,7 @@ class Stage:
             bus.close()
 
     def stranger(self, key: Key | None, address: str = "") -> zmq.Socket[bytes]:
-        """Return a socket that calls itself as all others do; it may connect by a forwarder."""
+        """Return a socket with the same routing id each time; ``address`` may be a forwarder."""
         raw = self.sockets.socket(zmq.DEALER)
         self.strangers.append(raw)
         raw.setsockopt(zmq.ROUTING_ID, b"the same")
@@ -71,7 +71,7 @@ class Stage:
         return raw
 
     def open(self, raw: zmq.Socket[bytes], session: str, request: str = "1") -> Message:
-        """Ask for a session; return the answer."""
+        """Open a session; return the answer."""
         raw.send_multipart(encode(OpenSession(request=request, session=session)))
         self.step_until(lambda: bool(raw.poll(0)))
         answer = decode(raw.recv_multipart())
@@ -79,7 +79,7 @@ class Stage:
         return answer
 
     def step_until(self, condition: Callable[[], object]) -> None:
-        """Let control and the services work."""
+        """Run control and the services until a condition holds."""
         end_s = time.monotonic() + 20
         while not condition():
             assert time.monotonic() < end_s

@@ -18,21 +18,21 @@ from kouxing.shared.endpoints import (
 
 
 class ControlConfig(ServiceConfig):
-    """Control's own keys."""
+    """The settings of control."""
 
     control: BoundEndpoint = "tcp://127.0.0.1:5550"
     """Address that control binds to take commands. For a host name, control binds every address of
     this host."""
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
-    """Where control publishes events."""
+    """Address at which control publishes events."""
     max_sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 64
-    """Sessions that may be open at once; of one key, three quarters of them."""
+    """Maximum number of open sessions; one key can have three quarters of them."""
     max_load: Annotated[float, Field(ge=0.1, le=1000)] = 0.8
-    """Share of a worker's time that sessions may take; the rest is for those that move."""
+    """Share of a worker's time for new sessions; the rest is for sessions that move."""
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which a session is closed."""
     lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9
-    """Seconds without heartbeat after which a service counts as lost."""
+    """Seconds without a heartbeat after which a service is lost."""
 
     @property
     def bound_control(self) -> str:

@@ -38,7 +38,7 @@ class Placement:
         Raises
         ------
         Refusal
-            No ready worker provides one of the endpoints, or none has room.
+            No ready worker provides one of the endpoints, or all workers are busy.
         """
         workers: dict[str, str] = {}
         needed = list(CLIENT_NEEDS)

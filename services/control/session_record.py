@@ -42,7 +42,7 @@ class SessionRecord:
     speaking: bool = False
     speech_time: int = 0  # media time at which the newest speech started
     next_sequence: int = 1  # first audio message that a new recognizer would need
-    resume_sequence: int | None = None  # first one that the client resends; None: none
+    resume_sequence: int | None = None  # first one to resend; None: the recognizer stays
     media_time: int = 0  # its phones are final up to here
 
     @property

@@ -128,7 +128,7 @@ class StartSession(Message):
 class SessionStarted(Message):
     """A service serves a session.
 
-    The session's phones are final up to ``media_time``; 0 if the service keeps none.
+    The session's phones are final up to ``media_time``; 0 if the service has no phones.
     """
 
     request: Name  # of the start-session

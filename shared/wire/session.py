@@ -58,7 +58,7 @@ class SessionFacts:
     language: Name | None = None  # of the phones
     frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # of the FAP frames
     delay_ms: Annotated[float, Meta(ge=0, le=1000)] | None = None  # from audio to its FAP frame
-    lips: Name | None = None  # the lip model of a face whose settings name none
+    lips: Name | None = None  # lip model of a face without a chosen one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -65,7 +65,7 @@ def section(heading: str, document: str = PROTOCOL) -> str:
 
 
 def table(text: str, number: int = 0) -> list[list[str]]:
-    """Return the cells of a table in a text, without its header; no rows if there is none."""
+    """Return the rows of a table in a text, without its header; an empty list without a table."""
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
     rows = tables[number].splitlines() if tables else []
     return [[cell.strip() for cell in row.strip("|").split(" |")] for row in rows[2:]]

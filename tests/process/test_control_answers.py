@@ -1,4 +1,4 @@
-"""An answer is repeated to whom it belongs, and its token to nobody else."""
+"""Control repeats an answer, with its token, only to the client that sent the request."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_repeated_request_gets_the_same_answer(stage: Stage) -> None:
 
 @pytest.fixture
 def link(stage: Stage) -> Iterator[Link]:
-    """Pass on what comes to control."""
+    """Forward connections to control."""
     port = stage.control.endpoints["commands"].partition(" ")[0].rpartition(":")[2]
     made = Link((), socket.create_server(("127.0.0.1", 0)), ("127.0.0.1", int(port)))
     made.start()
@@ -48,8 +48,8 @@ def link(stage: Stage) -> Iterator[Link]:
     made.close()
 
 
-def cut_off_before_it_is_told(stage: Stage, link: Link) -> tuple[zmq.Socket[bytes], str]:
-    """Return a client that never gets the answer to its request, and the token in it."""
+def disconnect_before_the_answer(stage: Stage, link: Link) -> tuple[zmq.Socket[bytes], str]:
+    """Return a client that misses the answer to its request, and the token in that answer."""
     address = f"tcp://127.0.0.1:{link.listener.getsockname()[1]}"
     client = stage.stranger(stage.control.key and user_key(), address)
     client.send_multipart(encode(OpenSession(request="1", session="mine")))
@@ -66,7 +66,7 @@ def cut_off_before_it_is_told(stage: Stage, link: Link) -> tuple[zmq.Socket[byte
 
 
 def test_a_client_that_missed_the_answer_opens_the_session_again(stage: Stage, link: Link) -> None:
-    client, lost = cut_off_before_it_is_told(stage, link)
+    client, lost = disconnect_before_the_answer(stage, link)
     opened = stage.open(client, "mine")
     assert isinstance(opened, SessionOpened)
     assert opened.token not in ("", lost)
@@ -75,7 +75,7 @@ def test_a_client_that_missed_the_answer_opens_the_session_again(stage: Stage, l
 
 
 def test_a_session_with_audio_is_not_opened_again(stage: Stage, link: Link) -> None:
-    client, _ = cut_off_before_it_is_told(stage, link)
+    client, _ = disconnect_before_the_answer(stage, link)
     record = stage.control._sessions.find("mine")
     recognizer = dataclasses.replace(
         stage.control._registry["recognizer"].heartbeat, sessions={"mine": SessionInput(sequence=1)}

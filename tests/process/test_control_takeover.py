@@ -1,4 +1,4 @@
-"""A control that starts again learns the sessions from the services, and only what they may say."""
+"""A restarted control learns the sessions from the services."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ PLACED = {
 
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no limit of control pass by itself, however slow the machine is."""
+    """Extend the time limits of control for slow machines."""
     monkeypatch.setattr(takeover, "TAKEOVER_S", 60.0)
     monkeypatch.setattr(control_service, "START_TIMEOUT_S", 60.0)
 
 
-def served(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
-    """Return a session that an earlier control has placed at the services of the stage."""
+def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
+    """Return the report of a session that an earlier control has placed on these services."""
     start = StartSession(
         session="mine", epoch=4, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
         num_channels=1, record=False, paced=True, endpoints=endpoints,
@@ -51,7 +51,7 @@ def served(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStart
 
 
 def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
-    """Return the next messages that control sends to a socket."""
+    """Return the next messages from control on a socket."""
     received: list[Message] = []
     end_s = time.monotonic() + 20
     while len(received) < num:
@@ -66,7 +66,7 @@ def test_restores_a_session_unchanged(stage: Stage, client: Socket) -> None:
     answers(stage, synthesizer)  # its heartbeat is answered
     answers(stage, recognizer)
     face = FaceSettings(lips="learnt", expressiveness=1.5)
-    recognizer.send(served(face=face))
+    recognizer.send(report(face=face))
     for service in stage.services:
         (start,) = answers(stage, service)
         assert isinstance(start, StartSession)
@@ -80,7 +80,7 @@ def test_defers_a_request_until_its_session_is_restored(stage: Stage, client: So
     client.send(CloseSession(session="mine", token="t", request="1"))
     while not stage.control._requests._deferred:
         stage.control.step(0.01)
-    stage.services[0].send(served())
+    stage.services[0].send(report())
     assert answers(stage, client) == [Done(session="mine", request="1")]
 
 
@@ -90,7 +90,7 @@ def test_repeats_the_answer_to_a_client_of_a_restored_session(stage: Stage) -> N
         client.send(OpenSession(session="other", request="1"))
         _, start = answers(stage, stage.services[0], 2)
         assert isinstance(start, StartSession)
-        stage.services[0].send(served(client=start.client, client_request="2"))
+        stage.services[0].send(report(client=start.client, client_request="2"))
         answers(stage, stage.services[0])  # it is taken over, before the client asks
         client.send(OpenSession(session="mine", request="2"))
         (opened,) = answers(stage, client)
@@ -104,9 +104,9 @@ def test_only_the_recognizer_of_a_session_may_report_it(
 ) -> None:
     recognizer, synthesizer = stage.services
     if sender == "synthesizer":
-        synthesizer.send(served())
+        synthesizer.send(report())
     else:
-        recognizer.send(served({**PLACED, "audio": "tcp://127.0.0.1:2"}))
+        recognizer.send(report({**PLACED, "audio": "tcp://127.0.0.1:2"}))
     stage.control._takeover.end_s = time.monotonic() + 0.5
     client.send(CloseSession(session="mine", token="t", request="1"))
     (answer,) = answers(stage, client)
@@ -118,7 +118,7 @@ def test_moves_a_session_without_synthesizer_at_the_deadline(
     stage: Stage,
 ) -> None:
     recognizer, synthesizer = stage.services
-    recognizer.send(served({**PLACED, "faps": "tcp://127.0.0.1:3"}))
+    recognizer.send(report({**PLACED, "faps": "tcp://127.0.0.1:3"}))
     stage.control._takeover.end_s = time.monotonic() + 0.5
     starts: list[StartSession] = []
     while not starts or starts[-1].epoch == 4:

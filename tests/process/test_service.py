@@ -33,7 +33,7 @@ pytestmark = pytest.mark.process
 
 
 class Slow(Service):
-    """Takes 5 ms for a message; counts what its loop does."""
+    """Takes 5 ms for a message; counts ticks, heartbeats and messages."""
 
     kind = ServiceKind(name="slow", role="worker")
 
@@ -131,7 +131,7 @@ def test_warns_if_an_insecure_service_is_reachable_from_other_hosts(
 
 
 class Worker(Service):
-    """Serves whatever it is told; notes what happens in which order."""
+    """Records what happens, in order."""
 
     kind = ServiceKind(name="worker", role="worker")
 
@@ -151,13 +151,13 @@ class Worker(Service):
 
 
 class Control:
-    """Answers heartbeats as the process that it is said to be."""
+    """Answers heartbeats under the instance name ``instance``."""
 
     def __init__(self) -> None:
         self.bus = Bus()
         self.socket = self.bus.bind_router("tcp://127.0.0.1:*", "control.commands")
         self.instance = "control-1"
-        self.stops: list[str] = []  # what a heartbeat is answered with
+        self.stops: list[str] = []  # sessions to stop, before each reply
         self.beats: list[Heartbeat] = []
         self.starts: list[StartSession] = []
         self.peer = NO_PEER
@@ -232,12 +232,12 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     control.stops = ["s0"]
     answering = threading.Thread(target=control.answer)
 
-    def stand_still(*_: object) -> None:
+    def stall(*_: object) -> None:
         time.sleep(RESYNC_AFTER_S + 0.1)
         worker.happened.append("input")
         answering.start()
 
-    worker._handlers[worker.input][Progress] = stand_still
+    worker._handlers[worker.input][Progress] = stall
     monkeypatch.setattr(worker, "on_tick", lambda _now_s: worker.happened.append("tick"))
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
