@@ -52,7 +52,7 @@ class Connection(ABC):
 
 
 class DatagramConnection(Connection):
-    """UDP. Receipt is not confirmed, but this machine reports when no program listens on it."""
+    """UDP. Receipt is not confirmed, but a local port without a listener is reported."""
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)

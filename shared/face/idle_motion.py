@@ -27,7 +27,7 @@ _DEGREE = math.pi / 180.0 / RADIANS_PER_ANGLE_UNIT
 _BLINK_MEDIAN_S = 3.0
 _BLINK_LOG_SD = 0.5
 _BLINK_MIN_S = 0.6
-_LID_FALL_S, _LID_SHUT_S, _LID_RISE_S = 0.08, 0.03, 0.16
+_LID_FALL_S, _LID_CLOSED_S, _LID_RISE_S = 0.08, 0.03, 0.16
 UPPER_LID, LOWER_LID = 900.0, 150.0  # the sum slightly exceeds the open eye's 1024
 
 _FIXATION_MEAN_S = 1.4
@@ -126,12 +126,12 @@ class IdleMotion:
 
     def _lid(self, time_s: float) -> float:
         """Return how far the lids are closed, 0 to 1."""
-        while time_s > self._blink_s + _LID_FALL_S + _LID_SHUT_S + _LID_RISE_S:
+        while time_s > self._blink_s + _LID_FALL_S + _LID_CLOSED_S + _LID_RISE_S:
             self._blink_s = self._draw_blink(self._blink_s)
         since_s = time_s - self._blink_s
-        if since_s < _LID_FALL_S + _LID_SHUT_S:
+        if since_s < _LID_FALL_S + _LID_CLOSED_S:
             return smooth_step(since_s / _LID_FALL_S)
-        return 1.0 - smooth_step((since_s - _LID_FALL_S - _LID_SHUT_S) / _LID_RISE_S)
+        return 1.0 - smooth_step((since_s - _LID_FALL_S - _LID_CLOSED_S) / _LID_RISE_S)
 
     def _gaze(self, time_s: float) -> NDArray[np.float64]:
         """Return yaw (left) and pitch (down) of the gaze in space."""

@@ -29,9 +29,9 @@ both eyes of ARKit. In VRM, "blink" holds what both eyes have in common, "blinkL
 weight in VRM: it distinguishes vowels, but consonants also raise it and have no shape.
 
 Equation (2) is solved exactly by block pivoting (J. Kim, H. Park, "Fast nonnegative matrix
-factorization", SIAM J. Scientific Computing 33(6), 2011; here with two bounds): guess which weights
-are 0, which are 1 and which are in between, solve for the latter, and move the weights that violate
-a bound or an optimality condition.
+factorization", SIAM J. Scientific Computing 33(6), 2011; here with two bounds). Guess which weights
+are 0, which are 1 and which are free. Solve for the free weights. Then move the weights that
+violate a bound or an optimality condition, and repeat.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.property
 KEPT_S = 3.0  # events repeated for a new synthesizer
 LARGEST_STEP = 1.2  # relative to the largest undisturbed step
 UNSEEN = 1.0  # FAP units; smaller steps are invisible
-SHUT, NEARLY_SHUT = 12.0, 35.0  # FAP units between inner lips
+CLOSED, NEARLY_CLOSED = 12.0, 35.0  # FAP units between inner lips
 RATE_HZ = 50.0
 JAW, EYELID, HEAD_PITCH, LOWER_LIP = 3, 19, 48, 5  # FAPs
 
@@ -134,10 +134,10 @@ def gaps(frames: Sequence[Frame]) -> NDArray[np.float32]:
     return gap
 
 
-def assert_shut_in_time(frames: Sequence[Frame], lips: str) -> None:
+def assert_closed_in_time(frames: Sequence[Frame], lips: str) -> None:
     plain, moved = gaps(undisturbed(lips)), gaps(frames)
-    for number in np.flatnonzero(plain < SHUT):
-        assert moved[max(0, number - 1) : number + 2].min() < NEARLY_SHUT
+    for number in np.flatnonzero(plain < CLOSED):
+        assert moved[max(0, number - 1) : number + 2].min() < NEARLY_CLOSED
 
 
 cuts = st.integers(0, 10_000).map(lambda number: number % (len(events()) - 60) + 40)
@@ -150,7 +150,7 @@ few_examples = settings(max_examples=8)
 def test_another_synthesizer_continues_anywhere(lips: str, cut: int) -> None:
     frames = with_another_synthesizer(lips, cut)
     assert_unseen(frames, lips)
-    assert_shut_in_time(frames, lips)
+    assert_closed_in_time(frames, lips)
 
 
 @few_examples
@@ -158,7 +158,7 @@ def test_another_synthesizer_continues_anywhere(lips: str, cut: int) -> None:
 def test_another_recognizer_continues_anywhere(lips: str, cut: int) -> None:
     frames = with_another_recognizer(lips, cut)
     assert_unseen(frames, lips)
-    assert_shut_in_time(frames, lips)
+    assert_closed_in_time(frames, lips)
 
 
 @pytest.mark.parametrize("fap", [JAW, LOWER_LIP, EYELID, HEAD_PITCH])
@@ -176,4 +176,4 @@ def test_continues_during_the_largest_movement(
     )
     frames = move("learnt", cut)
     assert_unseen(frames, "learnt")
-    assert_shut_in_time(frames, "learnt")
+    assert_closed_in_time(frames, "learnt")

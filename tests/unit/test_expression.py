@@ -21,7 +21,7 @@ pytestmark = pytest.mark.unit
 
 UPPER, LOWER = np.array([[4, 8, 9, 51, 55, 56], [5, 10, 11, 52, 57, 58]]) - 1
 JAW, CORNER, BROW = 3 - 1, 12 - 1, FAP_NUMBER["raise_l_m_eyebrow"] - 1
-SHUT = 20.0  # FAP units between lips
+CLOSED = 20.0  # FAP units between lips
 FRAME_S = 0.02
 
 
@@ -71,7 +71,7 @@ def test_surprise_opens_the_mouth_only_without_speech() -> None:
     assert gaps(shown(face, 3.0)[-1]).max() > 300.0
     face.process(SpeechChange(active=True, time_s=3.0))
     closing = shown(face, 3.3)
-    assert gaps(closing[-1]).max() <= SHUT
+    assert gaps(closing[-1]).max() <= CLOSED
     assert closing[-1][JAW] < 5.0
     assert closing[-1][BROW] > 100.0
 
@@ -107,9 +107,9 @@ def test_expressions_do_not_open_closures(
     expressive.set_expressions(wanted, 60.0)
     mixed = np.concatenate([begun.reshape(-1, NUM_FAPS), shown(expressive, 2.0)])
     from_sound = slice(round(0.3 / FRAME_S), None)
-    shut = gaps(frames)[from_sound] <= SHUT
-    assert (gaps(mixed)[from_sound][shut] <= gaps(frames)[from_sound][shut] + 0.01).all()
-    assert (gaps(mixed)[from_sound][~shut] >= SHUT - 0.01).all()
+    closed = gaps(frames)[from_sound] <= CLOSED
+    assert (gaps(mixed)[from_sound][closed] <= gaps(frames)[from_sound][closed] + 0.01).all()
+    assert (gaps(mixed)[from_sound][~closed] >= CLOSED - 0.01).all()
 
 
 def test_surprise_does_not_overextend_the_jaw() -> None:

@@ -41,11 +41,11 @@ def test_closed_lips_stay_closed(amount: float) -> None:
     rng = np.random.default_rng(5)
     for _ in range(200):
         faps = rng.normal(0.0, 150.0, NUM_FAPS).astype(np.float32)
-        shut = gaps(faps) <= 20.0
+        closed = gaps(faps) <= 20.0
         changed = expressed(faps, amount)
-        np.testing.assert_array_equal(changed[UPPER][shut], faps[UPPER][shut])
-        np.testing.assert_array_equal(changed[LOWER][shut], faps[LOWER][shut])
-        assert (gaps(changed)[~shut] > 20.0 - 1e-3).all()
+        np.testing.assert_array_equal(changed[UPPER][closed], faps[UPPER][closed])
+        np.testing.assert_array_equal(changed[LOWER][closed], faps[LOWER][closed])
+        assert (gaps(changed)[~closed] > 20.0 - 1e-3).all()
 
 
 @pytest.mark.parametrize("amount", [0.5, DEFAULT, 2.0])

@@ -300,8 +300,8 @@ def test_idle_motion_has_natural_statistics() -> None:
     faps = np.zeros((minutes * 60 * rate_hz, 68), dtype=np.float32)
     for k, row in enumerate(faps):
         motion.apply(row, k / rate_hz, State.SPEAKING)
-    shut = faps[:, 18] > 500.0
-    assert 12 < np.count_nonzero(shut[1:] & ~shut[:-1]) / minutes < 24  # blinks per minute
+    closed = faps[:, 18] > 500.0
+    assert 12 < np.count_nonzero(closed[1:] & ~closed[:-1]) / minutes < 24  # blinks per minute
     np.testing.assert_array_equal(faps[:, 18], faps[:, 19])
     head_deg = np.rad2deg(faps[:, 47:50] * 1e-5)
     assert (head_deg.std(axis=0) > 0.4).all()

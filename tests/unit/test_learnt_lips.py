@@ -9,7 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
-from kouxing.services.synthesizer.lips.learnt.closures import ClosingPhones, ClosureRule, shut_share
+from kouxing.services.synthesizer.lips.learnt.closures import (
+    ClosingPhones,
+    ClosureRule,
+    closure_share,
+)
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.learnt.track import LipTrack
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -361,7 +365,7 @@ def test_phones_are_no_evidence_against_a_closure() -> None:
     assert log_odds == [0.0, 0.0]
     phones.add(phone("p", 0.46, index=1), 0.4)
     assert phones.log_odds(0.5) > 2.0
-    assert [shut_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
+    assert [closure_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
 
 
 def test_other_phones_are_evidence_against_a_closure_in_recordings() -> None:

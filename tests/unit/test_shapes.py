@@ -88,9 +88,9 @@ def test_solution_is_optimal(name: str) -> None:
 @pytest.mark.parametrize("shapes", SHAPE_SETS.values(), ids=SHAPE_SETS)
 def test_closed_lips_and_lids_stay_closed(shapes: ShapeSet) -> None:
     inner = [FAP_NUMBER[name] - 1 for name in ("lower_t_midlip_o", "raise_b_midlip_o")]
-    shut = VISEMES[1].copy()  # p b m
-    shut[inner] = 0.0
-    assert shapes.faps(shapes.weights(shut))[inner].sum() > -60  # 1 mm
+    closed = VISEMES[1].copy()  # p b m
+    closed[inner] = 0.0
+    assert shapes.faps(shapes.weights(closed))[inner].sum() > -60  # 1 mm
     if shapes is not OCULUS:
         lids = neutral_faps(close_t_l_eyelid=UPPER_LID, close_b_l_eyelid=LOWER_LID)
         found = weights_by_name(lids, shapes)

@@ -26,7 +26,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.modifiers.expressiveness import JAW, LOWER, OPEN, SHUT, UPPER
+from kouxing.services.synthesizer.modifiers.expressiveness import CLOSED, JAW, LOWER, OPEN, UPPER
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import NUM_FAPS
@@ -91,11 +91,11 @@ class Expression:
 def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:
     """Add an expression (68,) to a face (68,), in place; ``free`` is the minimum of ``a``."""
     gap = -(faps[UPPER] + faps[LOWER])
-    room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - SHUT
+    room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED
     room = np.tile(np.minimum(room[:3], room[3:]), 2)  # inner and outer lip
-    apart = np.maximum(room / (OPEN - SHUT), free)
+    apart = np.maximum(room / (OPEN - CLOSED), free)
     change = -(expression[UPPER] + expression[LOWER])
-    change = np.clip(apart * change, np.minimum(SHUT - gap, 0.0), np.maximum(_WIDEST - gap, 0.0))
+    change = np.clip(apart * change, np.minimum(CLOSED - gap, 0.0), np.maximum(_WIDEST - gap, 0.0))
     upwards = (expression[LOWER] - expression[UPPER]) / 2.0
     upwards = np.where(upwards > 0.0, upwards, apart * upwards)
     upper, lower = -upwards - change / 2.0, upwards - change / 2.0

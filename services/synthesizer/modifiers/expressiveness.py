@@ -15,10 +15,10 @@ d       difference from the usual width or protrusion   FAP       (1,)
     x' = x + (e - 1) * max(x - 20, 0)                                       for e < 1
     d' = d + 2 * (e - 1) * d
 
-Closures are preserved. A lip within ``SHUT`` of its closed position does not move. Lips with a gap
-up to ``SHUT`` keep their gap, and so do lips whose lower lip touches the teeth (f). Very wide
-openings do not grow, so that the jaw does not drop too far. Horizontal movements are small but
-equally visible, so they count twice.
+Closures are preserved. A lip within ``CLOSED`` of its closed position does not move. Lips keep
+their gap if it is at most ``CLOSED``, or if the lower lip touches the teeth (f). Very wide openings
+do not grow, so that the jaw does not drop too far. Horizontal movements are small but equally
+visible, so they count twice.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 
-SHUT = 20.0  # largest gap of a closure, FAP units
+CLOSED = 20.0  # largest gap of a closure, FAP units
 OPEN = 80.0  # from this gap upwards, lips have the width of an open mouth
 _WIDEST = 900.0  # openings of this size do not grow
 _USUAL_WIDTH = -40.0  # FAP of a mouth corner in speech, from the dynamic visemes
@@ -58,17 +58,17 @@ class Expressiveness:
         if self.amount == 1.0:
             return
         upper, lower = -faps[UPPER], -faps[LOWER]  # openings
-        beyond = np.maximum(upper + lower - SHUT, 0.0)  # (6,) excess of the gaps
-        free_upper, free_lower = (np.maximum(lip - SHUT, 0.0) for lip in (upper, lower))
+        beyond = np.maximum(upper + lower - CLOSED, 0.0)  # (6,) excess of the gaps
+        free_upper, free_lower = (np.maximum(lip - CLOSED, 0.0) for lip in (upper, lower))
         free = free_upper + free_lower
         # a lower lip at the teeth (f) is also a closure
-        apart = np.minimum(free_lower / (OPEN - SHUT), 1.0)
+        apart = np.minimum(free_lower / (OPEN - CLOSED), 1.0)
         grown = apart * self._growth(np.minimum(free, beyond))
         share = grown / np.maximum(free, 1.0)
         faps[UPPER] -= share * free_upper
         faps[LOWER] -= share * free_lower
         gap = float(upper[0] + lower[0])
-        is_open = float(apart[0]) * min(max((gap - SHUT) / (OPEN - SHUT), 0.0), 1.0)
+        is_open = float(apart[0]) * min(max((gap - CLOSED) / (OPEN - CLOSED), 0.0), 1.0)
         faps[JAW] += is_open * self._growth(np.maximum(faps[JAW], 0.0))
         width = faps[_WIDTH] - _USUAL_WIDTH
         # at rest the mouth is wider than in speech, but not spread

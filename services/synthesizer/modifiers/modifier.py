@@ -14,7 +14,7 @@ from kouxing.services.synthesizer.lips.lip_model import Articulation
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameContext:
-    """What is known when a frame is made."""
+    """Information about a frame that modifiers use."""
 
     time_s: float  # media time of the frame
     known_s: float  # media time up to which the audio is known

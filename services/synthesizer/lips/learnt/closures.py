@@ -168,7 +168,7 @@ def log_odds_of(probability: float) -> float:
     return math.log(clipped / (1.0 - clipped))
 
 
-def shut_share(log_odds: float, doubt: float) -> float:
+def closure_share(log_odds: float, doubt: float) -> float:
     """Return how far lips move to their closure, from 0 (unchanged) to 1 (closed)."""
     return smooth_step(0.5 + 0.5 * log_odds / doubt)
 

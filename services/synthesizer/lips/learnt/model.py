@@ -29,10 +29,10 @@ from kouxing.services.synthesizer.lips.learnt.closures import (
     ClosingPhones,
     ClosureRule,
     close_lips,
+    closure_share,
     lip_to_teeth,
     log_odds_of,
     separate_lips,
-    shut_share,
 )
 from kouxing.services.synthesizer.lips.learnt.track import HOLD_S, MAX_GAP_S, LipTrack
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
@@ -55,7 +55,7 @@ _REST_S = 0.15  # duration of the way to rest without sound
 _FLUSHED_S = 0.3  # audio whose lip frames may arrive after an interruption
 _MEMORY_S = 0.5
 _TEETH_LOG_ODDS = 1.0  # threshold for a phone f
-_SHUT_SHARE = 0.5  # lips count as closed from this share of the way to a closure
+_CLOSED_SHARE = 0.5  # lips count as closed from this share of the way to a closure
 _JITTER = 10.0  # FAP units: changes of this size are halved, smaller changes are reduced further
 _MAX_FAP = 4000.0  # FAP units; larger values are invalid
 _EPSILON = 1e-6  # FAP units, and FAP units per second
@@ -219,10 +219,10 @@ class LearntStream:
         closure = rule.log_odds(
             faps, log_odds_of(frame.closure), self._bilabials.log_odds(frame.time_s)
         )
-        lip_to_teeth(faps, shut_share(teeth, rule.doubt))
-        share = shut_share(closure, rule.doubt)
+        lip_to_teeth(faps, closure_share(teeth, rule.doubt))
+        share = closure_share(closure, rule.doubt)
         before, newest = self._shares
-        if before < _SHUT_SHARE <= newest:  # a new closure lasts at least two frames
+        if before < _CLOSED_SHARE <= newest:  # a new closure lasts at least two frames
             share = max(share, newest)
         self._shares = (newest, share)
         close_lips(faps, share)
