@@ -6,7 +6,7 @@ a high predicted probability needs no phone. Without a phone, the odds decrease 
 opening, so that lips open in time, and with rounding, because lips nearly meet in u and w. Phones
 are no evidence against a closure, so a p recognized as t cannot open closed lips. A phone on its
 own cannot close lips that are predicted to be wide open. In a complete recording phones are more
-reliable: other phones open the lips, and so does the middle of a vowel between two closing phones.
+reliable: other phones open the lips, also in the middle of a vowel between two closing phones.
 
 Phones alone decide about lower lip to upper teeth (f), which the lip predictor does not predict
 well.
