@@ -26,7 +26,7 @@ from kouxing.shared.wire.control import (
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.session import SessionFacts
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.process
 
 LOCAL = "tcp://127.0.0.1:*"
 FRAME_SAMPLES = 320  # 20 ms
