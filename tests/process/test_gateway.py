@@ -344,8 +344,8 @@ async def test_microphone_and_sample_choose_their_lips(
         for lips in ("learnt", "dynamic-visemes"):
             await microphone.send_json({"lips": lips})
             await receive_json(viewer, "lips", lips=lips)
-        await viewer.send_json({"play": "sample", "lips": "muscles"})
-        assert "lips must be one of" in (await receive_json(viewer, "error"))["text"]
+        await viewer.send_json({"play": "sample", "lips": 1})
+        assert "lips must be the name of a lip model" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"lips": "learnt"})
         assert "of the sample sentence only" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lips": "learnt"})
