@@ -1,6 +1,6 @@
 """Runs the command line, as ``kouxing`` or ``python -m kouxing``.
 
-Ctrl-C ends a command that still imports what it needs, without a traceback.
+Ctrl-C during slow imports ends the command without a traceback.
 """
 
 from __future__ import annotations
