@@ -266,12 +266,12 @@ class ControlService(Service):
 
     def _on_session_started(self, started: SessionStarted, instance: str) -> None:
         record = self._sessions.get(started.session)
-        if started.start is not None:
-            if not self._takeover.add(started.start, instance):
+        if started.start is not None and record is None:
+            if self._takeover.add(started.start, instance):
+                self._restore_sessions()
+            else:
                 text = f"{instance} may not report this session"
                 self.warn("no-takeover", text, started.session)
-            elif record is None:
-                self._restore_sessions()
         elif record is not None and started.request == record.start_request:
             deferred = self._sessions.record_started(record, instance, started.media_time)
             self._send_start(record, deferred)

@@ -292,15 +292,3 @@ def test_the_stored_schema_is_current() -> None:
 
 def test_there_is_a_sample_of_every_kind() -> None:
     assert sorted(sample.kind for sample in SAMPLES) == sorted(MESSAGES)
-
-
-def test_kinds_are_class_names() -> None:
-    assert MESSAGES["fap-frame"].__name__ == "FapFrame"
-    for kind, cls in MESSAGES.items():
-        assert "".join(word.capitalize() for word in kind.split("-")) == cls.__name__
-
-
-def test_no_topic_is_a_prefix_of_another() -> None:
-    topics = [f"{kind}/{session}/" for kind in MESSAGES for session in ("a", "ab")]
-    for one in topics:
-        assert not any(other != one and other.startswith(one) for other in topics)

@@ -7,7 +7,6 @@ from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.session import Done, OpenSession
-from kouxing.shared.wire.speech import Phone
 
 pytestmark = pytest.mark.unit
 
@@ -84,10 +83,3 @@ def test_rejects_a_confidence_outside_0_to_1(confidence: float) -> None:
 def test_binary_fields_are_binary_in_msgpack() -> None:
     _, body = encode(AudioChunk(session="s", token="t", pcm=b"\x01\x02"))
     assert msgpack.unpackb(body)["pcm"] == b"\x01\x02"
-
-
-def test_decodes_an_encoded_phone() -> None:
-    phone = Phone(
-        session="s", index=2, symbol="zh", duration=800, confidence=0.25, final=True, media_time=5
-    )
-    assert decode(encode(phone)) == phone

@@ -64,10 +64,6 @@ def test_port_0_is_a_free_port() -> None:
     assert int(moved["KOUXING_GATEWAY_PORT"]) > 0
 
 
-def test_control_starts_first() -> None:
-    assert next(iter(KINDS)) == "control"
-
-
 def test_more_workers_bind_other_ports_of_the_same_address() -> None:
     settings = read_settings(
         assignments={"recognizer.audio": "tcp://127.0.0.5:5560", "recognizer.instance": "ours"}
