@@ -42,7 +42,6 @@ from kouxing.shared.zap import Zap, answer_handshakes
 
 QUEUE_LENGTH = 20_000  # messages: a subscriber to a recording may pause for 400 s
 LIVE_BUFFER = 65_536  # bytes in the kernel: a few seconds of FAP frames
-AUDIO_QUEUE_LENGTH = 500  # chunks; a sender that is faster than the recognizer then waits
 # Few answers to audio wait: not every client reads them.
 AUDIO = Limits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
 COMMANDS = Limits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
@@ -340,8 +339,6 @@ class Bus:
     ----------
     zap
         The allowed keys; None without encryption.
-    connect_ms
-        Timeout of one attempt to connect, for sockets that are opened later.
 
     Raises
     ------
@@ -350,7 +347,6 @@ class Bus:
     """
 
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
-        self.connect_ms = CONNECT_MS
         self._context = zmq.Context()
         self._limiter = ConnectionLimiter(extra_connections)
         self._key = key
@@ -445,7 +441,7 @@ class Bus:
         raw.setsockopt(zmq.RCVHWM, queue_length)
         raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
         raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
-        raw.setsockopt(zmq.CONNECT_TIMEOUT, self.connect_ms)
+        raw.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_MS)
         raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         raw.setsockopt(zmq.LINGER, 0)
         return raw

@@ -15,12 +15,12 @@ import aiohttp
 import msgpack
 import numpy as np
 import pytest
+from kouxing_client.base import MAX_UNACKNOWLEDGED
 from numpy.typing import NDArray
 from pythonosc.osc_bundle import OscBundle
 
 from kouxing.services.gateway.sample import SAMPLE_FILE, SAMPLE_TEXT
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
-from kouxing.shared.bus import AUDIO_QUEUE_LENGTH
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.audio import AudioChunk
@@ -237,7 +237,7 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
 ) -> None:
     system = own_system
     system.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # not bound yet
-    num_chunks = AUDIO_QUEUE_LENGTH + 100
+    num_chunks = MAX_UNACKNOWLEDGED + 100
     last_pcm = b"\x02\x00" * 320
     async with connected(own_gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 16000})
@@ -247,16 +247,16 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
         await microphone.send_json({"flush": True})
         await until(lambda: bool(system.flushed))  # the gateway has read all chunks
         system.do(system.bind_audio)
-        await until(lambda: len(system.audio_messages) == AUDIO_QUEUE_LENGTH)
+        await until(lambda: len(system.audio_messages) == MAX_UNACKNOWLEDGED)
         await microphone.send_json({"skip": 320})
         await microphone.send_bytes(last_pcm)
-        await until(lambda: len(system.audio_messages) > AUDIO_QUEUE_LENGTH)
-    *queued, last = system.audio_messages[: AUDIO_QUEUE_LENGTH + 1]
-    assert [chunk.media_time for chunk in queued] == [320 * n for n in range(AUDIO_QUEUE_LENGTH)]
+        await until(lambda: len(system.audio_messages) > MAX_UNACKNOWLEDGED)
+    *queued, last = system.audio_messages[: MAX_UNACKNOWLEDGED + 1]
+    assert [chunk.media_time for chunk in queued] == [320 * n for n in range(MAX_UNACKNOWLEDGED)]
     assert isinstance(last, AudioChunk)
     assert last.pcm == last_pcm
     assert last.media_time == 320 * (num_chunks + 1)
-    assert last.sequence == AUDIO_QUEUE_LENGTH + 1
+    assert last.sequence == MAX_UNACKNOWLEDGED + 1
 
 
 @async_test
@@ -345,7 +345,9 @@ async def test_microphone_and_sample_choose_their_lips(
             await microphone.send_json({"lips": lips})
             await receive_json(viewer, "lips", lips=lips)
         await viewer.send_json({"play": "sample", "lips": 1})
-        assert "lips must be the name of a lip model" in (await receive_json(viewer, "error"))["text"]
+        assert (
+            "lips must be the name of a lip model" in (await receive_json(viewer, "error"))["text"]
+        )
         await viewer.send_json({"lips": "learnt"})
         assert "of the sample sentence only" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lips": "learnt"})
