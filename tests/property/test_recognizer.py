@@ -69,14 +69,14 @@ def recognize_chunks(chunks: list[np.ndarray], rate_hz: int) -> list[StreamOutpu
 @pytest.mark.slow
 @settings(max_examples=12)
 @given(cuts=CUTS, rate_hz=st.sampled_from([16_000, 44_100]))
-def test_any_chunking_gives_the_same_phones(cuts: list[int], rate_hz: int) -> None:
+def test_chunks_do_not_affect_phones(cuts: list[int], rate_hz: int) -> None:
     assert recognize_chunks(pieces(HELLO, cuts), rate_hz) == recognize_chunks([HELLO], rate_hz)
 
 
 @pytest.mark.slow
 @settings(max_examples=6)
 @given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 20))
-def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: int) -> None:
+def test_other_sessions_do_not_affect_scores(seed: int, num_sessions: int) -> None:
     model, rng = the_model(), np.random.default_rng(seed)
     frames = model.create_front_end().accept_waveform(HELLO)
     parts = [frames[start : start + 40] for start in rng.integers(0, 150, num_sessions)]
@@ -101,7 +101,7 @@ def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: 
 
 @settings(max_examples=30)
 @given(cuts=CUTS, rate_hz=st.integers(8_000, 48_000))
-def test_resampling_in_any_chunks(cuts: list[int], rate_hz: int) -> None:
+def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
     resampler = Resampler(rate_hz)
     parts = [resampler.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
     whole = to_16_khz(NOISE, rate_hz)
@@ -110,7 +110,7 @@ def test_resampling_in_any_chunks(cuts: list[int], rate_hz: int) -> None:
 
 @settings(max_examples=30)
 @given(cuts=CUTS, half_width=st.integers(1, 3))
-def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
+def test_chunks_do_not_affect_features(cuts: list[int], half_width: int) -> None:
     log_mel, differences = LogMel(), Differences(half_width)
     parts = [
         differences.append(cepstra(log_mel.accept_waveform(piece))) for piece in pieces(NOISE, cuts)
@@ -121,7 +121,7 @@ def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
 
 @settings(max_examples=30)
 @given(cuts=CUTS, name=st.sampled_from(["gmm", "neural"]))
-def test_front_ends_in_any_chunks(cuts: list[int], name: str) -> None:
+def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
     model = the_model(name)
     front_end = model.create_front_end()
     parts = [front_end.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
@@ -135,7 +135,7 @@ def test_front_ends_in_any_chunks(cuts: list[int], name: str) -> None:
     num_stable_frames=st.integers(1, 6),
     before=st.just(9),
 )
-def test_the_output_rule_is_the_paper_s(
+def test_output_rule_matches_the_paper(
     phones: list[int], num_stable_frames: int, before: int
 ) -> None:
     """Li 2011, eq. 4, word for word."""
@@ -150,7 +150,7 @@ def test_the_output_rule_is_the_paper_s(
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), num_frames=st.integers(1, 400))
-def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
+def test_the_search_covers_each_frame_once(seed: int, num_frames: int) -> None:
     topology = the_model().topology
     rng = np.random.default_rng(seed)
     decoder = Decoder(topology)
@@ -170,7 +170,7 @@ def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31), num_frames=st.integers(2, 300), data=st.data())
-def test_a_search_goes_on_from_where_another_stands(
+def test_a_search_continues_from_the_state_of_another(
     seed: int, num_frames: int, data: st.DataObject
 ) -> None:
     topology = the_model().topology
@@ -189,7 +189,7 @@ def test_a_search_goes_on_from_where_another_stands(
         assert decoder.final_path() == one.final_path()
 
 
-def test_phones_too_many_are_withdrawn() -> None:
+def test_withdraws_surplus_phones() -> None:
     model = the_model()
     silence = model.inventory.silence
     rows = settled_rows(model)
@@ -214,7 +214,7 @@ def test_phones_too_many_are_withdrawn() -> None:
     assert count_errors(expected[1:], found).rate < 0.2
 
 
-def test_provisional_scores_that_hold_give_the_same_phones_sooner() -> None:
+def test_correct_provisional_scores_give_the_same_phones_earlier() -> None:
     model = the_model()
     rows = settled_rows(model)
 

@@ -26,7 +26,7 @@ PHONES = st.builds(
 
 
 @given(phones=st.lists(PHONES, max_size=30), text=st.sampled_from(["", "你好欢迎来到"]))
-def test_what_is_shown_is_of_the_phones_that_stand(phones: list[Phone], text: str) -> None:
+def test_shows_exactly_the_phones_that_are_not_withdrawn(phones: list[Phone], text: str) -> None:
     track = SyllableTrack(MANDARIN, characters_of(text, MANDARIN))
     shown: dict[int, Syllable] = {}
     standing: set[int] = set()

@@ -42,7 +42,7 @@ def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
     assert vowels[0].onset_s == pytest.approx(0.0075)
 
 
-def test_vowels_are_where_the_sound_is(vowels: list[Phone]) -> None:
+def test_aligns_vowels_with_their_sound(vowels: list[Phone]) -> None:
     samples, rate_hz = read_audio(VOWELS_FILE)
     loud = np.square(samples[:, 0]).mean()
     for phone in spoken(vowels, load_inventory()):
@@ -97,7 +97,7 @@ def test_textgrid_covers_the_whole_time() -> None:
     assert "        intervals: size = 5" in lines
 
 
-def test_nothing_said_is_one_empty_interval() -> None:
+def test_a_silent_textgrid_has_one_empty_interval() -> None:
     assert 'text = ""' in format_phones([], "textgrid", 1.0)
     assert format_phones([], "csv", 1.0).count("\n") == 1
 
@@ -112,7 +112,7 @@ def test_nothing_said_is_one_empty_interval() -> None:
         ("said.txt", PhoneFormat.CSV, "index,phone"),
     ],
 )
-def test_the_suffix_tells_the_form(
+def test_the_suffix_selects_the_format(
     name: str, form: PhoneFormat | None, beginning: str, tmp_path: Path
 ) -> None:
     align(
@@ -124,7 +124,7 @@ def test_the_suffix_tells_the_form(
     assert (tmp_path / name).read_text().startswith(beginning)
 
 
-def test_a_text_that_does_not_fit_is_told_and_fails(
+def test_rejects_a_text_that_does_not_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wrong.txt").write_text("今天是2024年10月1日，Mike走了", encoding="utf-8")
@@ -138,7 +138,7 @@ def test_a_text_that_does_not_fit_is_told_and_fails(
     assert output.is_file()
 
 
-def test_a_missing_file_of_text_is_not_taken_for_the_text() -> None:
+def test_rejects_a_missing_text_file() -> None:
     with pytest.raises(UserError, match=r"nowhere\.txt: there is no such file"):
         align(DEMO / "hello-female.wav", "nowhere.txt")
 
@@ -153,7 +153,7 @@ def test_a_missing_file_of_text_is_not_taken_for_the_text() -> None:
          " liǎn shí shí shuō chū lái", True),
     ],
 )  # fmt: skip
-def test_the_fit_tells_whether_the_text_was_said(text: str, *, fits: bool) -> None:
+def test_the_fit_shows_whether_the_text_was_spoken(text: str, *, fits: bool) -> None:
     model = load_model(model_path("blocks"))
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     syllables = model.inventory.pronounce(text)
@@ -183,11 +183,11 @@ def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
     }  # fmt: skip
 
 
-def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
+def test_rejects_an_unknown_suffix(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"ends in \.txt, \.csv, \.json, \.textgrid"):
         align(VOWELS_FILE, "啊", output=tmp_path / "said.xml")
 
 
-def test_unknown_style() -> None:
+def test_rejects_an_unknown_style() -> None:
     with pytest.raises(UserError, match="'xml'"):
         format_phones(PHONES, "xml", 1.0)

@@ -37,7 +37,7 @@ def write_zip(path: Path, content: bytes, method: int = zipfile.ZIP_DEFLATED) ->
         archive.writestr("format.npy", content)
 
 
-def test_arrays_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_arrays_round_trip(tmp_path: Path) -> None:
     arrays = {"a": np.arange(6).reshape(2, 3), "b": np.array("text"), "c": np.zeros((0, 4))}
     np.savez_compressed(tmp_path / "a.npz", allow_pickle=False, **arrays)
     again = read_arrays(tmp_path / "a.npz", MIB)
@@ -57,7 +57,7 @@ def peak_bytes_of(path: Path, load: object) -> int:
 
 
 @pytest.mark.parametrize("load", [load_model, Head.load])
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, load: object) -> None:
+def test_rejects_a_zip_bomb_before_unpacking_it(tmp_path: Path, load: object) -> None:
     with zipfile.ZipFile(
         tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1
     ) as archive:
@@ -78,7 +78,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, load: object) -
         (b"no array", zipfile.ZIP_DEFLATED),
     ],
 )
-def test_an_array_that_is_not_there_is_refused(tmp_path: Path, content: bytes, method: int) -> None:
+def test_rejects_a_truncated_array(tmp_path: Path, content: bytes, method: int) -> None:
     write_zip(tmp_path / "a.npz", content, method)
     tracemalloc.start()
     with pytest.raises(ValueError, match=r".+"):
@@ -87,6 +87,6 @@ def test_an_array_that_is_not_there_is_refused(tmp_path: Path, content: bytes, m
     tracemalloc.stop()
 
 
-def test_what_is_no_file_is_refused() -> None:
+def test_rejects_what_is_not_a_file() -> None:
     with pytest.raises(ValueError, match="not a file"):
         read_arrays(Path("/dev/zero"), MIB)

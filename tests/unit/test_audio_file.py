@@ -16,7 +16,7 @@ from tests.system import DEMO, VOWELS_FILE
 pytestmark = pytest.mark.unit
 
 
-def test_blocks_add_up_to_the_file(tmp_path: Path) -> None:
+def test_blocks_contain_the_whole_file(tmp_path: Path) -> None:
     samples = np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 2)).astype(np.float32)
     soundfile.write(tmp_path / "a.wav", samples, 22050, subtype="FLOAT")
     source = open_audio(tmp_path / "a.wav")
@@ -25,14 +25,14 @@ def test_blocks_add_up_to_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"])
-def test_every_sample_format_is_scaled_to_one(tmp_path: Path, subtype: str) -> None:
+def test_scales_every_sample_format_to_one(tmp_path: Path, subtype: str) -> None:
     sine = 0.5 * np.sin(np.arange(4000) * 0.1)
     soundfile.write(tmp_path / "a.wav", sine, 16000, subtype=subtype)
     read, _ = read_audio(tmp_path / "a.wav")
     np.testing.assert_allclose(read[:, 0], sine, atol=0.01)
 
 
-def test_rates_above_48_khz_are_resampled(tmp_path: Path) -> None:
+def test_resamples_rates_above_48_khz(tmp_path: Path) -> None:
     sine = 0.5 * np.sin(2 * np.pi * 440 * np.arange(192000) / 192000)
     soundfile.write(tmp_path / "a.wav", sine, 192000)
     read, rate_hz = read_audio(tmp_path / "a.wav")
@@ -42,7 +42,7 @@ def test_rates_above_48_khz_are_resampled(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_hour_is_read_without_holding_it(tmp_path: Path) -> None:
+def test_reads_an_hour_in_little_memory(tmp_path: Path) -> None:
     with soundfile.SoundFile(tmp_path / "hour.flac", "w", 8000, 1) as file:
         for _ in range(60):
             file.write(np.zeros(60 * 8000, np.float32))
@@ -60,9 +60,9 @@ def test_an_hour_is_read_without_holding_it(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (b"", "empty"),
-        (b"this is no sound", "no audio"),
+        (b"this is no sound", "cannot read audio"),
         (VOWELS_FILE.read_bytes()[:44], "no samples"),
-        (VOWELS_FILE.read_bytes()[:20], "no audio"),
+        (VOWELS_FILE.read_bytes()[:20], "cannot read audio"),
     ],
     ids=["empty", "text", "header only", "half a header"],
 )
@@ -78,7 +78,7 @@ def test_rejects_a_sample_rate_below_8_khz(tmp_path: Path) -> None:
         open_audio(tmp_path / "low.wav")
 
 
-def test_nan_is_named_with_its_place(tmp_path: Path) -> None:
+def test_rejects_nan_and_reports_its_time(tmp_path: Path) -> None:
     samples = np.zeros(32000, np.float32)
     samples[24000] = np.inf
     soundfile.write(tmp_path / "a.wav", samples, 16000, subtype="FLOAT")
@@ -87,7 +87,7 @@ def test_nan_is_named_with_its_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["wav", "mp3"])
-def test_a_file_that_is_cut_off_is_remarked_on(tmp_path: Path, suffix: str) -> None:
+def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, suffix: str) -> None:
     sine = 0.5 * np.sin(2 * np.pi * 440 * np.arange(32000) / 16000)
     whole, cut = tmp_path / f"whole.{suffix}", tmp_path / f"cut.{suffix}"
     soundfile.write(whole, sine, 16000)
@@ -104,7 +104,7 @@ def test_a_file_that_is_cut_off_is_remarked_on(tmp_path: Path, suffix: str) -> N
     assert "of 2.0 s" in remark
 
 
-def test_a_length_that_a_pipe_could_not_know_is_no_cut(tmp_path: Path) -> None:
+def test_ignores_the_unknown_length_of_a_pipe(tmp_path: Path) -> None:
     path = tmp_path / "piped.wav"
     soundfile.write(path, np.zeros(1600, np.float32), 16000)
     data = bytearray(path.read_bytes())
@@ -115,17 +115,17 @@ def test_a_length_that_a_pipe_could_not_know_is_no_cut(tmp_path: Path) -> None:
     assert source.remarks == []
 
 
-def test_a_name_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_rejects_a_bad_file_name(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot read the file: File name too long"):
         open_audio(tmp_path / f"{'a' * 300}.wav")
 
 
-def test_a_folder_is_called_one(tmp_path: Path) -> None:
+def test_rejects_a_folder(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="folder"):
         open_audio(tmp_path)
 
 
-def test_raw_sound_may_come_in_odd_pieces() -> None:
+def test_reads_raw_audio_in_odd_pieces() -> None:
     values = np.arange(-1000, 1000, dtype="<i2")
     source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), 16000, 2)
     read = np.concatenate(list(source.blocks))
@@ -135,7 +135,7 @@ def test_raw_sound_may_come_in_odd_pieces() -> None:
 @pytest.mark.parametrize(
     ("subtype", "expected"), [("PCM_16", 0.25), ("FLOAT", 0.25), ("PCM_24", "use 16-bit PCM")]
 )
-def test_a_pipe_may_bring_a_wav_header(subtype: str, expected: float | str) -> None:
+def test_reads_the_wav_header_of_a_pipe(subtype: str, expected: float | str) -> None:
     file = io.BytesIO()
     soundfile.write(file, np.full((3000, 2), 0.25), 24000, subtype=subtype, format="WAV")
     file.seek(0)
@@ -160,9 +160,7 @@ def _write_media(path: Path, codec: str, samples: np.ndarray, rate_hz: int) -> N
         container.mux(stream.encode(None))
 
 
-def test_reading_an_mp3_file_writes_nothing_to_the_terminal(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_reading_mp3_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     speech, rate_hz = read_audio(DEMO / "hello-male.wav")
     _write_media(tmp_path / "a.mp3", "libmp3lame", speech[:, 0], rate_hz)
     assert len(read_audio(tmp_path / "a.mp3")[0]) >= len(speech)
@@ -173,7 +171,7 @@ def test_reading_an_mp3_file_writes_nothing_to_the_terminal(
     ("name", "codec", "rate_hz"),
     [("a.m4a", "aac", 44100), ("a.webm", "libopus", 48000), ("a.mkv", "pcm_s16le", 22050)],
 )
-def test_what_a_telephone_records_is_read(
+def test_reads_recordings_of_telephones(
     tmp_path: Path, name: str, codec: str, rate_hz: int
 ) -> None:
     sine = (0.5 * np.sin(2 * np.pi * 440 * np.arange(rate_hz) / rate_hz)).astype(np.float32)
@@ -191,7 +189,7 @@ def test_what_a_telephone_records_is_read(
     assert source.remarks == []
 
 
-def test_media_that_are_cut_off_or_silent_films_are_named(tmp_path: Path) -> None:
+def test_rejects_media_without_audio_and_remarks_on_cut_files(tmp_path: Path) -> None:
     sine = (0.5 * np.sin(np.arange(96000) / 17)).astype(np.float32)
     _write_media(tmp_path / "a.mkv", "pcm_s16le", sine, 48000)
     data = (tmp_path / "a.mkv").read_bytes()

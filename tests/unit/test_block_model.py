@@ -80,7 +80,7 @@ def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
 # --- scores
 
 
-def test_onnxruntime_computes_what_pytorch_does() -> None:
+def test_onnxruntime_and_pytorch_agree() -> None:
     expected = torch_scores(FRAMES, BLOCK)
     stream = blocks().create_stream()
     start = 0
@@ -118,7 +118,7 @@ def test_before_the_first_whole_block_all_scores_are_provisional() -> None:
     assert len(stream.score(FRAMES[2 * LENGTH : 2 * LENGTH + 1])) == 2 * BLOCK
 
 
-def test_scores_come_in_time() -> None:
+def test_scores_come_within_the_look_ahead() -> None:
     stream = blocks().create_stream()
     assert stream.look_ahead_frames == 2 * LENGTH
     num_settled = 0
@@ -132,7 +132,7 @@ def test_scores_come_in_time() -> None:
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 2, 3, 28, 29, 30, 36, 37])
-def test_every_frame_of_a_segment_is_settled_once(num_frames: int) -> None:
+def test_settles_every_frame_once(num_frames: int) -> None:
     stream = blocks().create_stream()
     for _ in range(2):
         rows = [*stream.score(FRAMES[:num_frames]), *stream.score(None)]
@@ -140,7 +140,7 @@ def test_every_frame_of_a_segment_is_settled_once(num_frames: int) -> None:
     assert len(stream.score(None)) == 0
 
 
-def test_scores_are_the_same_in_any_chunks_and_any_company() -> None:
+def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
     model = blocks()
     lone = model.create_stream()
     expected = {}
@@ -166,7 +166,7 @@ def test_scores_are_the_same_in_any_chunks_and_any_company() -> None:
         np.testing.assert_array_equal(np.concatenate([*found, stream.score(None)]), whole)
 
 
-def test_only_the_past_counts() -> None:
+def test_scores_do_not_depend_on_frames_before_the_past() -> None:
     model = blocks()
     past, layers = model.session.sizes.past, model.session.sizes.layers
     reach = 2 * layers * (past + LENGTH)
@@ -189,7 +189,7 @@ def scores_of_encoder(model: BlockModel, frames: np.ndarray) -> np.ndarray:
     return np.stack(kept)
 
 
-def test_a_segment_begins_afresh() -> None:
+def test_segments_are_independent() -> None:
     stream = blocks().create_stream()
     first = np.concatenate([stream.score(FRAMES), stream.score(None)])
     stream.score(FRAMES[:77])
@@ -199,7 +199,7 @@ def test_a_segment_begins_afresh() -> None:
     np.testing.assert_array_equal(again, first)
 
 
-def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
+def test_long_speech_restarts_the_table_with_an_empty_past(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     whole = scores_of(blocks(), FRAMES)
@@ -213,7 +213,7 @@ def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
     np.testing.assert_array_equal(scores_of(blocks(), later)[80:], short[80:])
 
 
-def test_a_talking_session_takes_less_than_two_megabytes() -> None:
+def test_a_speaking_session_needs_less_than_two_megabytes() -> None:
     sizes = blocks().session.sizes
     assert sizes.past == 125
     whisper = blocks_module.BlockSizes(5, 15, 125, 512, 192, layers=6, heads=8, head_size=64)
@@ -234,7 +234,7 @@ def file_of(*, past: int = 125, block: int = BLOCK, states: int = 180) -> np.nda
     return onnx_of(*networks(states), block, past=past)
 
 
-def test_files_are_checked(tmp_path: Path) -> None:
+def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     path = tmp_path / "blocks.npz"
     blocks().save(path)
     arrays = read_archive(path).arrays

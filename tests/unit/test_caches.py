@@ -22,7 +22,7 @@ def marked(memory: CacheMemory, number: int) -> list[Cache]:
     return caches
 
 
-def test_any_sessions_run_as_neighbours_and_keep_what_is_theirs() -> None:
+def test_sessions_keep_their_caches_in_any_run() -> None:
     rng = np.random.default_rng(0)
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, NUM_PLACES)
@@ -38,7 +38,7 @@ def test_any_sessions_run_as_neighbours_and_keep_what_is_theirs() -> None:
         assert all((c.rings == mark).all() for c, mark in zip(caches, marks, strict=True))
 
 
-def test_a_run_writes_where_the_caches_are() -> None:
+def test_a_run_writes_to_the_caches() -> None:
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, 5)
     ((numbers, rings),) = memory.runs([caches[4], caches[0]])
@@ -47,7 +47,7 @@ def test_a_run_writes_where_the_caches_are() -> None:
     assert [int(cache.rings.flat[0]) for cache in caches] == [10, 2, 3, 4, 40]
 
 
-def test_neighbours_stay_where_they_are() -> None:
+def test_adjacent_caches_are_not_moved() -> None:
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, 6)
     for chosen in ([1, 2, 3], [5, 4], [3]):
@@ -59,7 +59,7 @@ def test_neighbours_stay_where_they_are() -> None:
     assert sum(cache.place != before for cache, before in zip(caches, places, strict=True)) == 2
 
 
-def test_more_sessions_than_a_run_has_are_in_several_runs() -> None:
+def test_splits_many_sessions_into_runs() -> None:
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, 2 * NUM_PLACES + 1)
     runs = list(memory.runs(caches))
@@ -68,7 +68,7 @@ def test_more_sessions_than_a_run_has_are_in_several_runs() -> None:
         assert [int(mark) for mark in rings[0, :, 0, 0, 0]] == [each + 1 for each in numbers]
 
 
-def test_a_place_is_free_once_its_cache_is_gone() -> None:
+def test_reuses_the_place_of_a_deleted_cache() -> None:
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, NUM_PLACES)
     shelf, place = caches[3].shelf, caches[3].place
@@ -77,7 +77,7 @@ def test_a_place_is_free_once_its_cache_is_gone() -> None:
     assert (again.shelf, again.place) == (shelf, place)
 
 
-def test_memory_is_taken_where_something_is_written_and_given_back() -> None:
+def test_uses_memory_only_for_written_caches() -> None:
 
     memory = CacheMemory(LARGE, NUM_PLACES)
     first = memory.open()

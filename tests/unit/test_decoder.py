@@ -91,7 +91,7 @@ def brute_force(
     ("order", "kept", "states_per_phone", "num_frames"),
     [(2, 1.0, 2, 8), (2, 1.0, 3, 9), (3, 1.0, 2, 9), (3, 0.5, 2, 9), (4, 0.6, 1, 7)],
 )
-def test_same_as_trying_every_path(
+def test_finds_the_best_of_all_paths(
     seed: int, order: int, kept: float, states_per_phone: int, num_frames: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -118,7 +118,7 @@ def clear_scores(
     return np.array(rows)
 
 
-def test_clear_speech_is_read_off() -> None:
+def test_decodes_clear_speech() -> None:
     model = topology(5, np.random.default_rng(0))
     sequence = [SIL, 3, 30, 12, 45, SIL]
     decoder = Decoder(model)
@@ -134,14 +134,14 @@ def test_clear_speech_is_read_off() -> None:
     assert all(0 < confidence <= 1 for _, _, confidence in last)
 
 
-def test_speech_cut_off_inside_a_unit_keeps_what_came_before() -> None:
+def test_speech_that_ends_within_a_phone_keeps_the_earlier_phones() -> None:
     model = topology(5, np.random.default_rng(0))
     decoder = Decoder(model)
     decoder.advance(clear_scores([3, 30, 12], model, frames_per_state=2)[:23])
     assert decoder.final_path() == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 23)]
 
 
-def test_the_phones_before_decide_between_equal_scores() -> None:
+def test_the_language_model_decides_between_equal_scores() -> None:
     """30 and 31 score the same; after 3 comes the one, after 4 the other."""
     singles: dict[Gram, float] = {(phone,): -4.0 for phone in range(NUM_PHONES)}
     language = Table(singles | {(3, 30): -0.1, (4, 31): -0.1}, {(3,): -3.0, (4,): -3.0}).tree()
@@ -155,7 +155,7 @@ def test_the_phones_before_decide_between_equal_scores() -> None:
     assert [segment.phone for segment in decoder.final_path()] == [3, 30, 4, 31]
 
 
-def test_endless_speech_keeps_its_memory_and_its_result() -> None:
+def test_long_speech_needs_bounded_memory() -> None:
     rng = np.random.default_rng(1)
     model = topology(5, rng)
     sequence = rng.permutation(np.arange(SIL)).tolist() * 8  # 472 phones, 4720 frames
@@ -186,7 +186,7 @@ def crowded_language() -> PhoneLanguageModel:
     )
 
 
-def test_a_crowd_of_paths_stays_within_its_bound() -> None:
+def test_limits_the_number_of_tokens() -> None:
     language = crowded_language()
     assert len(language.graph.last_phone) > 200_000
     model = topology(1, np.random.default_rng(0), language)
@@ -209,7 +209,7 @@ def test_a_crowd_of_paths_stays_within_its_bound() -> None:
     assert all(one.end == two.start for one, two in pairwise(path))
 
 
-def test_searches_that_take_turns_do_not_disturb_each_other() -> None:
+def test_interleaved_searches_are_independent() -> None:
     model = topology(3, np.random.default_rng(0), crowded_language())
     scores = np.random.default_rng(1).normal(scale=4.0, size=(2, 40, model.num_states))
     together = [Decoder(model), Decoder(model)]
@@ -222,7 +222,7 @@ def test_searches_that_take_turns_do_not_disturb_each_other() -> None:
         assert decoder.final_path() == alone.final_path()
 
 
-def test_path_since_gives_the_phones_before_the_last() -> None:
+def test_path_since_returns_the_phones_before_the_last() -> None:
     model = topology(5, np.random.default_rng(0))
     decoder = Decoder(model)
     decoder.advance(clear_scores([3, 30, 12, 45], model, frames_per_state=2)[:35])

@@ -24,7 +24,7 @@ def small(**changes: object) -> PhoneInventory:
     return PhoneInventory(**(values | changes))  # type: ignore[arg-type]
 
 
-def test_mandarin_has_the_paper_s_phones() -> None:
+def test_mandarin_has_the_phones_of_the_paper() -> None:
     """Li et al. 2011, section 3.1: 21 initials, 38 finals and silence."""
     assert (len(MANDARIN.initials), len(MANDARIN.vowels), MANDARIN.silence) == (21, 38, "sil")
     assert len(MANDARIN) == 60
@@ -52,12 +52,12 @@ def test_a_small_inventory() -> None:
         ({"visemes": {"m": (("b", 1.0),), "a": (("a", 0.9),)}}, "viseme shares of a must add up"),
     ],
 )
-def test_phones_that_make_no_inventory(changes: dict[str, object], message: str) -> None:
+def test_rejects_bad_phones(changes: dict[str, object], message: str) -> None:
     with pytest.raises(UserError, match=f"language small: .*{message}"):
         small(**changes)
 
 
-def test_phones_are_counted_in_8_bits() -> None:
+def test_limits_the_number_of_phones() -> None:
     names = [chr(97 + n // 26) + chr(97 + n % 26) for n in range(MAX_PHONES)]
     visemes = dict.fromkeys([*names, "sil"], (("rest", 1.0),))
     largest = {"kinds": ("vowel",) * (MAX_PHONES - 1) + ("silence",), "visemes": visemes}
@@ -66,7 +66,7 @@ def test_phones_are_counted_in_8_bits() -> None:
         small(phones=(*names, "sil"), **(largest | {"kinds": ("vowel", *largest["kinds"])}))
 
 
-def test_an_unknown_language_names_the_known_ones() -> None:
+def test_rejects_an_unknown_language() -> None:
     with pytest.raises(
         UserError, match="language 'klingon' is not installed; choose from: mandarin"
     ):
@@ -83,7 +83,7 @@ def test_an_unknown_language_names_the_known_ones() -> None:
         ("phone\tkind\tvisemes\tbefore_rounded\nsil\tsilence\trest:1\t\n", "pronounce"),
     ],
 )
-def test_a_broken_package_is_named(
+def test_rejects_a_broken_package(
     table: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -100,9 +100,7 @@ def test_a_broken_package_is_named(
         load_inventory("broken")
 
 
-def test_a_package_that_is_not_there_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rejects_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     install_language(tmp_path, "lost", "no_such_package")
     with pytest.raises(UserError, match="cannot read package no_such_package"):

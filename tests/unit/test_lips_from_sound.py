@@ -47,7 +47,7 @@ def lips_of(chunk: int, delay_s: float = 0.2) -> list[LipFrame]:
     return [output for output in outputs if isinstance(output, LipFrame)]
 
 
-def test_a_step_is_what_the_formulas_say() -> None:
+def test_a_step_matches_the_formulas() -> None:
     rng = np.random.default_rng(1)
     rows = rng.normal(size=(4, NUM_FEATURES)).astype(np.float32)
     stream = MODEL.create_stream(MODEL.delays_s)
@@ -69,7 +69,7 @@ def test_a_step_is_what_the_formulas_say() -> None:
     np.testing.assert_allclose(made[-1], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_reset_forgets_everything() -> None:
+def test_reset_starts_a_new_segment() -> None:
     row = np.ones(NUM_FEATURES, np.float32)
     stream = MODEL.create_stream(MODEL.delays_s)
     first, second = stream.step(row), stream.step(row)
@@ -78,7 +78,7 @@ def test_reset_forgets_everything() -> None:
     np.testing.assert_array_equal(stream.step(row), first)
 
 
-def test_each_delay_has_its_own_outputs_and_times() -> None:
+def test_each_delay_has_separate_outputs_and_times() -> None:
     frames, values = np.ones((2, 80), np.float32), np.ones((4, 8, 64), np.float32)
     both = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, values)
     alone = MODEL.create_stream([0.155]).process_position(1.0, frames, values)
@@ -89,7 +89,7 @@ def test_each_delay_has_its_own_outputs_and_times() -> None:
     assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
 
 
-def test_left_and_right_move_alike_and_the_tongue_is_left_alone() -> None:
+def test_copies_faps_to_the_other_side() -> None:
     faps = mouth_faps(np.arange(1, len(LIP_FAPS) + 1, dtype=np.float32))
     value = dict(zip(MOUTH_FAPS, faps, strict=True))
     assert value[6] == value[7] == LIP_FAPS.index(6) + 1
@@ -97,7 +97,7 @@ def test_left_and_right_move_alike_and_the_tongue_is_left_alone() -> None:
     assert value[44] == value[45] == value[46] == value[47] == 0
 
 
-def test_any_chunking_gives_the_same_lips() -> None:
+def test_chunks_do_not_affect_lip_frames() -> None:
     whole, small = lips_of(len(SAMPLES)), lips_of(777)
     assert len(whole) > 20
     assert [lip.time_s for lip in small] == [lip.time_s for lip in whole]
@@ -106,7 +106,7 @@ def test_any_chunking_gives_the_same_lips() -> None:
         assert (one.closure, one.lip_to_teeth) == (other.closure, other.lip_to_teeth)
 
 
-def test_a_model_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_files_round_trip(tmp_path: Path) -> None:
     MODEL.save(tmp_path / "lips.npz")
     again = load_lip_predictor(tmp_path / "lips.npz")
     assert again.delays_s == DELAYS_S
@@ -129,7 +129,7 @@ def test_a_model_comes_back_from_its_file(tmp_path: Path) -> None:
         ("projection", np.ones((100, 6), np.float32), "100 features"),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(
+def test_rejects_a_file_with_bad_arrays(
     tmp_path: Path, name: str, array: np.ndarray, message: str
 ) -> None:
     write_archive(tmp_path / "bad.npz", {**arrays_of(MODEL), name: array})
@@ -137,7 +137,7 @@ def test_a_file_that_does_not_fit_is_refused(
         load_lip_predictor(tmp_path / "bad.npz")
 
 
-def test_a_missing_array_or_delay_is_named(tmp_path: Path) -> None:
+def test_rejects_a_missing_array_or_delay(tmp_path: Path) -> None:
     arrays = arrays_of(MODEL)
     del arrays["entry_bias"]
     write_archive(tmp_path / "bad.npz", arrays)
@@ -158,7 +158,7 @@ def test_uses_the_predictor_only_with_its_network(tmp_path: Path) -> None:
     assert lip_predictor_for(load_model(), path) is None
 
 
-def test_the_shipped_lips_open_round_and_close() -> None:
+def test_the_shipped_predictor_opens_rounds_and_closes_the_lips() -> None:
     outputs = recognize_live(load_model(), SAMPLES, lips=load_lip_predictor(), face_delay_s=0.2)
     lips = [output for output in outputs if isinstance(output, LipFrame)]
 

@@ -21,8 +21,6 @@ from kouxing.services.recognizer.acoustic.neural import FORMAT, NeuralModel
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.events import Phone
-from tests.live_streams import recognize_live, recognize_together
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
@@ -43,7 +41,7 @@ def scores_of(model: NeuralModel, frames: np.ndarray) -> np.ndarray:
     return np.concatenate([stream.score(frames), stream.score(None)])
 
 
-def test_every_look_ahead_has_scores_of_its_own() -> None:
+def test_look_aheads_have_different_scores() -> None:
     found = {}
     for frames in neural().look_aheads:
         model = neural(10.0 * frames)
@@ -58,7 +56,7 @@ def test_every_look_ahead_has_scores_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("num_frames", range(8))
-def test_short_segments_have_scores_of_all_their_frames(num_frames: int) -> None:
+def test_scores_all_frames_of_short_segments(num_frames: int) -> None:
     for frames in neural().look_aheads:
         stream = neural(10.0 * frames).create_stream()
         for _ in range(2):
@@ -67,7 +65,7 @@ def test_short_segments_have_scores_of_all_their_frames(num_frames: int) -> None
         assert len(stream.score(None)) == 0
 
 
-def test_scores_come_no_later_than_the_look_ahead() -> None:
+def test_scores_come_within_the_look_ahead() -> None:
     for frames in neural().look_aheads:
         stream = neural(10.0 * frames).create_stream()
         num_scores = 0
@@ -78,13 +76,13 @@ def test_scores_come_no_later_than_the_look_ahead() -> None:
             assert num_scores <= number + 2 - frames or num_scores == 0
 
 
-def test_a_look_ahead_of_one_frame_gives_the_first_frame_the_scores_of_the_second() -> None:
+def test_with_a_look_ahead_of_one_frame_frame_0_has_the_scores_of_frame_1() -> None:
     scores = scores_of(neural(10.0), FRAMES)
     np.testing.assert_array_equal(scores[0], scores[1])
     assert not np.array_equal(scores[1], scores[2])
 
 
-def test_the_last_frame_is_repeated_at_the_end() -> None:
+def test_repeats_the_last_frame_at_the_end() -> None:
     for frames in (10.0, 60.0):
         model = neural(frames)
         longer = np.concatenate([FRAMES, np.repeat(FRAMES[-1:], 30, axis=0)])
@@ -92,7 +90,7 @@ def test_the_last_frame_is_repeated_at_the_end() -> None:
         np.testing.assert_array_equal(scores_of(model, FRAMES), again)
 
 
-def test_scores_depend_on_the_look_ahead_and_on_nothing_later() -> None:
+def test_scores_do_not_depend_on_frames_after_the_look_ahead() -> None:
     model = neural(30.0)
     other = FRAMES.copy()
     other[50:] += 0.5
@@ -102,7 +100,7 @@ def test_scores_depend_on_the_look_ahead_and_on_nothing_later() -> None:
     assert not same[47:].any()
 
 
-def test_only_the_window_counts() -> None:
+def test_scores_do_not_depend_on_frames_before_the_window() -> None:
     """What lies before the window of every layer and the frames around it changes nothing."""
     model = neural(10.0)
     layers = model.session.sizes.num_layers
@@ -115,7 +113,7 @@ def test_only_the_window_counts() -> None:
     np.testing.assert_array_equal(one[reach + 10 :], two[reach + 10 :])
 
 
-def test_a_segment_begins_afresh() -> None:
+def test_segments_are_independent() -> None:
     stream = neural().create_stream()
     first = np.concatenate([stream.score(FRAMES), stream.score(None)])
     assert len(stream.score(None)) == 0
@@ -127,7 +125,7 @@ def test_a_segment_begins_afresh() -> None:
     np.testing.assert_array_equal(again, first)
 
 
-def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
+def test_long_speech_restarts_the_table_with_an_empty_past(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model = neural(10.0)
@@ -140,36 +138,6 @@ def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
     later = FRAMES.copy()
     later[:38] = 0.3  # what only the positions before the new beginning have seen
     np.testing.assert_array_equal(scores_of(model, later)[41:81], short[41:81])
-
-
-def test_sessions_scored_together_give_what_each_gives_alone() -> None:
-    model = neural()
-    sounds = [HELLO, HELLO[8000:], HELLO[:9000], np.zeros(4000, np.float32)]
-    alone = [recognize_live(model, sound) for sound in sounds]
-    phones = [[event for event in events if isinstance(event, Phone)] for events in alone]
-    together = recognize_together(model, sounds)
-    assert [
-        [event for event in events if isinstance(event, Phone)] for events in together
-    ] == phones
-    assert phones[0]
-
-
-def test_scores_are_the_same_whoever_comes_and_goes() -> None:
-    model = neural()
-    expected = scores_of(model, FRAMES)
-    streams = [model.create_stream() for _ in range(5)]
-    rows: list[list[np.ndarray]] = [[] for _ in streams]
-    num_frames = len(FRAMES)
-    for frame in range(num_frames):
-        company = [n for n in range(5) if frame < num_frames // (n + 1)]
-        piece = FRAMES[frame : frame + 1]
-        order = company[frame % 3 :] + company[: frame % 3]  # in any order
-        for n, scores in zip(order, model.score([(streams[n], piece) for n in order]), strict=True):
-            rows[n].append(scores)
-    for n in range(5):
-        found = np.concatenate(rows[n])
-        np.testing.assert_array_equal(found, expected[: len(found)])
-        assert len(found) >= num_frames // (n + 1) - 1
 
 
 def test_positions_are_sinusoids() -> None:
@@ -187,14 +155,9 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scores_of(again, FRAMES), scores_of(model, FRAMES))
 
 
-def test_an_unknown_look_ahead_is_refused() -> None:
+def test_rejects_an_unknown_look_ahead() -> None:
     with pytest.raises(UserError, match="no look-ahead of 50 ms; choose 10, 30"):
         neural(50.0)
-
-
-def test_a_gmm_has_one_look_ahead() -> None:
-    model = load_model(model_path("gmm"), look_ahead_ms=10.0)
-    assert model.create_stream().look_ahead_frames == 4
 
 
 @pytest.mark.parametrize(
@@ -210,7 +173,9 @@ def test_a_gmm_has_one_look_ahead() -> None:
         ({"acoustic_scale": np.array(np.nan, np.float32)}, "not finite"),
     ],
 )
-def test_files_are_checked(change: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+def test_rejects_a_file_with_bad_arrays(
+    change: dict[str, np.ndarray], message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "model.npz"
     arrays = read_archive(model_path("neural")).arrays
     assert str(arrays["format"]) == FORMAT
@@ -230,7 +195,7 @@ def with_network(change: Callable[[Any], None], path: Path) -> Path:
     return path
 
 
-def test_a_network_of_another_form_is_refused(tmp_path: Path) -> None:
+def test_rejects_a_network_with_other_inputs(tmp_path: Path) -> None:
     def without_inputs(graph: Any) -> None:
         del graph.node[:], graph.output[1:], graph.input[:]
         graph.node.add(op_type="Identity", input=["norm.bias"], output=["log_posteriors"])
@@ -255,7 +220,7 @@ def test_a_network_of_another_form_is_refused(tmp_path: Path) -> None:
             load_model(with_network(change, tmp_path / "model.npz"))
 
 
-def test_a_network_of_other_states_is_refused(tmp_path: Path) -> None:
+def test_rejects_a_network_with_other_states(tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     arrays = read_archive(model_path("neural")).arrays
     one_less = {name: arrays[name][:-1] for name in ("log_stay", "log_leave", "log_prior")}

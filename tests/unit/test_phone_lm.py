@@ -27,7 +27,7 @@ def table(seed: int, order: int, kept: float) -> Table:
 @pytest.mark.parametrize(
     ("order", "kept"), [(2, 1.0), (3, 1.0), (2, 0.5), (3, 0.3), (5, 0.6), (6, 0.4)]
 )
-def test_the_graph_agrees_with_the_formula(order: int, kept: float) -> None:
+def test_graph_matches_the_formula(order: int, kept: float) -> None:
     wanted = table(order, order, kept)
     assert wanted.order == order
     graph = wanted.tree().graph
@@ -42,7 +42,7 @@ def test_the_graph_agrees_with_the_formula(order: int, kept: float) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.3, 1.0])
-def test_every_phone_has_a_context_and_a_pause_has_one_only(kept: float) -> None:
+def test_every_phone_has_a_context(kept: float) -> None:
     graph = table(0, 4, kept).tree().graph
     assert graph.last_phone[1 : 1 + NUM_PHONES].tolist() == list(range(NUM_PHONES))
     assert (graph.backoff_state[: 1 + NUM_PHONES] == 0).all()
@@ -55,7 +55,7 @@ def test_every_phone_has_a_context_and_a_pause_has_one_only(kept: float) -> None
     assert (graph.backoff_state[1:] < np.arange(1, len(graph.backoff_state))).all()
 
 
-def test_a_context_with_unknown_ends_falls_back_to_what_is_known() -> None:
+def test_unknown_contexts_back_off() -> None:
     """After 0 7 comes 21, but neither 7 21 nor 0 7 21 begins anything: the context is 21."""
     singles: dict[Gram, float] = {(phone,): -4.0 for phone in range(NUM_PHONES)}
     known = Table(singles | {(0, 7): -1.0, (0, 7, 21): -2.0}, {(0,): -0.5, (0, 7): -0.25})
@@ -85,7 +85,7 @@ def changed(change: Callable[[Arrays], None]) -> PhoneLanguageModel:
     return phone_lm_from(Archive(arrays))
 
 
-def test_a_phone_lm_comes_back_from_its_arrays() -> None:
+def test_arrays_round_trip() -> None:
     phone_lm = table(1, 4, 0.6).tree()
     assert phone_lm.log_prob.min() >= -12.75
     assert np.abs(phone_lm.log_backoff).max() <= 6.35
@@ -99,7 +99,7 @@ def test_a_phone_lm_comes_back_from_its_arrays() -> None:
         np.testing.assert_array_equal(stored[name], array)
 
 
-def test_unlikely_n_grams_are_clipped() -> None:
+def test_clips_unlikely_n_grams() -> None:
     singles: dict[Gram, float] = {(phone,): -100.0 for phone in range(NUM_PHONES)}
     phone_lm = Table(singles, {(0,): -100.0, (1,): 100.0}).tree()
     again = phone_lm_from(Archive(phone_lm_arrays(phone_lm)))
@@ -219,13 +219,13 @@ def no_backoff(arrays: Arrays) -> None:
         (no_backoff, "lm_log_backoff is missing"),
     ],
 )
-def test_damaged_arrays_are_refused(change: Callable[[Arrays], None], message: str) -> None:
+def test_rejects_damaged_arrays(change: Callable[[Arrays], None], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         changed(change)
 
 
 @pytest.mark.parametrize("num_phones", [MAX_ORDER, MAX_ORDER + 1])
-def test_the_longest_n_gram_has_its_bound(num_phones: int) -> None:
+def test_limits_the_order(num_phones: int) -> None:
     grams: dict[Gram, float] = {(phone,): -1.0 for phone in range(NUM_PHONES)}
     grams |= {(0,) * length: -1.0 for length in range(2, num_phones + 1)}
     arrays = phone_lm_arrays(Table(grams, {}).tree())

@@ -42,12 +42,12 @@ SYLLABLES = {
 LEGAL = [syllable for row in SYLLABLES.values() for syllable in row.split()]
 
 
-def test_table_is_whole() -> None:
+def test_phone_table_is_complete() -> None:
     assert len(LEGAL) == len(set(LEGAL)) == 410
 
 
 @pytest.mark.parametrize("initial", list(SYLLABLES))
-def test_every_legal_syllable_has_initial_and_final(initial: str) -> None:
+def test_every_valid_syllable_has_initial_and_final(initial: str) -> None:
     for syllable in SYLLABLES[initial].split():
         phones = phones_of_syllable(syllable)
         if initial in MANDARIN.initials:
@@ -127,7 +127,7 @@ def test_spellings(syllable: str, phones: str) -> None:
 @pytest.mark.parametrize(
     "wrong", ["", "1", "ja", "muo3", "luun2", "xyz", "zhuangg", "b", "ni3hao3"]
 )
-def test_unknown_syllables_are_named(wrong: str) -> None:
+def test_rejects_unknown_syllables(wrong: str) -> None:
     with pytest.raises(UserError, match=f"'{wrong}'"):
         phones_of_syllable(wrong)
 
@@ -155,11 +155,11 @@ def test_text() -> None:
         ("-5℃", "负五摄氏度"),
     ],
 )
-def test_numbers_are_read(text: str, read: str) -> None:
+def test_reads_numbers(text: str, read: str) -> None:
     assert "".join(syllable.text for syllable in transcribe(text).syllables) == read
 
 
-def test_a_transcript_has_characters_tones_and_what_was_dropped() -> None:
+def test_transcript_has_characters_tones_and_dropped_parts() -> None:
     transcript = transcribe("银行 的花儿，A股 ☃。女")
     assert [syllable.text for syllable in transcript.syllables] == list("银行的花儿股女")
     spelling = [syllable.spelling for syllable in transcript.syllables]

@@ -30,12 +30,12 @@ def noise(num_samples: int) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("frequency_hz", [80.0, 120.0, 220.0, 330.0])
-def test_the_pitch_of_a_voice_is_found(frequency_hz: float) -> None:
+def test_tracks_a_constant_pitch(frequency_hz: float) -> None:
     found = pitches(voice(np.full(RATE_HZ, frequency_hz)))[10:]
     np.testing.assert_allclose(found, frequency_hz, rtol=0.03)
 
 
-def test_it_follows_a_rising_voice_and_noise_and_silence_have_none() -> None:
+def test_tracks_a_rising_pitch_but_not_noise_or_silence() -> None:
     rising = voice(np.linspace(150.0, 250.0, RATE_HZ))
     silent = np.zeros(RATE_HZ // 2, np.float32)
     found = pitches(np.concatenate([silent, rising, noise(RATE_HZ)]))
@@ -45,7 +45,7 @@ def test_it_follows_a_rising_voice_and_noise_and_silence_have_none() -> None:
     assert np.count_nonzero(found[80:]) < 5
 
 
-def test_a_long_voice_is_followed_throughout() -> None:
+def test_tracks_a_long_voice() -> None:
     pause = noise(RATE_HZ)
     spoken = voice(np.full(11 * RATE_HZ, 200.0))
     found = pitches(np.concatenate([spoken, pause, spoken[: 2 * RATE_HZ]]))
@@ -53,7 +53,7 @@ def test_a_long_voice_is_followed_throughout() -> None:
     np.testing.assert_allclose(found[12 * 50 + 10 :], 200.0, rtol=0.03)
 
 
-def test_who_begins_later_soon_hears_the_same() -> None:
+def test_a_tracker_that_starts_later_soon_agrees() -> None:
     samples = voice(np.linspace(150.0, 250.0, 4 * RATE_HZ)) + noise(4 * RATE_HZ)
     whole, later = pitches(samples), pitches(samples[70 * SLICE :], num_before=70)
     np.testing.assert_array_equal(later[80:], whole[150:])

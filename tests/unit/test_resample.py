@@ -16,24 +16,24 @@ def tone(rate_hz: int, hz: float = 440.0, seconds: float = 1.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
-def test_a_tone_stays_the_same_tone(rate_hz: int) -> None:
+def test_keeps_a_tone(rate_hz: int) -> None:
     heard = to_16_khz(tone(rate_hz), rate_hz)
     assert abs(len(heard) - 16_000) <= 1
     inner = slice(1000, 15_000)
     np.testing.assert_allclose(heard[inner], tone(16_000)[inner], atol=2e-3)
 
 
-def test_stereo_is_averaged() -> None:
+def test_averages_stereo() -> None:
     left = tone(48_000)
     heard = to_16_khz(np.stack([left, np.zeros_like(left)], axis=1), 48_000)
     np.testing.assert_allclose(heard[1000:15_000], 0.5 * tone(16_000)[1000:15_000], atol=2e-3)
 
 
-def test_what_16_khz_cannot_hold_is_removed() -> None:
+def test_removes_frequencies_above_8_khz() -> None:
     assert np.abs(to_16_khz(tone(48_000, hz=12_000.0), 48_000)[500:-500]).max() < 1e-3
 
 
-def test_16_khz_passes_through_and_is_clipped() -> None:
+def test_clips_16_khz_audio_and_passes_it_through() -> None:
     samples = np.array([0.0, 0.5, 3.0, -3.0], np.float32)
     np.testing.assert_array_equal(Resampler(16_000).accept_waveform(samples), [0.0, 0.5, 1.0, -1.0])
     column = Resampler(16_000).accept_waveform(samples[:, None])
@@ -41,12 +41,12 @@ def test_16_khz_passes_through_and_is_clipped() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [0, 7_999, 48_001, 192_000])
-def test_rates_out_of_range(rate_hz: int) -> None:
+def test_rejects_rates_out_of_range(rate_hz: int) -> None:
     with pytest.raises(UserError, match=str(rate_hz)):
         Resampler(rate_hz)
 
 
-def test_wrong_samples_are_refused() -> None:
+def test_rejects_bad_samples() -> None:
     with pytest.raises(UserError, match="9 channels"):
         Resampler(16_000, 9)
     with pytest.raises(UserError, match="shape"):

@@ -70,7 +70,7 @@ def used_mb() -> float:
     return memory_mb()
 
 
-def test_a_talking_session_takes_less_than_4_mb_and_stays_so() -> None:
+def test_a_speaking_session_needs_less_than_4_mb() -> None:
     model = load_live_model("blocks")
     sessions = Sessions(model)
     sessions.add(NUM_SESSIONS)

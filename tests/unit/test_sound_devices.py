@@ -46,7 +46,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("firefox", "--monitor-stream=7"),
     ],
 )
-def test_a_monitor_is_recorded_by_its_name(server: Path, name: str, target: str) -> None:
+def test_records_a_monitor_by_name(server: Path, name: str, target: str) -> None:
     source = monitor(name)
     assert not (server / "asked").exists()  # nothing runs until somebody wants it
     blocks = [*source.blocks]
@@ -54,33 +54,33 @@ def test_a_monitor_is_recorded_by_its_name(server: Path, name: str, target: str)
     assert target in (server / "asked").read_text().split()
 
 
-def test_devices_are_listed(server: Path) -> None:
+def test_lists_devices(server: Path) -> None:
     listed = [(each.kind, each.name) for each in sound_devices() if each.kind != "mic"]
     assert listed == [("monitor", "HDMI"), ("program", "Firefox")]
 
 
-def test_a_name_that_no_device_has_is_told_which_there_are(server: Path) -> None:
+def test_rejects_an_unknown_name_and_lists_the_devices(server: Path) -> None:
     with pytest.raises(
         UserError, match="no device is called 'vlc'; this machine has 'HDMI', 'Firefox'"
     ):
         monitor("vlc")
 
 
-def test_without_a_sound_server_it_is_said_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_a_missing_sound_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     for name in ("", "firefox"):
         with pytest.raises(UserError, match=r"PulseAudio or PipeWire.*BlackHole"):
             monitor(name)
 
 
-def test_a_recorder_that_complains_much_is_still_heard(server: Path) -> None:
+def test_records_despite_many_warnings(server: Path) -> None:
     (server / "parec").write_text(
         f"#!/bin/sh\nhead -c 200000 /dev/zero >&2; cat {server / 'pcm'}\n"
     )
     assert len(np.concatenate([*monitor().blocks])) == 1000
 
 
-def test_what_cannot_be_recorded_says_why(server: Path) -> None:
+def test_reports_why_it_cannot_record(server: Path) -> None:
     (server / "parec").write_text("#!/bin/sh\necho Connection refused >&2; exit 1\n")
     with pytest.raises(UserError, match="cannot record: Connection refused"):
         next(monitor().blocks)

@@ -26,7 +26,7 @@ def phone(index: int, symbol: str, *, final: bool = True, duration_s: float = 0.
     )
 
 
-def test_every_syllable_of_mandarin_is_spelled_as_it_is_read() -> None:
+def test_spelling_inverts_reading_for_every_syllable() -> None:
     num_spelled = 0
     for initial in ["", *sorted(MANDARIN.initials)]:
         for final in sorted(MANDARIN.vowels):
@@ -61,7 +61,7 @@ def test_spelling(phones: tuple[str, ...], spelling: str) -> None:
     assert spell(phones) == spelling
 
 
-def test_an_initial_is_shown_at_once_and_completed_by_its_vowel() -> None:
+def test_shows_an_initial_at_once_and_adds_its_vowel() -> None:
     track = SyllableTrack(MANDARIN)
     (first,) = track.update(phone(0, "sh", final=False))
     assert (first.index, first.text, first.final) == (0, "sh", False)
@@ -74,7 +74,7 @@ def test_an_initial_is_shown_at_once_and_completed_by_its_vowel() -> None:
     assert final.final
 
 
-def test_an_initial_alone_is_final_only_once_no_vowel_can_follow() -> None:
+def test_an_initial_is_final_once_no_vowel_can_follow() -> None:
     track = SyllableTrack(MANDARIN)
     assert not track.update(phone(0, "d"))[0].final
     (pause,) = track.update(phone(1, "sil", final=False))  # it may prove to be a vowel
@@ -83,7 +83,7 @@ def test_an_initial_alone_is_final_only_once_no_vowel_can_follow() -> None:
     assert (initial.text, initial.final) == ("d", True)
 
 
-def test_what_proves_to_be_one_syllable_is_withdrawn_as_two() -> None:
+def test_joins_two_syllables_after_a_revision() -> None:
     track = SyllableTrack(MANDARIN)
     for index, symbol in enumerate(("a", "ou", "sil")):
         track.update(phone(index, symbol, final=False))
@@ -94,7 +94,7 @@ def test_what_proves_to_be_one_syllable_is_withdrawn_as_two() -> None:
     assert alone.text == "m"
 
 
-def test_a_long_stream_keeps_its_syllables() -> None:
+def test_keeps_syllables_in_a_long_stream() -> None:
     track = SyllableTrack(MANDARIN)
     texts: dict[int, str] = {}
     for index in range(4 * MAX_PHONES):
@@ -104,7 +104,7 @@ def test_a_long_stream_keeps_its_syllables() -> None:
     assert list(texts.values()) == ["ba", "sil"] * (4 * MAX_PHONES // 3) + ["b"]
 
 
-def test_the_characters_of_a_known_text_are_shown_though_phones_are_wrong() -> None:
+def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
     text = characters_of("四是四，十是十。十四是十四，四十是四十！" * 4, MANDARIN)
     track = SyllableTrack(MANDARIN, text)
     texts: dict[int, str] = {}
@@ -125,7 +125,7 @@ def test_the_characters_of_a_known_text_are_shown_though_phones_are_wrong() -> N
     assert right >= 0.9 * len(expected), shown
 
 
-def test_what_is_not_in_the_text_is_spelled() -> None:
+def test_spells_syllables_that_are_not_in_the_text() -> None:
     assert place_in_text([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")]) == [
         None,
         0,
@@ -139,7 +139,7 @@ def test_what_is_not_in_the_text_is_spelled() -> None:
     assert texts == {0: "ni", 2: "好"}
 
 
-def test_a_phone_that_nobody_knows_is_withdrawn_without_a_trace() -> None:
+def test_ignores_the_withdrawal_of_an_unknown_phone() -> None:
     track = SyllableTrack(MANDARIN)
     assert track.update(phone(3, "sil", duration_s=0.0)) == []
     track.update(phone(0, "sh"))

@@ -123,7 +123,7 @@ def symbols(phones: list[Phone], toy: PhoneInventory) -> str:
     return " ".join(phone.symbol for phone in spoken(phones, toy))
 
 
-def test_the_model_names_its_language(toy: PhoneInventory, tmp_path: Path) -> None:
+def test_loads_the_language_of_a_model(toy: PhoneInventory, tmp_path: Path) -> None:
     inventory = loaded(toy, tmp_path).inventory
     assert inventory is toy
     assert inventory.language == "toy"
@@ -133,7 +133,7 @@ def test_the_model_names_its_language(toy: PhoneInventory, tmp_path: Path) -> No
     assert inventory.pronounce("Mami o") == [("m", "a"), ("m", "i"), ("o",)]
 
 
-def test_it_is_recognised_live_and_offline(toy: PhoneInventory, tmp_path: Path) -> None:
+def test_recognizes_it_live_and_offline(toy: PhoneInventory, tmp_path: Path) -> None:
     model = loaded(toy, tmp_path)
     samples, _ = vowels()
     assert symbols(recognize(model, samples, 16_000), toy) == "a o e i u y"
@@ -142,7 +142,7 @@ def test_it_is_recognised_live_and_offline(toy: PhoneInventory, tmp_path: Path) 
     assert symbols(final, toy) == "a o e i u y"
 
 
-def test_text_is_aligned(toy: PhoneInventory, tmp_path: Path) -> None:
+def test_aligns_text(toy: PhoneInventory, tmp_path: Path) -> None:
     model = loaded(toy, tmp_path)
     samples, labels = vowels()
     aligned = spoken(align_text(model, samples, 16_000, "aoe iuy"), toy)
@@ -153,7 +153,7 @@ def test_text_is_aligned(toy: PhoneInventory, tmp_path: Path) -> None:
         align_text(model, samples, 16_000, "xyz")
 
 
-def test_its_sound_opens_the_mouth(toy: PhoneInventory, tmp_path: Path) -> None:
+def test_opens_the_mouth(toy: PhoneInventory, tmp_path: Path) -> None:
     visemes = "dynamic-visemes"
     chain = LiveChain(
         loaded(toy, tmp_path),
@@ -169,7 +169,7 @@ def test_its_sound_opens_the_mouth(toy: PhoneInventory, tmp_path: Path) -> None:
     assert not any(jaw[:10])  # nobody speaks yet
 
 
-def test_its_lips_close_for_m_and_it_has_a_diphthong(toy: PhoneInventory) -> None:
+def test_closes_the_lips_for_m_and_moves_through_a_diphthong(toy: PhoneInventory) -> None:
     face = FaceAnimator(load_lip_model("toy"), frame_rate_hz=50.0, delay_s=0.1)
     for index, (symbol, onset_s, duration_s) in enumerate(
         [("a", 0.1, 0.4), ("m", 0.5, 0.1), ("a", 0.6, 0.3), ("y", 0.9, 0.3)]
@@ -191,7 +191,7 @@ def test_its_lips_close_for_m_and_it_has_a_diphthong(toy: PhoneInventory) -> Non
     assert width[48] < width[57] - 80  # y is u and then i: rounded at 0.96 s, wide at 1.14 s
 
 
-def test_a_model_of_other_phones_is_refused(toy: PhoneInventory, tmp_path: Path) -> None:
+def test_rejects_a_model_with_other_phones(toy: PhoneInventory, tmp_path: Path) -> None:
     path = tmp_path / "toy.npz"
     trained(toy).save(path)
     arrays = read_archive(path).arrays
@@ -200,7 +200,7 @@ def test_a_model_of_other_phones_is_refused(toy: PhoneInventory, tmp_path: Path)
         load_model(path)
 
 
-def test_a_model_of_a_language_that_is_not_installed_is_refused(
+def test_rejects_a_model_whose_language_is_not_installed(
     toy: PhoneInventory, tmp_path: Path
 ) -> None:
     path = tmp_path / "toy.npz"

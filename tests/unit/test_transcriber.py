@@ -26,22 +26,20 @@ SOUND = 0.1 * np.random.default_rng(0).standard_normal(16_000).astype(np.float32
         ("sherpa-onnx-sense-voice-zh", sense_voice),
     ],
 )
-def test_every_kind_of_model_is_run(
-    tmp_path: Path, name: str, write: Callable[[Path], Path]
-) -> None:
+def test_runs_every_kind_of_model(tmp_path: Path, name: str, write: Callable[[Path], Path]) -> None:
     transcriber = SherpaTranscriber(write(tmp_path / name))
     assert transcriber.transcribe(SOUND) == "你好"
     assert transcriber.transcribe(SOUND[:8000]) == "你好"
 
 
-def test_of_several_files_the_smallest_is_taken(tmp_path: Path) -> None:
+def test_uses_the_smallest_file(tmp_path: Path) -> None:
     folder = paraformer(tmp_path / "paraformer")
     (folder / "model.onnx").rename(folder / "model.int8.onnx")
     (folder / "model.onnx").write_bytes(bytes(100_000))  # cannot be loaded
     assert SherpaTranscriber(folder).transcribe(SOUND) == "你好"
 
 
-def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
+def test_rejects_a_folder_without_a_model(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"contains no tokens\.txt"):
         SherpaTranscriber(tmp_path)
     with pytest.raises(UserError, match="no model of a known kind"):
@@ -52,9 +50,7 @@ def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
         SherpaTranscriber(damaged)
 
 
-def test_without_the_package_the_user_is_told_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reports_which_package_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sherpa_onnx", None)
     with pytest.raises(UserError, match=r"pip install 'kouxing\[speech-to-text\]'"):
         SherpaTranscriber(tmp_path)

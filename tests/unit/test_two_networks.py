@@ -25,12 +25,12 @@ def two_networks() -> TwoNetworks:
     return cast(TwoNetworks, with_early_network(blocks()))
 
 
-def test_a_model_that_is_early_itself_stays_alone() -> None:
+def test_a_causal_model_is_not_combined() -> None:
     neural = load_model()
     assert with_early_network(neural) is neural
 
 
-def test_the_newest_frames_have_the_causal_scores() -> None:
+def test_the_newest_frames_have_causal_scores() -> None:
     model = two_networks()
     together, early, late = (
         model.create_stream(),
@@ -59,7 +59,7 @@ def events_of(model: AcousticModel, chunk: int = 320) -> list[StreamOutput]:
     return recognize_live(model, HELLO, chunk, lips=lips, face_delay_s=0.06)
 
 
-def test_the_lips_are_those_of_the_causal_network() -> None:
+def test_lip_frames_come_from_the_causal_network() -> None:
     assert lip_predictor_for(blocks()) is None
     found, expected = (
         [event for event in events_of(model) if isinstance(event, LipFrame)]
@@ -72,7 +72,7 @@ def test_the_lips_are_those_of_the_causal_network() -> None:
 
 
 @pytest.mark.parametrize("chunk", [160, 777])
-def test_provisional_scores_are_the_same_in_any_chunks(chunk: int) -> None:
+def test_chunks_do_not_affect_provisional_scores(chunk: int) -> None:
     def scores_of(pieces: list[np.ndarray]) -> list[FrameScores]:
         scorer = SpeechScorer(two_networks())
         for piece in pieces:
@@ -90,7 +90,7 @@ def test_provisional_scores_are_the_same_in_any_chunks(chunk: int) -> None:
         np.testing.assert_array_equal(one.provisional, two.provisional)
 
 
-def test_phones_are_the_same_in_any_chunks_and_any_company() -> None:
+def test_chunks_and_other_sessions_do_not_affect_phones() -> None:
     model = two_networks()
     expected = [event for event in events_of(model) if isinstance(event, Phone)]
     assert len(expected) > 5

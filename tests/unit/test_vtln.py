@@ -1,5 +1,3 @@
-import itertools
-
 import numpy as np
 import pytest
 
@@ -57,14 +55,14 @@ def centre_hz(band: float) -> float:
 
 @pytest.mark.parametrize("pitch_hz", [80.0, 110.0, 160.0, 220.0, 330.0])
 @pytest.mark.parametrize("level", [0.5, 0.02])
-def test_the_pitch_of_a_vowel(pitch_hz: float, level: float) -> None:
+def test_tracks_the_pitch_of_a_vowel(pitch_hz: float, level: float) -> None:
     measured_hz, strength = PitchTracker().accept_waveform(vowel(pitch_hz, level=level))
     np.testing.assert_allclose(measured_hz[4:], pitch_hz, rtol=0.03)
     assert (strength[4:] > VOICED_STRENGTH).all()
     assert strength.max() <= 1.0
 
 
-def test_noise_and_silence_have_no_voice() -> None:
+def test_noise_and_silence_are_unvoiced() -> None:
     _, strength = PitchTracker().accept_waveform(noise())
     assert (strength > VOICED_STRENGTH).mean() < 0.02
     pitch_hz, strength = PitchTracker().accept_waveform(np.zeros(16_000, np.float32))
@@ -74,7 +72,7 @@ def test_noise_and_silence_have_no_voice() -> None:
     assert strength.max() < VOICED_STRENGTH
 
 
-def test_a_frame_of_pitch_is_ready_with_the_frame_of_features() -> None:
+def test_pitch_is_ready_with_the_features() -> None:
     log_mel, tracker = LogMel(), PitchTracker()
     sample = np.zeros(1, np.float32)
     for _ in range(400 + 160 * 3):
@@ -83,7 +81,7 @@ def test_a_frame_of_pitch_is_ready_with_the_frame_of_features() -> None:
         assert len(pitch_hz) == len(strength) == num_frames
 
 
-def test_a_frame_hears_up_to_its_end() -> None:
+def test_pitch_depends_on_audio_up_to_the_end_of_the_frame() -> None:
     """A change at sample t * 160 + 400 or later is none to frame t; one just before it is."""
     sound = vowel(150.0, seconds=0.2)
     end = 10 * 160 + 400
@@ -96,36 +94,7 @@ def test_a_frame_hears_up_to_its_end() -> None:
         assert (frames[:, 10] == whole[:, 10]).all() == same
 
 
-def chunks(num_samples: int, size: int | None) -> list[slice]:
-    if size is None:
-        cuts = np.sort(np.random.default_rng(3).integers(0, num_samples, 60))  # some are empty
-        edges = [0, *cuts.tolist(), num_samples]
-    else:
-        edges = [*range(0, num_samples, size), num_samples]
-    return [slice(*pair) for pair in itertools.pairwise(edges)]
-
-
-@pytest.mark.parametrize("size", [1, 7, 160, 1000, None])
-def test_any_chunks_give_the_same_bits(size: int | None) -> None:
-    sound = np.concatenate([vowel(105.0, 0.15), noise(0.05), vowel(180.0, 0.1)])
-    pitch_hz, strength = PitchTracker().accept_waveform(sound)
-    log_mel = LogMel().accept_waveform(sound)
-    warped = VocalTractNormalizer().warp(log_mel, pitch_hz, strength)
-    assert (warped != log_mel).any()
-
-    bank, tracker, vtln = LogMel(), PitchTracker(), VocalTractNormalizer()
-    pitches, strengths, frames = [], [], []
-    for chunk in chunks(len(sound), size):
-        pitch, strong = tracker.accept_waveform(sound[chunk])
-        pitches.append(pitch)
-        strengths.append(strong)
-        frames.append(vtln.warp(bank.accept_waveform(sound[chunk]), pitch, strong))
-    np.testing.assert_array_equal(np.concatenate(pitches), pitch_hz)
-    np.testing.assert_array_equal(np.concatenate(strengths), strength)
-    np.testing.assert_array_equal(np.concatenate(frames), warped)
-
-
-def test_a_low_voice_goes_up_with_time() -> None:
+def test_warps_a_low_voice_more_over_time() -> None:
     vtln = VocalTractNormalizer()
     assert vtln.factor == 1.0
     factors = []
@@ -138,14 +107,7 @@ def test_a_low_voice_goes_up_with_time() -> None:
     assert factors[-1] == pytest.approx(np.exp(0.2 * np.log(REFERENCE_HZ / 110)), abs=5e-3)
 
 
-def test_a_vowel_spoken_low_is_warped() -> None:
-    sound = vowel(110.0, seconds=2.0)
-    vtln = VocalTractNormalizer()
-    vtln.warp(LogMel().accept_waveform(sound), *PitchTracker().accept_waveform(sound))
-    assert vtln.factor == pytest.approx((REFERENCE_HZ / 110) ** (0.2 * 198 / 218), abs=4e-3)
-
-
-def test_a_high_voice_keeps_every_bit() -> None:
+def test_does_not_change_a_high_voice() -> None:
     sound = vowel(240.0)
     log_mel = LogMel().accept_waveform(sound)
     vtln = VocalTractNormalizer()
@@ -155,7 +117,7 @@ def test_a_high_voice_keeps_every_bit() -> None:
     assert not np.shares_memory(warped, log_mel)
 
 
-def test_a_formant_moves_up_by_the_factor() -> None:
+def test_moves_formants_up_by_the_factor() -> None:
     log_mel = bands_with_a_peak(2000, 20)
     vtln = VocalTractNormalizer()
     warped = vtln.warp(log_mel, *voice(90.0, 2000))
@@ -167,14 +129,14 @@ def test_a_formant_moves_up_by_the_factor() -> None:
     assert centre_hz(int(peak)) / centre_hz(20) == pytest.approx(vtln.factor, rel=0.05)
 
 
-def test_the_factor_has_a_limit() -> None:
+def test_limits_the_factor() -> None:
     vtln = VocalTractNormalizer()
     warped = vtln.warp(bands_with_a_peak(2000, 20), *voice(40.0, 2000))
     assert vtln.factor == MAX_FACTOR
     assert np.isfinite(warped).all()
 
 
-def test_frames_without_voice_do_not_move_the_mean() -> None:
+def test_ignores_unvoiced_frames() -> None:
     vtln = VocalTractNormalizer()
     vtln.warp(bands_with_a_peak(50, 20), *voice(110.0, 50))
     before = vtln.factor
@@ -183,22 +145,13 @@ def test_frames_without_voice_do_not_move_the_mean() -> None:
     assert vtln.factor == before
 
 
-def test_another_speaker_is_followed() -> None:
+def test_adapts_to_another_speaker() -> None:
     vtln = VocalTractNormalizer()
     vtln.warp(bands_with_a_peak(20_000, 20), *voice(110.0, 20_000))
     vtln.warp(bands_with_a_peak(3000, 20), *voice(330.0, 3000))
     assert vtln.factor == 1.0
 
 
-def test_reset_forgets() -> None:
-    vtln = VocalTractNormalizer()
-    log_mel = bands_with_a_peak(100, 20)
-    first = vtln.warp(log_mel, *voice(110.0, 100))
-    vtln.reset()
-    assert vtln.factor == 1.0
-    np.testing.assert_array_equal(vtln.warp(log_mel, *voice(110.0, 100)), first)
-
-
-def test_shapes_that_do_not_fit() -> None:
+def test_rejects_different_shapes() -> None:
     with pytest.raises(ValueError, match="shapes"):
         VocalTractNormalizer().warp(bands_with_a_peak(3, 20), *voice(110.0, 2))

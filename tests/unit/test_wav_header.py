@@ -24,7 +24,7 @@ def wav(rate_hz: int = 22050, num_channels: int = 1, sample_bytes: int = 2) -> b
     return file.getvalue()
 
 
-def test_a_wav_header_tells_the_format() -> None:
+def test_reads_the_format() -> None:
     assert read_wav_header(wav(24000, 2)) == WavHeader(
         sample_rate_hz=24000, num_channels=2, encoding="s16le", num_bytes=44
     )
@@ -37,7 +37,7 @@ def test_a_wav_header_tells_the_format() -> None:
     )
 
 
-def test_a_wav_header_of_another_format_says_what_was_expected() -> None:
+def test_rejects_other_formats() -> None:
     with pytest.raises(UserError, match="format 1 with 8 bits; use 16-bit PCM"):
         read_wav_header(wav(sample_bytes=1))
     with pytest.raises(UserError, match="incomplete"):
