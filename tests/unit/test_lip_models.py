@@ -53,7 +53,8 @@ def test_a_package_adds_a_lip_model_by_entry_point(
     (metadata / "entry_points.txt").write_text("[kouxing.lip_models]\ntoy = toy_lips\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert lip_models()["toy"].delay_ms == 40.0
-    assert load_lip_model(name="toy") == ("toy", "mandarin")
+    toy: object = load_lip_model(name="toy")
+    assert toy == ("toy", "mandarin")
 
 
 def test_an_unknown_lip_model_is_an_error() -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kouxing.services.driver.poses import FADE_S, Poses
+from kouxing.services.driver.poses import Poses
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion
+from kouxing.shared.face.resting_face import FADE_S
 
 pytestmark = pytest.mark.unit
 
