@@ -9,7 +9,7 @@ the 52 names of Perfect Sync instead, because a model with both would open its m
 name these as Apple (jawOpen) or as Unity does (JawOpen), and case may matter, so both are sent.
 
 Unity's axes are x to the model's right, y up, z to the front, left-handed. A bone message also
-contains a position, which only the model knows. It is sent as 0, and only some receivers ignore it.
+contains a position that is unknown here. It is sent as 0, and only some receivers ignore it.
 Therefore head rotation is off unless ``head=on``.
 """
 

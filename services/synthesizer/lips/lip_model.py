@@ -17,7 +17,7 @@ from kouxing.shared.phones.events import SoundEvent
 
 
 class Articulation(Protocol):
-    """What the lip model knows about the current speech; used by modifiers."""
+    """Data about the current speech that modifiers use."""
 
     @property
     def syllable_onsets_s(self) -> NDArray[np.float64]:
