@@ -42,14 +42,14 @@ def picture(name: str) -> NDArray[np.uint8]:
 
 def write_video(path: Path, pictures: list[NDArray[np.uint8]], *, sound: bool = True) -> None:
     with VideoWriter(path, 192, 144, 25.0, 16_000 if sound else None) as writer:
-        for each in pictures:
-            writer.write_image(each)
+        for image in pictures:
+            writer.write_image(image)
             if sound:
                 writer.write_sound(np.zeros(640, np.float32))
 
 
 def run(app: object, *arguments: object) -> None:
-    RUNNER.invoke(app, [str(each) for each in arguments], catch_exceptions=False)  # type: ignore[arg-type]
+    RUNNER.invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)  # type: ignore[arg-type]
 
 
 def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_tracks_the_lips_of_a_rendered_head(tmp_path: Path) -> None:
-    """The head turns and nods while it speaks; the FAPs that move it are known."""
+    """The head turns and nods while it speaks. Its true FAPs are known."""
     samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * 16_000]
     visemes = "dynamic-visemes"
     settings = SynthesizerConfig(lips=visemes)

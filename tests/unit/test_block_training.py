@@ -41,7 +41,7 @@ def small_network() -> BlockNetwork:
 
 @torch.no_grad()
 def outputs(network: BlockNetwork, frames: np.ndarray, block_length: int) -> torch.Tensor:
-    """Log posteriors by block, (blocks, B + R, 2, states), of as many frames as are used."""
+    """Compute log posteriors by block, (blocks, B + R, 2, states)."""
     laid = layout((len(frames) - 1) // 2, block_length)
     features = network.encoder(torch.from_numpy(frames)[None], laid)
     return network.readout.read(features, laid)[0, laid.blocks]

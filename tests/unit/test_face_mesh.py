@@ -1,4 +1,4 @@
-"""The face mesh finds what MediaPipe finds."""
+"""The face mesh finds the landmarks that MediaPipe finds."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_finds_mediapipes_landmarks(name: str) -> None:
 
 def test_finds_a_rotated_face() -> None:
     upright = picture("woman_a")
-    landmarks, turned = (FaceMesh().track(each) for each in (upright, np.rot90(upright)))
+    landmarks, turned = (FaceMesh().track(image) for image in (upright, np.rot90(upright)))
     assert landmarks is not None
     assert turned is not None
     back = np.stack([upright.shape[1] - turned[:, 1], turned[:, 0]], axis=1)

@@ -33,14 +33,14 @@ def test_recovers_openings() -> None:
     opening = key_frames_of(phones, true, INVENTORY.silence).openings_at(time_s)
     clip = clip_of(time_s, faps_of(opening))
     relative = relative_openings([clip])[0]
-    scale = 5.0 / np.percentile(opening, 98)  # what is wide for this speaker is 5
+    scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5
     np.testing.assert_allclose(relative, np.minimum(scale * opening, 5.0), atol=0.01)
     found = fit_openings([clip], [phones], INVENTORY)
     for phone in ("a", "i", "u", "d", "b", "sh"):
         expected = min(scale * true.opening[phone], 5.0)
         assert found[phone] == pytest.approx(expected, abs=0.3)
     assert found["sil"] == found["b"] == 0.0
-    # what is not heard is like what has its visemes
+    # a phone without data follows its visemes
     assert found["ang"] == pytest.approx(found["a"], abs=0.3)
     travel = faps_of([5.0])[0] / scale
     np.testing.assert_allclose(travel_of([clip]), travel, rtol=0.05, atol=1e-9)

@@ -41,7 +41,7 @@ CLIP = clip_of(np.empty(0), np.empty((0, 28)))
 
 
 class Clock(WholeEncoder):
-    """Hears nothing but what time it is."""
+    """An encoder whose feature is the time."""
 
     def __init__(self) -> None:
         super().__init__(Shape(num_states=0, look_aheads=(), width=32, heads=2, inner=48))
@@ -51,7 +51,7 @@ class Clock(WholeEncoder):
 
 
 class Loudness(WholeEncoder):
-    """Hears how loud each 20 ms are."""
+    """An encoder whose feature is the loudness of 20 ms."""
 
     def __init__(self) -> None:
         super().__init__(Shape(num_states=0, look_aheads=(), width=32, heads=2, inner=48))
@@ -122,7 +122,7 @@ def test_learns_lips_from_the_whole_recording() -> None:
     taught = train_teacher(Loudness(), speech[1:], examples[1:], DELAYS_S, num_epochs=30, seed=0)
     (label,) = taught.label(speech[:1], [examples[0].components], DELAYS_S, 1)
     now = DELAYS_S.index(TAUGHT_DELAY_S)
-    made, wanted = (each.targets[:, now, LOWER_LIP] for each in (label, examples[0]))
+    made, wanted = (example.targets[:, now, LOWER_LIP] for example in (label, examples[0]))
     assert np.corrcoef(made, wanted)[0, 1] > 0.8
 
 

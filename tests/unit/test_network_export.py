@@ -1,4 +1,4 @@
-"""The network's file: what is written is what is read again and what onnxruntime computes."""
+"""The network's ONNX file: exported, read again, and run by onnxruntime."""
 
 import numpy as np
 import pytest

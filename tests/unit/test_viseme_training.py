@@ -45,8 +45,8 @@ def test_estimates_the_parameters_behind_curves() -> None:
     before = blend(START, build_timeline(phones, INVENTORY), time_s)
     for column in measured:
         error, start_error = (
-            float(np.sqrt(np.mean((each[:, column] - curve[:, column]) ** 2)))
-            for each in (again, before)
+            float(np.sqrt(np.mean((faps[:, column] - curve[:, column]) ** 2)))
+            for faps in (again, before)
         )
         assert error < 0.35 * start_error
     assert found.target[VISEME_INDEX["i"], JAW] == pytest.approx(150.0, rel=0.2)
