@@ -39,7 +39,7 @@ class Sums:
     """Base of results that can be added field by field."""
 
     def __add__(self, other: Self) -> Self:
-        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return type(self)(*(ours + theirs for ours, theirs in pairs))
 
 

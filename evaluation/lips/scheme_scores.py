@@ -93,7 +93,7 @@ def score_schemes(
     lips: Sequence[str],
 ) -> Outcome:
     """Score all conditions; raises UserError if there are neither texts nor tracked lips."""
-    if all(each.aligned is None and not len(each.sentence.clip.time_s) for each in sentences):
+    if all(s.aligned is None and not len(s.sentence.clip.time_s) for s in sentences):
         raise UserError("no sentence has a text or tracked lips; give other sentences")
     conditions = all_conditions(recognizers, lips)
     mouths = {
@@ -122,7 +122,7 @@ def score_schemes(
             _condition_score(
                 condition,
                 [m for n in range(len(sentences)) if (m := mouths[condition, n]) is not None],
-                [d for each in sentences for d in phone_delays_s(condition, each, inventory)],
+                [d for s in sentences for d in phone_delays_s(condition, s, inventory)],
                 like_aligned[condition],
                 like_real[condition],
             )
@@ -233,7 +233,7 @@ def _orders(
         for recognizer in recognizers:
             schemes = [scores.get(Condition(ALIGNED, name, ""), {})]
             schemes += [scores.get(Condition(n, name, recognizer.name), {}) for n in SCHEMES[1:]]
-            rows = [[_correlation(each.get(n)) for each in schemes] for n in schemes[0]]
+            rows = [[_correlation(by_number.get(n)) for by_number in schemes] for n in schemes[0]]
             table = np.array([row for row in rows if None not in row], dtype=float)
             if len(table):
                 means = table.mean(axis=0)

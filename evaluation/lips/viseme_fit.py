@@ -78,8 +78,8 @@ def fit_folder(folder: Path, parameters: Path | None) -> list[FittedClip]:
     """Model all clips of a folder that the parameters were not trained on."""
     model = load_model()
     learnt, guessed = (
-        DynamicVisemes(each, model.inventory)
-        for each in (load_parameters(parameters), initial_parameters())
+        DynamicVisemes(values, model.inventory)
+        for values in (load_parameters(parameters), initial_parameters())
     )
     clips = clips_to_score(folder, parameters, language=model.inventory.code)
     return [
@@ -167,10 +167,10 @@ def fit_figure(fitted: Sequence[FittedClip]) -> Any:
     axes = figure.subplots(
         1 + len(MEASURES), 2, sharex="col", sharey="row", width_ratios=(1.0, 2.2), squeeze=False
     )
-    clip = max(fitted, key=lambda each: _long_vowel(each)[2])
+    clip = max(fitted, key=lambda clip: _long_vowel(clip)[2])
     start_s, length_s, _ = _long_vowel(clip)
     _draw_fit(axes[:, 0], clip, start_s - _CONTEXT_S, start_s + length_s + _CONTEXT_S)
-    clip = max(fitted, key=lambda each: _busiest_stretch(each)[1])
+    clip = max(fitted, key=lambda clip: _busiest_stretch(clip)[1])
     start_s, _ = _busiest_stretch(clip)
     _draw_fit(axes[:, 1], clip, start_s, start_s + _SENTENCE_S)
     for axis, measure in zip(axes[1:, 0], MEASURES, strict=True):

@@ -59,7 +59,10 @@ def compare(
     is_new = times > newest
     is_rest = np.diff(times, prepend=-1) == 0
     errors = count_errors(
-        *([phone.symbol for phone in each.final_phones(silence)] for each in (undisturbed, seen))
+        *(
+            [phone.symbol for phone in record.final_phones(silence)]
+            for record in (undisturbed, seen)
+        )
     )
     due_s = seen.start_s + delay_s + times / MEDIA_RATE_HZ
     is_live = is_new & (arrived_s < seen.live_until_s)

@@ -345,7 +345,7 @@ def _outcome(
         sessions, num_refused = _open_all(client, fault.num_sessions)
         silence = load_inventory(sessions[0].info["facts"]["language"] or DEFAULT_LANGUAGE).silence
         endpoints = [state.endpoints for state in client.status().services]
-        publishers = [each["faps"] for each in endpoints if "faps" in each]
+        publishers = [by_name["faps"] for by_name in endpoints if "faps" in by_name]
         monitor = EpochMonitor(sessions[0], publishers, system.key)
         actions = fault.actions(system, sessions[0].name, timing)
         with _second_subscriber(

@@ -105,8 +105,8 @@ class LocalSystem:
         self._spare_kind = spare
         self._spare_name = f"{spare}-2"
         more = {
-            name: {**own, variable(spare, "instance"): SPARE}
-            for name, own in more_workers(read_settings(), 2).items()
+            name: {**addresses, variable(spare, "instance"): SPARE}
+            for name, addresses in more_workers(read_settings(), 2).items()
             if name == self._spare_name
         }
         self.supervisor = Supervisor([], folder, console, environment, services=services, more=more)
@@ -261,15 +261,15 @@ def instance_of(system: System, session: str, service: str) -> str:
     report = status(system)
     workers = {
         worker
-        for each in report.sessions
-        if each.session == session
-        for worker in each.workers.values()
+        for state in report.sessions
+        if state.session == session
+        for worker in state.workers.values()
     }
     return next(
         (
-            each.instance
-            for each in report.services
-            if each.service == service and each.instance in workers
+            state.instance
+            for state in report.services
+            if state.service == service and state.instance in workers
         ),
         "",
     )

@@ -250,9 +250,9 @@ class Page:
         self._browser.wait_for(IS_WELCOME if not secrets else "document.readyState === 'complete'")
 
     def press(self, name: str) -> None:
-        found = f"document.getElementById('{name}')"
-        self._browser.wait_for(f"{found}?.matches(':enabled') && {found}.checkVisibility()")
-        self._browser.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
+        button = f"document.getElementById('{name}')"
+        self._browser.wait_for(f"{button}?.matches(':enabled') && {button}.checkVisibility()")
+        self._browser.evaluate(f"{button}.scrollIntoView({{block: 'center'}})")
         self._browser.click(name)
 
     def judge_everything(

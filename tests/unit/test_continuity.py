@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
+from array import array
+
 import pytest
+from kouxing_client import FapFrame, Phone, Speech
 
 from kouxing.evaluation.system.continuity import compare, staleness, worst
 from kouxing.evaluation.system.live import Seen
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.speech import Phone, Speech
 
 pytestmark = pytest.mark.unit
-MASK = bytes([252] + [255] * 7 + [15])
 JAW = 2  # index of FAP 3
 
 
 def frame(number: int, *, epoch: int = 1, jaw: float | None = None) -> FapFrame:
-    values = np.zeros(68, "<f4")
+    values = array("f", bytes(4 * 68))
     values[JAW] = 10.0 * number if jaw is None else jaw
-    return FapFrame(
-        session="s", epoch=epoch, media_time=320 * number, values=values.tobytes(), mask=MASK
-    )
+    return FapFrame(session="s", epoch=epoch, media_time=320 * number, values=memoryview(values))
 
 
 def phone(index: int, symbol: str, *, epoch: int = 1, final: bool = True, at: int = -1) -> Phone:

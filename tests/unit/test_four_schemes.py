@@ -109,13 +109,13 @@ LIVE: list[SoundEvent] = [
 
 
 def told_phones(events: list[SoundEvent]) -> list[tuple[str, float, float]]:
-    found = [event for event in events if isinstance(event, Phone)]
-    indices = [event.index for event in found]
+    phones = [event for event in events if isinstance(event, Phone)]
+    indices = [event.index for event in phones]
     assert indices == sorted(set(indices)), "no phone is corrected"
     assert [event for event in events if not isinstance(event, Phone)] == [
         event for event in LIVE if not isinstance(event, Phone)
     ]
-    return [(event.symbol, event.onset_s, event.duration_s) for event in found]
+    return [(event.symbol, event.onset_s, event.duration_s) for event in phones]
 
 
 def test_the_papers_rule_corrects_nothing() -> None:
@@ -174,15 +174,15 @@ def utterance(name: str, speaker: str, seconds: float) -> Utterance:
 
 
 def test_chooses_sentences_of_all_speakers_near_4_s() -> None:
-    found = [
+    utterances = [
         utterance("a-long", "A", 9.0),
         utterance("a-usual", "A", 4.1),
         utterance("a-short", "A", 3.0),
         utterance("b-long", "B", 8.0),
     ]
-    assert [each.utterance_id for each in choose(found, 2)] == ["a-usual", "b-long"]
-    assert [each.utterance_id for each in choose(found, 3)] == ["a-short", "a-usual", "b-long"]
-    assert len(choose(found)) == 4
+    assert [each.utterance_id for each in choose(utterances, 2)] == ["a-usual", "b-long"]
+    assert [each.utterance_id for each in choose(utterances, 3)] == ["a-short", "a-usual", "b-long"]
+    assert len(choose(utterances)) == 4
 
 
 def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:

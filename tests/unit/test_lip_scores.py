@@ -68,13 +68,13 @@ def recognized(
 
 
 def make_scheme(name: str, frames: NDArray[np.float64], delay_s: float = 0.05) -> Scheme:
-    return Scheme(name, delay_s, lambda _heard: frames)
+    return Scheme(name, delay_s, lambda _clip: frames)
 
 
 def scores_of(lips: RecognizedClip, schemes: dict[str, NDArray[np.float64]]) -> list[LipScore]:
     """Score made frames under their names."""
-    found = [score_clip(lips, make_scheme(name, frames)) for name, frames in schemes.items()]
-    return pool([score for score in found if score is not None])
+    results = [score_clip(lips, make_scheme(name, frames)) for name, frames in schemes.items()]
+    return pool([score for score in results if score is not None])
 
 
 def test_measures_lag_openings_and_closures() -> None:
@@ -100,32 +100,35 @@ def test_measures_lag_openings_and_closures() -> None:
         ("source", "made"),
         ("speaker", "nobody"),
     }
-    found = {score.scheme: score for score in scores if score.kind == "all"}
+    results = {score.scheme: score for score in scores if score.kind == "all"}
 
-    late = found["late"].curves["opening"]
+    late = results["late"].curves["opening"]
     assert late.best_lag_ms == 50
     assert late.best_correlation == pytest.approx(1.0, abs=0.01)
     assert late.correlation is not None
     assert late.correlation < 0.95
-    assert found["late"].opening_delay_p50_ms == pytest.approx(50.0, abs=2.0)
-    assert found["late"].opening_delay_p95_ms == pytest.approx(50.0, abs=5.0)
-    assert [curve.correlation for curve in found["still"].curves.values()] == [None] * 3
-    assert found["true"].opening_delay_p95_ms == pytest.approx(0.0)
-    assert found["true"].openings_met == found["true"].openings >= 5
-    assert found["true"].closures.real >= 3
-    assert found["true"].closures.recall == 1.0
-    assert found["true"].bpm == sum(phone.symbol == "b" for phone in phones) >= 3
-    assert found["true"].bpm_met == found["true"].bpm
+    assert results["late"].opening_delay_p50_ms == pytest.approx(50.0, abs=2.0)
+    assert results["late"].opening_delay_p95_ms == pytest.approx(50.0, abs=5.0)
+    assert [curve.correlation for curve in results["still"].curves.values()] == [None] * 3
+    assert results["true"].opening_delay_p95_ms == pytest.approx(0.0)
+    assert results["true"].openings_met == results["true"].openings >= 5
+    assert results["true"].closures.real >= 3
+    assert results["true"].closures.recall == 1.0
+    assert results["true"].bpm == sum(phone.symbol == "b" for phone in phones) >= 3
+    assert results["true"].bpm_met == results["true"].bpm
     # the made curve has 50 frames a second, as this clip
-    for each in found["true"].curves.values():
+    for each in results["true"].curves.values():
         assert each.turns_per_s == pytest.approx(each.real_turns_per_s, rel=0.02)
         assert each.turns_per_s_at_50_hz == pytest.approx(each.turns_per_s)
     # a mouth that never opens closes nothing
     assert (
-        found["still"].bpm_met == found["still"].closures.met == found["still"].closures.made == 0
+        results["still"].bpm_met
+        == results["still"].closures.met
+        == results["still"].closures.made
+        == 0
     )
-    assert found["still"].closures.f1 == 0.0
-    true_rmse, late_rmse = found["true"].curves["opening"].rmse, late.rmse
+    assert results["still"].closures.f1 == 0.0
+    true_rmse, late_rmse = results["true"].curves["opening"].rmse, late.rmse
     assert true_rmse is not None
     assert late_rmse is not None
     assert true_rmse < 1e-3 < late_rmse
@@ -161,8 +164,8 @@ def test_speech_is_loud_voice_activity() -> None:
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
     events = [SpeechChange(active=True, time_s=0.5), SpeechChange(active=False, time_s=2.5)]
     times_s = np.array([0.2, 0.6, 1.05, 1.5, 1.95, 2.4, 2.6])
-    found = is_speech(recognized(clip, events=events), times_s)
-    assert found.tolist() == [False, True, True, False, True, True, False]
+    results = is_speech(recognized(clip, events=events), times_s)
+    assert results.tolist() == [False, True, True, False, True, True, False]
     assert not is_speech(recognized(clip), times_s).any()
 
 
@@ -180,18 +183,18 @@ def test_measures_late_and_moving_lips_in_pauses() -> None:
     twitching = late.copy()
     twitching[70:80:2, 4] = -10.0  # at 1.4 to 1.6 s
     gaping = np.full_like(frames, -300.0)
-    found = {
+    results = {
         score.scheme: score.pauses
         for score in scores_of(lips, {"late": late, "twitching": twitching, "gaping": gaping})
         if score.kind == "all"
     }
-    assert found["late"].count == found["late"].shut == found["late"].real_shut == 2
-    assert found["late"].speed == found["late"].real_speed == 0.0
-    assert found["late"].real_shut_after_p95_ms == pytest.approx(70.0, abs=5.0)
-    assert found["late"].shut_after_p95_ms == pytest.approx(165.0, abs=10.0)
+    assert results["late"].count == results["late"].shut == results["late"].real_shut == 2
+    assert results["late"].speed == results["late"].real_speed == 0.0
+    assert results["late"].real_shut_after_p95_ms == pytest.approx(70.0, abs=5.0)
+    assert results["late"].shut_after_p95_ms == pytest.approx(165.0, abs=10.0)
     # ten steps of 10 units in 20 ms, among those of 1.29 to 2.31 s and of 3.29 to 3.8 s
-    assert found["twitching"].speed == pytest.approx(500.0 * np.sqrt(10 / 75), rel=0.02)
-    assert (found["gaping"].shut, found["gaping"].shut_after_p50_ms) == (0, None)
+    assert results["twitching"].speed == pytest.approx(500.0 * np.sqrt(10 / 75), rel=0.02)
+    assert (results["gaping"].shut, results["gaping"].shut_after_p50_ms) == (0, None)
 
 
 def test_counts_closures_in_speech_separately() -> None:
@@ -215,14 +218,14 @@ def test_prints_scores_by_group() -> None:
     rng = np.random.default_rng(0)
     clip = clip_of(time_s, rng.normal(0.0, 100.0, (len(time_s), len(MOUTH_FAPS))))
     frames = rng.normal(0.0, 100.0, (101, NUM_FAPS))
-    found = [
+    results = [
         score_clip(
             recognized(replace(clip, speaker=speaker, language=language)),
             make_scheme("dynamic-visemes", frames, DEFAULT_DELAY_S),
         )
         for speaker, language in (("one", "zh"), ("somebody_with_a_name", "en"))
     ]
-    scores = pool([score for score in found if score is not None])
+    scores = pool([score for score in results if score is not None])
     console = Console(record=True, width=80, file=StringIO())
     print_scores(scores, console)
     text = console.export_text()
@@ -254,8 +257,8 @@ def test_finds_the_quietest_moment_of_a_phone() -> None:
         middle = round(time_s * SAMPLE_RATE_HZ)
         samples[middle - 200 : middle + 200] = 0.0
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    found = phones_with_viseme(recognized(clip, phones), "b")
-    np.testing.assert_allclose(quietest_moments(clip, found), quiet_s, atol=0.011)
+    results = phones_with_viseme(recognized(clip, phones), "b")
+    np.testing.assert_allclose(quietest_moments(clip, results), quiet_s, atol=0.011)
     # only phones in the model's language count
     english = replace(clip, language="en")
     assert phones_with_viseme(recognized(english, phones), "b") == []
@@ -275,17 +278,17 @@ def test_one_recognizer_run_serves_all_delays() -> None:
     model = load_model()
     samples = read_audio(VOWELS_FILE)[0][:, 0]
     lips = lip_predictor_for(model)
-    found = live_events(model, samples, lips, DELAYS_S)
-    assert list(found) == DELAYS_S
+    results = live_events(model, samples, lips, DELAYS_S)
+    assert list(results) == DELAYS_S
     alone = sound_events(model, samples, lips, DEFAULT_DELAY_S)
-    assert len(alone) == len(found[DEFAULT_DELAY_S]) > 200
-    for event, other in zip(alone, found[DEFAULT_DELAY_S], strict=True):
+    assert len(alone) == len(results[DEFAULT_DELAY_S]) > 200
+    for event, other in zip(alone, results[DEFAULT_DELAY_S], strict=True):
         if isinstance(event, LipFrame) and isinstance(other, LipFrame):
             assert (event.time_s, event.delay_s) == (other.time_s, other.delay_s)
             np.testing.assert_allclose(event.faps, other.faps, rtol=1e-4, atol=1e-3)
         else:
             assert event == other
-    delays = [{e.delay_s for e in found[d] if isinstance(e, LipFrame)} for d in DELAYS_S]
+    delays = [{e.delay_s for e in results[d] if isinstance(e, LipFrame)} for d in DELAYS_S]
     assert all(len(each) == 1 for each in delays)
     assert delays[0] != delays[-1]
     assert live_events(model, samples, None, DELAYS_S)[0.0] == sound_events(model, samples)
@@ -314,8 +317,8 @@ def test_skips_clips_used_for_training(tmp_path: Path, monkeypatch: pytest.Monke
     write_clip(clips, "b_four", language="en")
 
     def names(sources: Collection[str] = (), language: str | None = None) -> list[str]:
-        found = clips_to_score(clips, parameters, language=language, sources=sources)
-        return [clip.name for clip in found]
+        results = clips_to_score(clips, parameters, language=language, sources=sources)
+        return [clip.name for clip in results]
 
     assert names() == ["a_three", "b_four"]
     assert names(language="zh") == ["a_three"]
