@@ -116,7 +116,7 @@ class AudioSessions:
         KouxingError
             If control refuses or does not answer.
         """
-        if self._client is None:
+        if self._client is None or self._client.is_closed:
             self._client = AsyncClient(
                 self._control,
                 key=self._key,

@@ -146,6 +146,13 @@ def test_without_control_the_error_names_the_remedy() -> None:
         client.status()
 
 
+def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
+    client.close()
+    assert client.is_closed
+    with pytest.raises(KouxingError, match="closed"):
+        client.status()
+
+
 def test_asyncio_does_the_same(control: FakeControl) -> None:
     async def run() -> list[float]:
         async with AsyncClient(control.commands.endpoint, insecure=True) as client:

@@ -74,6 +74,11 @@ class BaseClient:
         key = None if insecure else key or find_key()
         self._thread = ClientThread(control, key, timeout_s, type(self)._make_signal)
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether the client was closed, or has failed, such as for lack of file descriptors."""
+        return not self._thread.is_running
+
     def _request(self, kind: str, session: str, fields: Fields) -> Future[Fields]:
         return self._thread.submit(lambda core: core.request(kind, session, **fields))
 

@@ -191,7 +191,10 @@ class Sockets:
         self._waker.close()
 
     def _open(self, kind: int, queue: int, on_message: Callable[[list[bytes]], None]) -> Connection:
-        raw: Connection = self._context.socket(kind)
+        try:
+            raw: Connection = self._context.socket(kind)
+        except zmq.ZMQError as error:  # such as too many open files
+            raise KouxingError(f"cannot open a socket: {error.strerror}") from None
         raw.linger, raw.sndhwm, raw.rcvhwm = 0, queue, queue
         raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
         raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])

@@ -52,6 +52,11 @@ class ClientThread:
         self._thread = threading.Thread(target=self._run, name="kouxing-client", daemon=True)
         self._thread.start()
 
+    @property
+    def is_running(self) -> bool:
+        """Whether the client is neither closed nor failed."""
+        return self._thread.is_alive()
+
     def call(self, function: Callable[[], None]) -> None:
         """Let the thread call a function soon."""
         self._sockets.call(function)
@@ -66,7 +71,7 @@ class ClientThread:
             else:
                 answer.set_result(asked.result())
 
-        if not self._thread.is_alive():
+        if not self.is_running:
             raise KouxingError("the client is closed")
         self._sockets.call(lambda: function(self.core).add_done_callback(pass_on))
         return answer
