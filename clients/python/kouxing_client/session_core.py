@@ -27,7 +27,6 @@ REJOIN_S = 1.0  # how long audio waits until subscriptions are in effect again
 MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may take to move
 LAST_S = 0.5  # for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
-MAX_LIVE = 100  # unread results of a live session
 SILENT_S = 2.0  # without results, a followed session may have moved or ended unnoticed
 
 
