@@ -17,7 +17,7 @@ JAW = 2  # index of FAP 3
 def frame(number: int, *, epoch: int = 1, jaw: float | None = None) -> FapFrame:
     values = array("f", bytes(4 * 68))
     values[JAW] = 10.0 * number if jaw is None else jaw
-    return FapFrame(session="s", epoch=epoch, media_time=320 * number, values=memoryview(values))
+    return FapFrame(session="s", epoch=epoch, media_time=320 * number, values=values)
 
 
 def phone(index: int, symbol: str, *, epoch: int = 1, final: bool = True, at: int = -1) -> Phone:
