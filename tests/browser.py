@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,8 @@ class Browser(Chromium):
         images = [self.image()]
 
         def is_steady() -> bool:
+            picture_ms = self.evaluate("window.kouxing?.state.drawing?.pictureMs ?? 0")
+            time.sleep(0.05 + 3 * picture_ms / 1000)  # a busy machine needs time for an image
             images.append(self.image())
             return np.array_equal(images[-1], images[-2])
 
