@@ -18,7 +18,7 @@ SERVICES = ("control", "recognizer", "synthesizer", "driver")
 
 def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")[:64000]
-    with System(SERVICES, tmp_path) as system, Client(system.control) as client:
+    with System(SERVICES, tmp_path) as system, Client(system.control, timeout_s=60.0) as client:
         session = client.open_session(encoding="f32le", shapes=["vrm"])
         opened = session.info
         output = session.results(*KINDS, keep_all=True)
