@@ -142,5 +142,5 @@ def test_evaluates_a_small_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_rejects_a_folder_without_recordings(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no wav"):
+    with pytest.raises(UserError, match="contains no wav"):
         robustness.read_recordings(tmp_path)
