@@ -51,7 +51,7 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         system.wait_ready()
         laptop = machine(tmp_path, "laptop", "client", "client")
         monkeypatch.setenv("XDG_STATE_HOME", str(laptop))
-        assert stream(system.control, np.zeros(3200, np.float32)).ended
+        assert stream(system.control, np.zeros(3200, np.float32)).frames
         refused = kouxing("keys", "add", "friend")
         assert refused.returncode == 2
         assert "on control's machine" in refused.stderr
