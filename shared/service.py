@@ -347,7 +347,7 @@ class Service(MessageLoop):
         )
 
     def _next_sessions(self, sessions: dict[str, SessionInput]) -> dict[str, SessionInput]:
-        """Return the sessions for the next heartbeat; a worker with many reports them in turn."""
+        """Return the sessions for the next heartbeat; a busy worker reports some of them each time."""
         if self.kind.role != "worker" or len(sessions) <= SESSIONS_PER_HEARTBEAT:
             return sessions
         names = list(sessions)
