@@ -347,7 +347,7 @@ class Service(MessageLoop):
         )
 
     def _next_sessions(self, sessions: dict[str, SessionInput]) -> dict[str, SessionInput]:
-        """Return the sessions for the next heartbeat; a busy worker reports some of them each time."""
+        """Return the sessions for the next heartbeat: some of them, if a worker has many."""
         if self.kind.role != "worker" or len(sessions) <= SESSIONS_PER_HEARTBEAT:
             return sessions
         names = list(sessions)
