@@ -109,7 +109,10 @@ class Containers:
             enter = ["sh", "-ec", ENTER_WITHOUT_ROOT]
             environment = {name: self._by_number(each) for name, each in environment.items()}
         enter += ["sh", str(folder), str(self._hosts), target]
-        own = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT)}
+        own = {
+            "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
+            "PYTHONPATH": f"{ROOT}:{ROOT / 'clients' / 'python'}",
+        }
         with self.log(host).open("ab") as log:
             return subprocess.Popen(
                 self._network.command(host, *enter, *program),
