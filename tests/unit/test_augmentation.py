@@ -13,7 +13,7 @@ def changed(log_mel: np.ndarray, **how: float) -> np.ndarray:
     """Change nothing but what is named."""
     plain = {"speed": 1.0, "warp": 1.0, "level": 0.0, "noise_below": 30.0, "decay": 0.0}
     return Augmentation(
-        **(plain | how), noise_tilt=0.0, colour=(0.0,) * 6, narrow=False, seed=0
+        **(plain | how), noise_tilt=0.0, color=(0.0,) * 6, narrow=False, seed=0
     ).apply(log_mel)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic import neural as neural_module
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.acoustic.network import (
@@ -36,7 +37,7 @@ def neural(look_ahead_ms: float | None = None) -> NeuralModel:
     return model
 
 
-def scores_of(model: NeuralModel, frames: np.ndarray) -> np.ndarray:
+def scores_of(model: AcousticModel, frames: np.ndarray) -> np.ndarray:
     stream = model.create_stream()
     return np.concatenate([stream.score(frames), stream.score(None)])
 

@@ -117,7 +117,7 @@ def test_the_face_knows_of_speech_when_it_is_due() -> None:
     ]
     heard = bilabials(is_text_known=False)
     quiet = [each for each in heard.events if not isinstance(each, Phone | SpeechChange)]
-    config = SynthesizerConfig(lips="dynamic-visemes")  # type: ignore[arg-type]
+    config = SynthesizerConfig(lips="dynamic-visemes")
     lips = load_lip_model(name="dynamic-visemes")
     silent, spoken = (
         animate_recording(replace(heard, events=[*quiet, *changes]), lips, config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -217,7 +218,7 @@ def test_lip_frames_do_not_affect_other_events() -> None:
 
 def test_sessions_decoded_together_get_the_lip_frames_that_each_gets_alone() -> None:
     recordings = [SAMPLES, SAMPLES[8000:], SAMPLES[:9000]]
-    options = {"lips": LoudLips(), "face_delay_s": 0.1}
+    options: dict[str, Any] = {"lips": LoudLips(), "face_delay_s": 0.1}
     together = recognize_together(MODEL, recordings, **options)
     for samples, outputs in zip(recordings, together, strict=True):
         assert messages_of(outputs) == messages_of(recognize_live(MODEL, samples, **options))
