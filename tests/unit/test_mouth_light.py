@@ -10,7 +10,7 @@ from kouxing.services.driver.head.mouth_light import mouth_light
 pytestmark = pytest.mark.unit
 
 
-# same values as in services/gateway/page/tests/mouth-light.test.js
+# same values as in tests/page/mouth-light.test.mjs
 @pytest.mark.parametrize(
     ("upper", "lower", "pushed", "light"),
     [(0, 0, 0, 0.08), (0, -120, 0, 0.5698), (-20, -120, 260, 0.4065), (-280, -600, 70, 0.9242)],

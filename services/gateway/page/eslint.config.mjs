@@ -20,5 +20,5 @@ export default [
   },
   { files: ["*.js"], languageOptions: { globals: globals.browser } },
   { files: ["*-worklet.js"], languageOptions: { globals: globals.audioWorklet } },
-  { files: ["tests/*.js"], languageOptions: { globals: globals.node } },
+  { files: ["*.test.mjs", "tests/*.js"], languageOptions: { globals: globals.node } },
 ];

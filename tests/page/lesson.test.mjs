@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { curvePath, extent, figures, verdict } from "../lip-curves.js";
-import { FaceRecording, LANDMARKS } from "../face-recording.js";
-import { MouthProfileStore } from "../mouth-profile.js";
+import { curvePath, extent, figures, verdict } from "../../services/gateway/page/lip-curves.js";
+import { FaceRecording, LANDMARKS } from "../../services/gateway/page/face-recording.js";
+import { MouthProfileStore } from "../../services/gateway/page/mouth-profile.js";
 
 const RATE_HZ = 48000;
 const CHUNK = Int16Array.from({ length: 960 }, (_, i) => i);

@@ -1,11 +1,11 @@
 import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import test from "node:test";
-import { languageFor, say, setLanguage } from "../language.js";
-import { Preferences } from "../preferences.js";
-import { TEXTS } from "../texts.js";
+import { languageFor, say, setLanguage } from "../../services/gateway/page/language.js";
+import { Preferences } from "../../services/gateway/page/preferences.js";
+import { TEXTS } from "../../services/gateway/page/texts.js";
 
-const PAGE = new URL("..", import.meta.url);
+const PAGE = new URL("../../services/gateway/page/", import.meta.url);
 
 class FakeStorage {
   items = {};

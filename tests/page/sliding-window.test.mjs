@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { SlidingWindow } from "../sliding-window.js";
+import { SlidingWindow } from "../../services/gateway/page/sliding-window.js";
 
 test("an empty window has no percentile", () => {
   assert.equal(new SlidingWindow(100).percentile(0.5), null);

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { FapTrack, Playout, SAMPLES_PER_MS } from "../playout.js";
+import { FapTrack, Playout, SAMPLES_PER_MS } from "../../services/gateway/page/playout.js";
 
 const FRAME_MS = 20;
 

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { mouthLight } from "../mouth-light.js";
+import { mouthLight } from "../../services/gateway/page/mouth-light.js";
 
 // The same values as in tests/unit/test_mouth_light.py.
 for (const [upper, lower, pushed, light] of [

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { GatewayState } from "../gateway-state.js";
+import { GatewayState } from "../../services/gateway/page/gateway-state.js";
 
 const SESSION = { session: "one", epoch: 1, sample: false, lips: "learnt" };
 

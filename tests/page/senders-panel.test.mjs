@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 
-import { isOutOfSync, senderText } from "../senders-panel.js";
+import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 
 test("the state of a sender is its contents and rate, or its problem", () => {
   const sender = { contents: "VRM shapes", rate_hz: 49.8, delay_ms: 0, problem: "" };

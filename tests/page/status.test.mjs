@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { LevelMeter, rms, SILENT_DB } from "../level.js";
-import { PhoneTrack } from "../phones.js";
-import { StreamActivity } from "../stream-activity.js";
+import { LevelMeter, rms, SILENT_DB } from "../../services/gateway/page/level.js";
+import { PhoneTrack } from "../../services/gateway/page/phones.js";
+import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
 import {
   delayText,
   drawingText,
@@ -12,7 +12,7 @@ import {
   stateKind,
   stateText,
   turnText,
-} from "../status.js";
+} from "../../services/gateway/page/status.js";
 
 function track(...symbols) {
   const phones = new PhoneTrack();

@@ -3,8 +3,8 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
-import { Playout, SAMPLES_PER_MS } from "../playout.js";
-import { Sound } from "../sound.js";
+import { Playout, SAMPLES_PER_MS } from "../../services/gateway/page/playout.js";
+import { Sound } from "../../services/gateway/page/sound.js";
 
 const RATE_HZ = 16000;
 const BLOCK = 128; // samples, as the Web Audio API processes them
@@ -27,7 +27,7 @@ globalThis.registerProcessor = (name, processor) => (processors[name] = processo
 globalThis.AudioContext = class {
   state = "running";
   destination = null;
-  audioWorklet = { addModule: () => import("../sound-worklet.js") };
+  audioWorklet = { addModule: () => import( "../../services/gateway/page/sound-worklet.js") };
   get outputLatency() {
     return card.latencyMs / 1000;
   }

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { DrawRate } from "../draw-rate.js";
+import { DrawRate } from "../../services/gateway/page/draw-rate.js";
 
 const TICK_MS = 1000 / 60;
 

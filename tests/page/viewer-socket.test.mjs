@@ -1,8 +1,8 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { socketUrl } from "../address.js";
-import { ViewerSocket } from "../viewer-socket.js";
-import { NUM_FAPS, readMessage } from "../messages.js";
+import { socketUrl } from "../../services/gateway/page/address.js";
+import { ViewerSocket } from "../../services/gateway/page/viewer-socket.js";
+import { NUM_FAPS, readMessage } from "../../services/gateway/page/messages.js";
 
 class FakeWebSocket {
   static OPEN = 1;

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
-import { AudioUplink } from "../audio-uplink.js";
+import { AudioUplink } from "../../services/gateway/page/audio-uplink.js";
 
 const BLOCK = 128; // samples, as the Web Audio API processes them
 const processors = {};
@@ -13,8 +13,8 @@ globalThis.AudioWorkletProcessor = class {
 globalThis.registerProcessor = (name, processor) => (processors[name] = processor);
 globalThis.sampleRate = 48000;
 globalThis.currentFrame = 0;
-await import("../microphone-worklet.js");
-await import("../sound-worklet.js");
+await import( "../../services/gateway/page/microphone-worklet.js");
+await import( "../../services/gateway/page/sound-worklet.js");
 
 test("the microphone is cut into chunks of 20 ms without gaps, and clipped", () => {
   const capture = new processors.capture();

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { MorphedMesh } from "../morph.js";
+import { MorphedMesh } from "../../services/gateway/page/morph.js";
 
 class Attribute {
   needsUpdate = false;

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { pathOf, socketUrl } from "../address.js";
+import { pathOf, socketUrl } from "../../services/gateway/page/address.js";
 
 test("the token is removed from the page's URL and added to every request", () => {
   globalThis.location = {

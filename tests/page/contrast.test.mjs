@@ -6,7 +6,7 @@ import { readFileSync } from "node:fs";
 import test from "node:test";
 
 const [TEXT, GRAPHICS] = [4.5, 3]; // minimum contrast (1.4.3, 1.4.11)
-const STYLE = readFileSync(new URL("../style.css", import.meta.url), "utf8");
+const STYLE = readFileSync(new URL("../../services/gateway/page/style.css", import.meta.url), "utf8");
 const COLOR = String.raw`#[0-9a-f]{3,6}|rgb\([^)]*\)`;
 
 /** Return a theme's colors by name: { rgb, share: opacity }. */
