@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 from aiohttp import WSMessage, WSMsgType, web
 
 from kouxing.services.gateway.audio_sessions import AudioSession
+from kouxing.services.gateway.limits import COMMAND_S, RateLimit
 from kouxing.services.gateway.pcm_format import PcmFormat
-from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
 
 MAX_AHEAD_S = 30.0  # audio that may be queued; then the client must wait
 PIECE_S = 0.04  # duration of the pieces in which queued audio is passed on
@@ -21,15 +21,8 @@ _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ER
 class AudioInput:
     """Passes a client's audio on to its session.
 
-    Parameters
-    ----------
-    session
-        Session that receives the audio.
-    pcm_format
-        Format of the audio.
-    is_ahead
-        Whether audio may arrive faster than real time, as synthesized speech does. It is then
-        queued here and passed on in real time, and an interruption drops the queue.
+    If ``is_ahead``, audio may arrive faster than real time, as synthesized speech does. It is then
+    queued here and passed on in real time, and an interruption drops the queue.
     """
 
     def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, is_ahead: bool) -> None:

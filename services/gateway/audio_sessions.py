@@ -88,17 +88,7 @@ class AudioSession:
 
 
 class AudioSessions:
-    """Opens sessions as a client of control.
-
-    Parameters
-    ----------
-    control
-        Where control takes commands.
-    key
-        The gateway's key; None if nothing is encrypted.
-    warn
-        Counts and logs a problem.
-    """
+    """Opens sessions as a client of control, without encryption if ``key`` is None."""
 
     def __init__(self, control: str, key: Key | None, warn: Warn) -> None:
         self._control = control
@@ -156,8 +146,3 @@ def error_text(error: UserError | KouxingError) -> str:
     if isinstance(error, Refused):
         return wire.error_text(error.text, error.code, error.retry_after_s)
     return wire.error_text(str(error))
-
-
-def retry_after_s(error: UserError | KouxingError) -> float:
-    """Return when to try again, in seconds; 0 if unknown."""
-    return error.retry_after_s if isinstance(error, Refused) else 0.0

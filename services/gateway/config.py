@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator
 
-from kouxing.services.gateway.connection_quota import ADDRESS_SHARE
+from kouxing.services.gateway.limits import ADDRESS_SHARE
 from kouxing.shared.config import BoundHost, BoundPort, Form, Switch, Texts
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig

@@ -14,7 +14,7 @@ from aiohttp import WSCloseCode, web
 
 import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.connection_quota import ConnectionQuota
+from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.lip_models import lip_models
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
@@ -101,16 +101,9 @@ def make_application(
 ) -> web.Application:
     """Return the web application.
 
-    Parameters
-    ----------
-    head_file
-        GLB to serve as ``head.glb``. If empty, the file in the page's folder.
-    routes
-        Private paths: sessions and uploads.
-    access
-        Conditions that requests must meet.
-    frame_ancestors
-        Origins of pages that may show the page in a frame, separated by spaces.
+    ``head_file`` is the GLB to serve as ``head.glb``; if empty, the file in the page's folder.
+    ``routes`` are private: sessions and uploads. Pages of ``frame_ancestors``, origins that are
+    separated by spaces, may show the page in a frame.
     """
     application = web.Application(
         middlewares=[access.middleware({route.path for route in routes})],

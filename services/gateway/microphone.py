@@ -10,8 +10,8 @@ from kouxing_client import KouxingError
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.audio_input import AudioInput
 from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
-from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
@@ -20,17 +20,7 @@ HELLO_TIMEOUT_S = 10.0
 
 
 class Microphones:
-    """Serves ``/microphone``.
-
-    Parameters
-    ----------
-    web_sockets
-        Opens the browsers' WebSockets.
-    address_share
-        Maximum fraction of the microphones for one address.
-    audio_sessions
-        Opens the sessions.
-    """
+    """Serves ``/microphone``."""
 
     def __init__(
         self, web_sockets: WebSockets, address_share: float, audio_sessions: AudioSessions

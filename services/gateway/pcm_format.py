@@ -61,12 +61,7 @@ class PcmFormat:
     def num_frames(self, pcm: bytes, *, is_first: bool) -> int:
         """Return the number of samples per channel in a binary message.
 
-        Parameters
-        ----------
-        pcm
-            Payload of the message.
-        is_first
-            Whether this is the first message, in which a file would have its header.
+        The first message would have the header of a file.
 
         Raises
         ------
@@ -96,20 +91,7 @@ class PcmFormat:
 
 
 def check_text(text: str, expected: str) -> None:
-    """Check that a text message does not contain encoded audio.
-
-    Parameters
-    ----------
-    text
-        Content of the message.
-    expected
-        Description of the valid messages, for the error text.
-
-    Raises
-    ------
-    UserError
-        If the text looks like base64.
-    """
+    """Raise a UserError with the ``expected`` messages if a text message looks like base64."""
     if len(text) >= 16 and not text.lstrip().startswith("{") and _is_base64(text):
         raise UserError(
             f"expected {expected}; this text looks like base64: send the bytes as a binary message"

@@ -17,12 +17,7 @@ SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由�
 class Sample:
     """One playback of the sample sentence.
 
-    Parameters
-    ----------
-    audio_sessions
-        Opens the session.
-    lips
-        Name of the lip model; empty for the system's default. It can be changed during playback.
+    ``lips`` is the lip model, empty for the system's default. It can be changed during playback.
     """
 
     def __init__(self, audio_sessions: AudioSessions, lips: str) -> None:

@@ -23,15 +23,7 @@ from kouxing.shared.logs import LOG
 
 
 class SendersApi:
-    """Sends the face that the gateway shows to other programs, and reports their state.
-
-    Parameters
-    ----------
-    urls
-        Value of ``gateway.senders``.
-    idle_motion_seed
-        Seed of the face's idle motion.
-    """
+    """Sends the face that the gateway shows to other programs, and reports their state."""
 
     def __init__(self, urls: Iterable[str], idle_motion_seed: int) -> None:
         self._configured = {url: parse_target(url) for url in urls}

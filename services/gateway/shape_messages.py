@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import msgpack
+import msgspec
 import numpy as np
 
 from kouxing.services.gateway import wire
@@ -29,16 +29,9 @@ class ShapeEncoder:
         return wire.text("shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names)
 
     def encode(self, kind: str, epoch: int, media_time: int, faps: bytes) -> str | bytes:
-        """Return the message for a frame.
+        """Return the message for a frame: 68 little-endian float32, FAP units.
 
-        Parameters
-        ----------
-        kind
-            "weights" for a frame of a session, "rest" for the face at rest.
-        epoch, media_time
-            Those of the FAP frame; 0 at rest.
-        faps
-            68 little-endian float32, FAP units.
+        ``kind`` is "weights" for a frame of a session, "rest" for the face at rest.
         """
         shapes = SHAPE_SETS[self.shape_set]
         weights = shapes.weights(np.frombuffer(faps, "<f4"))
@@ -55,10 +48,8 @@ class ShapeEncoder:
                 for name, weight in zip(shapes.names, weights, strict=True)
             },
         }
-        if self.message_format == "json":
-            return json.dumps(fields)
-        packed: bytes = msgpack.packb(fields)
-        return packed
+        encode = json.dumps if self.message_format == "json" else msgspec.msgpack.encode
+        return encode(fields)
 
 
 def parse_shape_query(query: Mapping[str, str]) -> ShapeEncoder | None:

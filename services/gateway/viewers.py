@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from aiohttp import WSMsgType, web
 
 from kouxing.services.gateway import wire
-from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.services.gateway.http import WebSockets
-from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
+from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RateLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.shared.errors import UserError
@@ -45,21 +44,9 @@ class Viewer:
 class Viewers:
     """Sends every viewer the messages of the session that it requested, or of the newest.
 
-    Parameters
-    ----------
-    web_sockets
-        Opens the browsers' WebSockets.
-    address_share
-        Maximum fraction of the viewers for one address.
-    metrics
-        Counts messages that are dropped for slow viewers.
-    play_sample
-        Starts the sample sentence with a lip model, unless it is playing; returns its session.
-        This session counts as the newest only if there is no other.
-    choose_sample_lips
-        Changes the lip model of the sample sentence while it is playing.
-    set_face
-        Sends control the settings of a session's face.
+    ``play_sample`` starts the sample sentence with a lip model, unless it is playing, and returns
+    its session. This session counts as the newest only if there is no other. ``set_face`` sends
+    control the settings of a session's face.
     """
 
     def __init__(
@@ -101,12 +88,9 @@ class Viewers:
         self._notify_viewers()
 
     def end_sample(self, error: str = "") -> None:
-        """Show the newest session again to viewers of the sample sentence.
+        """Show the newest session again to viewers of the sample sentence, with an error message.
 
-        Parameters
-        ----------
-        error
-            Error message for these viewers, if the sentence could not be played.
+        The message is empty if the sentence was played.
         """
         for viewer in self._viewers:
             if self._sample and viewer.chosen == self._sample:

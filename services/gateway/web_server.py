@@ -17,7 +17,7 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
-from kouxing.services.gateway.connection_quota import ADDRESS_SHARE, ConnectionQuota
+from kouxing.services.gateway.limits import ADDRESS_SHARE, ConnectionQuota
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
@@ -57,18 +57,8 @@ def bind_port(host: str, port: int) -> socket.socket:
 class WebServer:
     """Accepts connections and serves them with an aiohttp application.
 
-    Parameters
-    ----------
-    listening
-        Socket from ``bind_port``.
-    tls
-        TLS context for https; None for http.
-    on_refused
-        Called with the address of each connection that exceeds a limit.
-    on_bad_request
-        Called when data arrives that is not HTTP.
-    address_share
-        Maximum fraction of the connections for one address.
+    ``listening`` is from ``bind_port``. ``on_refused`` is called with the address of each
+    connection that exceeds a limit, ``on_bad_request`` when data arrives that is not HTTP.
     """
 
     def __init__(

@@ -36,10 +36,7 @@ def use_addresses(addresses: Sequence[str]) -> None:
 class Peer:
     """The answering side of one connection.
 
-    Parameters
-    ----------
-    on_channel
-        Called with each data channel that the client opens.
+    ``on_channel`` is called with each data channel that the client opens.
     """
 
     rate_hz, num_channels = 48_000, 2  # of decoded Opus, as s16le

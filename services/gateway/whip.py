@@ -16,17 +16,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from aiohttp import web
-from kouxing_client import KouxingError
+from kouxing_client import KouxingError, Refused
 
 from kouxing.services.gateway import wire
-from kouxing.services.gateway.audio_sessions import (
-    AudioSession,
-    AudioSessions,
-    error_text,
-    retry_after_s,
-)
-from kouxing.services.gateway.connection_quota import ConnectionQuota
-from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
+from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
+from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RateLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.services.gateway.viewers import Viewers
@@ -61,16 +55,7 @@ class _Client:
 class WhipClients:
     """Serves ``/whip``.
 
-    Parameters
-    ----------
-    address_share
-        Maximum fraction of the clients for one address.
-    audio_sessions
-        Opens the sessions.
-    viewers
-        Provides the messages for the data channels.
-    addresses
-        Addresses of this machine at which clients may connect; empty: all except loopback.
+    Clients may connect at ``addresses`` of this machine; empty: all except loopback.
     """
 
     def __init__(
@@ -122,7 +107,7 @@ class WhipClients:
         try:
             await opened
         except KouxingError as error:
-            wait_s = retry_after_s(error)
+            wait_s = error.retry_after_s if isinstance(error, Refused) else 0.0
             headers = {"Retry-After": str(math.ceil(wait_s))} if wait_s else {}
             raise web.HTTPServiceUnavailable(text=f"{error}\n", headers=headers) from None
         headers = {"Location": f"{request.path}/{name}"}

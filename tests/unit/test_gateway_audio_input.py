@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from kouxing.services.gateway.audio_input import MAX_AHEAD_S, AudioInput
+from kouxing.services.gateway.limits import RateLimit
 from kouxing.services.gateway.pcm_format import PcmFormat, check_text
-from kouxing.services.gateway.rate_limit import RateLimit
 from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit

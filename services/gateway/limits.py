@@ -1,7 +1,8 @@
-"""Limits on the number of connections, in total and from one address."""
+"""Limits on the number of connections, in total and from one address, and on their data."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import math
 from collections import Counter
@@ -10,19 +11,14 @@ from collections.abc import Iterator
 from aiohttp import web
 
 ADDRESS_SHARE = 0.75  # of the quota for one address; many people can share a proxy's address
+BURST_S = 5.0  # allowed lead over real time; a network that stalled delivers a burst
+COMMAND_S = 0.05  # a command costs as much as this duration of audio
 
 
 class ConnectionQuota:
-    """A limited number of connections of one kind.
+    """A limited number of connections of one kind, a plural noun such as ``viewers``.
 
-    Parameters
-    ----------
-    capacity
-        Maximum number of connections.
-    kind
-        Plural noun for error messages, such as ``viewers``.
-    address_share
-        Maximum fraction of ``capacity`` for one address; 1 if all clients come through a proxy.
+    One address gets at most ``address_share`` of ``capacity``.
     """
 
     def __init__(self, capacity: int, kind: str, address_share: float) -> None:
@@ -33,9 +29,8 @@ class ConnectionQuota:
 
     def acquire(self, address: str) -> bool:
         """Count a connection from an address; return False if a limit is reached."""
-        if self._num_open.total() >= self._capacity:
-            return False
-        if self._num_open[address] >= self._max_per_address:
+        is_full = self._num_open.total() >= self._capacity
+        if is_full or self._num_open[address] >= self._max_per_address:
             return False
         self._num_open[address] += 1
         return True
@@ -67,3 +62,16 @@ class ConnectionQuota:
             yield
         finally:
             self.release(address)
+
+
+class RateLimit:
+    """Limits one browser's data to real time, after an initial burst."""
+
+    def __init__(self) -> None:
+        self._used_until_s = 0.0  # when all data so far would end if it had come in real time
+
+    async def wait(self, duration_s: float) -> None:
+        """Charge for data of a given duration; return when more may be read."""
+        now_s = asyncio.get_running_loop().time()
+        self._used_until_s = max(self._used_until_s, now_s) + duration_s
+        await asyncio.sleep(max(0.0, self._used_until_s - now_s - BURST_S))
