@@ -63,10 +63,7 @@ def free_addresses(
 def available_addresses(settings: Settings) -> dict[str, str]:
     """Return an environment in which services bind free ports instead of default ports in use.
 
-    Raises
-    ------
-    UserError
-        If a port in use was set by the user.
+    Raises ``UserError`` if a port in use was set by the user.
     """
     free = free_addresses()
     environment = {}

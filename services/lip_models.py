@@ -47,10 +47,7 @@ class LipModelInfo:
 def lip_models() -> dict[str, LipModelInfo]:
     """Return the installed lip models by name.
 
-    Raises
-    ------
-    UserError
-        If an installed lip model cannot be imported.
+    Raises ``UserError`` if an installed lip model cannot be imported.
     """
     folder = Path(__file__).parent.joinpath(*_BUILT_IN)
     packages = {
@@ -72,10 +69,7 @@ def lip_models() -> dict[str, LipModelInfo]:
 def lip_model_info(name: str) -> LipModelInfo:
     """Return the description of an installed lip model.
 
-    Raises
-    ------
-    UserError
-        If the lip model is not installed.
+    Raises ``UserError`` if the lip model is not installed.
     """
     if name not in lip_models():
         raise UserError(f"unknown lip model {name!r}; use one of {', '.join(lip_models())}")

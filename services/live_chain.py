@@ -101,10 +101,7 @@ class LiveChain:
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:
         """Process samples, shape (n,) or (n, channels), and return the frames that are due.
 
-        Raises
-        ------
-        UserError
-            If the samples have another shape or are not finite.
+        Raises ``UserError`` if the samples have another shape or are not finite.
         """
         self._stream.accept_waveform(samples)
         return self._animate()

@@ -20,12 +20,8 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
     """Read all arrays of an npz file, never a pickle.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    ValueError
-        If it is not an npz file of plain arrays, or has more than ``max_bytes``.
+    Raises ``OSError`` if the file cannot be read. Raises ``ValueError`` if it is not an npz file of
+    plain arrays, or has more than ``max_bytes``.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):

@@ -346,10 +346,7 @@ def bound_keys(config_type: type[ServiceConfig]) -> dict[str, Bound]:
 def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
     """Split the values of ``--set`` into keys and values.
 
-    Raises
-    ------
-    UserError
-        If one is not ``KEY=VALUE``.
+    Raises ``UserError`` if one is not ``KEY=VALUE``.
     """
     values = {}
     for assignment in assignments:
@@ -361,13 +358,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
 
 
 def _find(values: Mapping[str, str], known: Mapping[str, Address], origin: str = "") -> Layer:
-    """Return the values of a source by table and key; without ``origin``, of the environment.
-
-    Raises
-    ------
-    UserError
-        If a name is unknown.
-    """
+    """Return the values of a source by table and key; without ``origin``, of the environment."""
     layer: Layer = {}
     for name, text in values.items():
         if name not in known:

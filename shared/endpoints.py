@@ -18,10 +18,7 @@ _ENDPOINT = re.compile(
 def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
     """Return host and port of ``tcp://host:port``.
 
-    Raises
-    ------
-    UserError
-        If the endpoint has another form. The error names the configuration key.
+    Raises ``UserError`` if the endpoint has another form. The error names the configuration key.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or (match["port"] != "*" and int(match["port"]) > 65535):

@@ -81,10 +81,7 @@ def key_folder() -> Path:
 def load_key(name: str, roles: Collection[str]) -> Key:
     """Return a key of this machine. On control's machine, create and allow a missing key.
 
-    Raises
-    ------
-    UserError
-        If the key cannot be read or created, or other users can read it.
+    Raises ``UserError`` if the key cannot be read or created, or other users can read it.
     """
     if credential := _credential(f"{name}.key"):
         return read_key(credential)
@@ -111,10 +108,7 @@ def user_key() -> Key:
 def control_endpoint(address: str, *, insecure: bool) -> str:
     """Return control's endpoint with, unless ``insecure``, its public key.
 
-    Raises
-    ------
-    UserError
-        If the user's key cannot be read (see ``load_key``).
+    Raises ``UserError`` if the user's key cannot be read (see ``load_key``).
     """
     return with_key(address, "" if insecure else user_key().control)
 
@@ -147,10 +141,7 @@ def add_key_hint(roles: Collection[str]) -> str:
 def read_grants() -> dict[str, Grant]:
     """Return the allowed keys, by public key. The list may not exist yet.
 
-    Raises
-    ------
-    UserError
-        If the list cannot be read, or other users can change it.
+    Raises ``UserError`` if the list cannot be read, or other users can change it.
     """
     if credential := _credential(_ALLOWED):
         return _read_grants(credential)
@@ -166,10 +157,7 @@ def grants_file() -> Path:
 def add_key(name: str, roles: Collection[str], path: Path) -> None:
     """Create and allow a key, and write it to a file for another machine.
 
-    Raises
-    ------
-    UserError
-        If the name is taken, a role is invalid, or this is not control's machine.
+    Raises ``UserError`` if the name is taken, a role is invalid, or this is not control's machine.
     """
     load_key(CONTROL, ())
     with _locked_folder() as folder:
@@ -179,10 +167,7 @@ def add_key(name: str, roles: Collection[str], path: Path) -> None:
 def revoke_key(name: str) -> None:
     """Revoke a key.
 
-    Raises
-    ------
-    UserError
-        If no key has this name.
+    Raises ``UserError`` if no key has this name.
     """
     with _locked_folder() as folder:
         grants = _parse_grants(folder / _ALLOWED)  # unchecked, so that it works with too many keys
@@ -195,12 +180,8 @@ def revoke_key(name: str) -> None:
 def save_grants(grants: Grants) -> None:
     """Save the list that control sent, so that it is available after a restart.
 
-    On control's machine this does nothing: the list there may be newer.
-
-    Raises
-    ------
-    UserError
-        If the list cannot be written.
+    On control's machine this does nothing: the list there may be newer. Raises ``UserError`` if the
+    list cannot be written.
     """
     with _locked_folder() as folder:
         is_controls = (folder / "control.key").exists()
@@ -245,10 +226,7 @@ def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> Non
 def read_key(path: Path) -> Key:
     """Return the key in a file.
 
-    Raises
-    ------
-    UserError
-        If it cannot be read, or other users can read it.
+    Raises ``UserError`` if it cannot be read, or other users can read it.
     """
     try:
         key = Key(**json.loads(_read(path)))

@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from kouxing.shared.bus import Bus, Received, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import Metrics
+from kouxing.shared.sockets import Poller, Received, Socket
 from kouxing.shared.wire.codec import BadMessage
 from kouxing.shared.wire.message import VERSION, Message
 from kouxing.shared.wire.session import Error, ErrorCode
@@ -41,7 +42,7 @@ class MessageLoop:
         self.metrics = Metrics()
         self.current_session = ""
         self._warning_limit = RateLimit()
-        self._poller = bus.poller()
+        self._poller = Poller()
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
         self._paused: set[Socket] = set()
 

@@ -10,8 +10,8 @@ import dataclasses
 from collections import deque
 from collections.abc import Callable
 
-from kouxing.shared.bus import Socket
 from kouxing.shared.keys import NO_PEER, Peer
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AcknowledgePhones
 

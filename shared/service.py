@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
@@ -28,6 +28,7 @@ from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.metrics import BusyShare, give_back_memory, memory_mb
 from kouxing.shared.prometheus import MetricsServer
 from kouxing.shared.service_kind import ServiceKind
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import (
     AllowedKey,
     Event,

@@ -8,8 +8,8 @@ from typing import Any
 
 from kouxing_client.follower import Follower
 
-from kouxing.shared.bus import Socket
 from kouxing.shared.service import Service
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Joined
 

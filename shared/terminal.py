@@ -47,10 +47,7 @@ def write_json(path: Path | None, results: object) -> None:
 def check_output(*paths: Path | None) -> None:
     """Check that output files can be written. Call this before long work; None is skipped.
 
-    Raises
-    ------
-    UserError
-        If a file cannot be written.
+    Raises ``UserError`` if a file cannot be written.
     """
     for path in paths:
         if path is None:
@@ -68,10 +65,7 @@ def check_output(*paths: Path | None) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file. Its folder must exist.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
+    Raises ``UserError`` if the file cannot be written.
     """
     try:
         path.write_text(text, encoding="utf-8")

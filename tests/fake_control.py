@@ -7,8 +7,9 @@ import threading
 from collections.abc import Callable
 from typing import Self
 
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
+from kouxing.shared.sockets import Poller, Socket
 from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
@@ -59,7 +60,7 @@ class FakeControl:
         self.received: list[Message] = []
         self.audio_messages: list[AudioChunk] = []
         self.audio_sender = Peer()
-        self._poller = self.bus.poller()
+        self._poller = Poller()
         self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stop = False
         self._thread = threading.Thread(target=self._run)

@@ -10,10 +10,11 @@ import numpy as np
 from kouxing_client import Client, FapFrame, KouxingError, Phone, Session, Speech
 from numpy.typing import NDArray
 
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Key
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire import face
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms

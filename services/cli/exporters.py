@@ -37,10 +37,7 @@ EXPORTERS: dict[str, type[Exporter]] = {
 def open_exporter(output: Path, options: ExportOptions) -> Exporter:
     """Return the exporter for a file, a folder or a numbered name.
 
-    Raises
-    ------
-    UserError
-        If the suffix is unknown, or the options do not fit the format.
+    Raises ``UserError`` if the suffix is unknown, or the options do not fit the format.
     """
     if is_sequence(output):
         return VideoExporter(output, options)

@@ -23,10 +23,7 @@ _PAGE = Path(str(resources.files("kouxing.services.gateway"))) / "page"
 def export_page_heads(folder: Path) -> None:
     """Export all heads of the package.
 
-    Raises
-    ------
-    UserError
-        If a file cannot be written.
+    Raises ``UserError`` if a file cannot be written.
     """
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head

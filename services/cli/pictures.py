@@ -47,10 +47,7 @@ class VideoExporter:
     def export(self, motion: Motion, progress: Progress) -> int:
         """Draw a motion and return the number of images.
 
-        Raises
-        ------
-        UserError
-            If a file cannot be written.
+        Raises ``UserError`` if a file cannot be written.
         """
         task = progress.add_task("drawing", total=1.0)
         with contextlib.closing(self._renderer):

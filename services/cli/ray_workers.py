@@ -114,10 +114,7 @@ class RayWorkers:
     def scale(self, kind: ServiceKind, number: int, settings: Settings) -> None:
         """Start or drain workers of a kind until ``number`` of them remain.
 
-        Raises
-        ------
-        UserError
-            If a setting is wrong, or the workers' key is missing.
+        Raises ``UserError`` if a setting is wrong, or the workers' key is missing.
         """
         insecure = settings.load(kind.config_type).insecure
         key = "" if insecure else key_text(load_key(kind.name, (f"service:{kind.name}",)))

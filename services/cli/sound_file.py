@@ -15,12 +15,8 @@ from kouxing.shared.terminal import print_message
 def read_mono_16k(path: Path) -> NDArray[np.float32]:
     """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
 
-    Prints a message if the file is truncated or clipped.
-
-    Raises
-    ------
-    UserError
-        As ``kouxing.shared.audio_file.open_audio``.
+    Prints a message if the file is truncated or clipped. Raises ``UserError`` as
+    ``kouxing.shared.audio_file.open_audio``.
     """
     source = open_audio(path, block_s=1.0)
     resampler = Resampler(source.sample_rate_hz, source.num_channels)

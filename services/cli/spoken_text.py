@@ -16,10 +16,7 @@ _MAX_BYTES = 1024 * 1024
 def read_text(text: str, inventory: PhoneInventory) -> Transcript:
     """Return the syllables of a text or of a text file. Prints a message about ignored words.
 
-    Raises
-    ------
-    UserError
-        If the file or the text cannot be read, or the text has no syllables.
+    Raises ``UserError`` if the file or the text cannot be read, or the text has no syllables.
     """
     transcript = inventory.read(text_of(text))
     if transcript.dropped:
@@ -41,10 +38,7 @@ def does_not_fit(audio: Path, alignment: Alignment) -> str:
 def text_of(text: str) -> str:
     """Return a text, or the content of the text file of that name.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, or is too large.
+    Raises ``UserError`` if the file cannot be read, or is too large.
     """
     try:
         path = Path(text)

@@ -54,12 +54,8 @@ def stream(
 ) -> StreamSummary:
     """Stream a source through a running system and wait for its last FAP frame.
 
-    ``mouth_profile`` is the speaker's, if any.
-
-    Raises
-    ------
-    UserError
-        If the system does not answer, refuses the session or stops answering.
+    ``mouth_profile`` is the speaker's, if any. Raises ``UserError`` if the system does not answer,
+    refuses the session or stops answering.
     """
     with connect(control) as client:
         drawn_before_s = _drawn_s(client) if record else 0.0
@@ -172,15 +168,7 @@ def _send_all(
 def _wait_for_end(
     output: _Output, session: Session, events: Results[Event], console: Console, client: Client
 ) -> None:
-    """Wait for the last frame; with much queued audio that may take a while.
-
-    Raises
-    ------
-    UserError
-        If the session is lost.
-    KouxingError
-        If control does not answer.
-    """
+    """Wait for the last frame; with much queued audio that may take a while."""
     ask_s = time.monotonic() + STATUS_S
     while not output.has_ended:
         output.update(0.2)
@@ -191,13 +179,7 @@ def _wait_for_end(
 
 
 def _check_errors(session: Session, events: Results[Event], console: Console) -> None:
-    """Print the errors that the services report.
-
-    Raises
-    ------
-    UserError
-        If the session is lost.
-    """
+    """Print the errors that the services report."""
     try:
         errors = session.take_errors()
     except Refused as refusal:
@@ -218,15 +200,7 @@ def _wait_for_video(
     drawn_before_s: float,
     duration_s: float,
 ) -> str:
-    """Wait for the driver's video of ``duration_s``; return its path, or an empty string.
-
-    Raises
-    ------
-    UserError
-        If the driver restarted or is gone.
-    KouxingError
-        If control does not answer.
-    """
+    """Wait for the driver's video of ``duration_s``; return its path, or an empty string."""
     with _progress(console) as progress:
         task = progress.add_task("writing the video", total=duration_s)
         newest_s = drawn_before_s
@@ -245,13 +219,7 @@ def _wait_for_video(
 
 
 def _drawn_s(client: Client, timeout_s: float = 0.0) -> float:
-    """Return how many seconds of video the driver has drawn since it started.
-
-    Raises
-    ------
-    UserError
-        If no driver runs within the time limit.
-    """
+    """Return how many seconds of video the driver has drawn since it started."""
     end_s = time.monotonic() + timeout_s
     while True:
         drivers = [state for state in client.status().services if state.service == "driver"]

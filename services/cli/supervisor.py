@@ -82,10 +82,7 @@ class Supervisor:
     def wait_ready(self, control: str, deadline_s: float = 120.0) -> None:
         """Wait until all services have registered with control.
 
-        Raises
-        ------
-        UserError
-            If a service cannot start, or the deadline passes.
+        Raises ``UserError`` if a service cannot start, or the deadline passes.
         """
         end_s = time.monotonic() + deadline_s
         with connect(control, timeout_s=2.0) as client:
@@ -114,10 +111,7 @@ class Supervisor:
     def wait(self) -> None:
         """Wait until ``stop`` is called.
 
-        Raises
-        ------
-        UserError
-            If a service reports a wrong configuration.
+        Raises ``UserError`` if a service reports a wrong configuration.
         """
         while not self._stopping.wait(POLL_S):
             if self._failure is not None:
@@ -126,10 +120,7 @@ class Supervisor:
     def check(self) -> None:
         """Kill services that hang, and restart those that have ended.
 
-        Raises
-        ------
-        UserError
-            If a service reports a wrong configuration.
+        Raises ``UserError`` if a service reports a wrong configuration.
         """
         now_s = time.monotonic()
         for name, process in list(self._processes.items()):

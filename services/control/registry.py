@@ -80,11 +80,8 @@ class Registry:
     def check(self, heartbeat: Heartbeat, peer: Peer) -> None:
         """Check that a heartbeat may register its service, or comes from its owner.
 
-        Raises
-        ------
-        Refusal
-            The instance belongs to another key, an endpoint is malformed or belongs to another kind
-            of service, or there are too many services.
+        Raises ``Refusal`` if the instance belongs to another key, an endpoint is malformed or
+        belongs to another kind of service, or there are too many services.
         """
         record = self._services.get(heartbeat.instance)
         if record is None or self.is_other_process(heartbeat, peer):

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Any, TypeAlias
 
 from kouxing.services.control.refusal import Refusal
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Grant, Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import Metrics
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
@@ -86,10 +87,7 @@ class Requests:
     def check_role(self, sender: Peer, *roles: str) -> None:
         """Reject a sender unless its key has one of ``roles``; accept anyone if ``insecure``.
 
-        Raises
-        ------
-        Refusal
-            If the key lacks these roles.
+        Raises ``Refusal`` if the key lacks these roles.
         """
         if self._bus.zap is None or not roles:
             return

@@ -52,10 +52,7 @@ class Sessions:
     def find(self, name: str) -> SessionRecord:
         """Return a session.
 
-        Raises
-        ------
-        Refusal
-            There is no such session.
+        Raises ``Refusal`` if there is no such session.
         """
         record = self._records.get(name)
         if record is None:
@@ -66,10 +63,7 @@ class Sessions:
     def find_owned(self, name: str, token: str) -> SessionRecord:
         """Return a session whose token is given.
 
-        Raises
-        ------
-        Refusal
-            There is no such session, or it has another token.
+        Raises ``Refusal`` if there is no such session, or it has another token.
         """
         record = self.find(name)
         if not secrets.compare_digest(record.token.encode(), token.encode()):
@@ -111,10 +105,8 @@ class Sessions:
     def open(self, opening: OpenSession, client: Peer, now_s: float) -> SessionRecord:
         """Place a new session.
 
-        Raises
-        ------
-        Refusal
-            The name is taken, there are too many sessions, or a service is missing or busy.
+        Raises ``Refusal`` if the name is taken, there are too many sessions, or a service is
+        missing or busy.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:

@@ -32,7 +32,6 @@ from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.services.gateway.viewers import Viewers
 from kouxing.services.gateway.web_server import WebServer, bind_port
 from kouxing.services.gateway.whip import WhipClients
-from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.resting_face import RESTING_RATE_HZ, RestingFace
@@ -43,6 +42,7 @@ from kouxing.shared.phones.known_text import Characters, characters_of
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import phone_of

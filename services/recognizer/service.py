@@ -24,7 +24,6 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import AudioRejected, RecognizerSession, create_session
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
-from kouxing.shared.bus import Socket
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
@@ -32,6 +31,7 @@ from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import give_back_memory
 from kouxing.shared.phones.events import SpeechChange, Waveform
 from kouxing.shared.service import Service
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import message_of

@@ -13,11 +13,11 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
-from kouxing.shared.bus import Socket
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange, Waveform
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_of, message_of

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 
-from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.reliable import ReliableSender
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, ResumeFace, Speech
 

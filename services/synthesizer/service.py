@@ -26,7 +26,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.bus import PHONES, Socket
+from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
 from kouxing.shared.face.expressions import ExpressionName
@@ -41,6 +41,7 @@ from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.reliable import ReliableReceiver
 from kouxing.shared.service import Service
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace

@@ -56,11 +56,8 @@ def encoded_size(structure: object) -> int:
 def decode(parts: Sequence[bytes]) -> Message:
     """Decode a message; unknown fields are ignored.
 
-    Raises
-    ------
-    BadMessage
-        If the number of parts is wrong, the kind or version is unknown, or a field has the wrong
-        type or range.
+    Raises ``BadMessage`` if the number of parts is wrong, the kind or version is unknown, or a
+    field has the wrong type or range.
     """
     if len(parts) != 2:
         raise BadMessage("parts", f"expected 2 parts (topic, body), got {len(parts)}")

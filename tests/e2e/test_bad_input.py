@@ -16,8 +16,9 @@ import zmq
 from kouxing_client import Client, KouxingError, Refused, Session, Sound
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.keys import load_key, user_key
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FapFrame

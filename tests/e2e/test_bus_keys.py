@@ -17,12 +17,13 @@ from kouxing_client import Client, KouxingError
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.kinds import KINDS
 from kouxing.shared import connections, kernel_sockets
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Grant, Key, add_key, key_folder, load_key, revoke_key
 from kouxing.shared.service import Service
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey
 from kouxing.shared.wire.face import FapFrame

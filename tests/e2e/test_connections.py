@@ -11,8 +11,9 @@ import pytest
 
 from kouxing.evaluation.system.attackers import connected, frame
 from kouxing.shared import connections
-from kouxing.shared.bus import ERROR_COST, MAX_DROPPED, Bus, Received, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.connections import BUDGET, MAX_TOPIC, MAX_TOPICS
+from kouxing.shared.sockets import ERROR_COST, MAX_DROPPED, Poller, Received, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.face import FapFrame
@@ -39,7 +40,7 @@ def port_of(bound: Socket) -> int:
 def collect(bus: Bus, bound: Socket, is_enough: Callable[[list[Received]], bool]) -> list[Received]:
     """Receive as a service's loop does, until it is enough."""
     received: list[Received] = []
-    poller, end_s = bus.poller(), time.monotonic() + 30
+    poller, end_s = Poller(), time.monotonic() + 30
     poller.add(bound)
     while not is_enough(received):
         assert time.monotonic() < end_s
@@ -231,7 +232,7 @@ def test_silent_connections_make_room_for_new_ones(
 def test_a_disconnected_address_is_blocked_for_a_while(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("kouxing.shared.bus.LONG_PENALTY_S", 600.0)
+    monkeypatch.setattr("kouxing.shared.sockets.LONG_PENALTY_S", 600.0)
     audio = bus.bind_router(LOCAL, "audio")
     talker = bus.connect_dealer(audio.endpoint)
     talker.send(chunk(1, 10))

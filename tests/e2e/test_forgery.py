@@ -13,9 +13,10 @@ import pytest
 from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, find_key
 
 from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Event, Heartbeat, SessionInput
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error

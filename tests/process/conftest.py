@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
+from kouxing.shared.sockets import Socket
 from tests.control_stage import Stage
 
 

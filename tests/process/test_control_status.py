@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from kouxing.services.control import status as control_status
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.endpoints import key_of
 from kouxing.shared.keys import load_key
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
 from tests.control_stage import Stage

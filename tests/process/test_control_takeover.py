@@ -8,7 +8,8 @@ import pytest
 
 from kouxing.services.control import service as control_service
 from kouxing.services.control import takeover
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession, StopSession
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import Message

@@ -21,9 +21,10 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import SynthesizerService
-from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.service import Service
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import (
     Heartbeat,

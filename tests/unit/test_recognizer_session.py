@@ -21,8 +21,8 @@ from kouxing.services.recognizer.session import (
     create_session,
 )
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
-from kouxing.shared.bus import Socket
 from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.session import ErrorCode, SessionFacts

@@ -7,9 +7,9 @@ from typing import cast
 import pytest
 
 from kouxing.services.recognizer.synthesizer_link import KEPT, SynthesizerLink
-from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, Progress, ResumeFace, Speech
 

@@ -1,0 +1,292 @@
+"""A ZeroMQ socket that carries messages, with limits against hostile peers.
+
+Undecodable messages are returned as ``BadMessage``.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import zmq
+
+from kouxing.shared.connections import KIB, LONG_PENALTY_S, PENALTY_S, Connection, LimitedSocket
+from kouxing.shared.endpoints import split_endpoint
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import NO_PEER, Grant, Key, Peer, may_follow
+from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Error, Joined
+from kouxing.shared.zap import Zap
+
+ERROR_COST = 4.0  # of the sender's budget, for each message that is answered with an error
+ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report has 15 MB
+MAX_PARTS = 4
+MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
+MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
+T = TypeVar("T", int, str)
+_SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A message or the reason why it is bad, and its sender (ROUTER sockets only)."""
+
+    message: Message | BadMessage
+    sender: Peer = NO_PEER
+
+
+class Socket:
+    """A ZeroMQ socket that sends and receives messages without blocking."""
+
+    def __init__(
+        self,
+        raw: zmq.Socket[bytes],
+        key: Key | None,
+        zap: Zap | None = None,
+        limited: LimitedSocket | None = None,
+        *,
+        routes: bool = False,
+        publishes: bool = False,
+        on_joined: Callable[[str], None] = lambda session: None,
+    ) -> None:
+        self.raw = raw
+        self._key = key
+        self._zap = zap  # of a socket that is bound with a key
+        self._limited = limited  # if it is bound
+        self._routes = routes
+        self._publishes = publishes
+        self._on_joined = on_joined
+        self._connection: Connection | None = None  # that the last message came through
+        self._sender = NO_PEER  # of it
+        self._has_rest = False  # parts of it that nobody wants
+        self._rest_from: Connection | None = None  # whose they are
+        self._name = secrets.token_hex(8)
+
+    @property
+    def endpoint(self) -> str:
+        """The bound endpoint with its port."""
+        return self.raw.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    @property
+    def file_descriptor(self) -> int:
+        """Becomes readable when the state may have changed (edge-triggered)."""
+        return int(self.raw.getsockopt(zmq.FD))
+
+    def send(self, message: Message, *, to: Peer = NO_PEER) -> bool:
+        """Queue a message (on a ROUTER: to one peer). Return False if the queue is full.
+
+        An answer to the message that is being handled reduces its sender's budget.
+        """
+        parts = encode(message)
+        if self._connection is not None and to == self._sender:
+            cost = ERROR_COST if isinstance(message, Error) else 0.0
+            self._connection.spend(cost + ANSWER_COST * len(parts[-1]) / KIB)
+        if self._routes:
+            parts.insert(0, to.address)
+        try:
+            self.raw.send_multipart(parts, flags=zmq.DONTWAIT)
+        except zmq.Again:
+            return False
+        if self._limited is not None:
+            self._limited.num_sent += 1
+        return True
+
+    def subscribe(self, kind: type[Message], session: str | None) -> None:
+        """Subscribe to a kind of message, of one session or of all (None)."""
+        prefix = f"{kind.kind}/".encode() if session is None else topic(kind, session)
+        self.raw.setsockopt(zmq.SUBSCRIBE, prefix)
+
+    def subscribe_session(self, kinds: Iterable[type[Message]], session: str) -> None:
+        """Subscribe to kinds of message of one session, and request a confirmation.
+
+        Every publisher answers with one ``joined`` message when all of them are in effect:
+        subscriptions keep their order, and the one to ``joined`` is the last.
+        """
+        for kind in (*kinds, Joined):
+            self.subscribe(kind, session)
+
+    def receive(self) -> Iterator[Received]:
+        """Yield the messages that have arrived, at most ``MAX_BATCH``.
+
+        A publishing socket answers a new subscription to ``joined/<session>/`` with a ``joined``
+        message. From then on, the subscriber misses nothing.
+        """
+        try:
+            for _ in range(MAX_BATCH):
+                if self.raw.closed:  # by the handler of the last message
+                    return
+                try:
+                    self._drop_rest()
+                    parts, key = self._take()
+                except zmq.Again:
+                    if not self._has_rest:
+                        self.note_empty()
+                    return
+                if self._connection is not None and self._connection.is_cut:
+                    continue
+                grant = None if self._zap is None else self._zap.grants.get(key)
+                if self._zap is not None and grant is None:  # gone or revoked
+                    continue
+                if self._publishes:
+                    self._on_subscription(parts, grant)
+                    continue
+                number = self._connection.inode if self._connection is not None else 0
+                self._sender = Peer(parts.pop(0), key, number) if self._routes else NO_PEER
+                try:
+                    yield Received(decode(parts), self._sender)
+                except BadMessage as error:
+                    yield Received(error, self._sender)
+        finally:
+            self._connection = None
+
+    def disconnect_stalled(self, kinds: Collection[type[Message]], sessions: Iterable[str]) -> None:
+        """Disconnect subscribers that stopped reading. Call this about once a second.
+
+        This affects only subscribers to one of ``kinds`` of one of ``sessions``: late frames of a
+        live session are worthless. libzmq reconnects the subscriber when it continues.
+        """
+        if self._limited is not None:
+            topics = [topic(kind, session) for session in sessions for kind in kinds]
+            self._limited.disconnect_stalled(topics)
+
+    def note_empty(self) -> None:
+        """Note that all complete messages have been received."""
+        if self._limited is not None:
+            self._limited.num_polls += 1
+
+    def is_open(self, connection: int) -> bool:
+        """Return whether a connection to this bound socket has not ended, by its number."""
+        return self._limited is not None and self._limited.has(connection)
+
+    def ended(self) -> Iterator[int]:
+        """Yield the numbers of connections that have ended since the last call."""
+        while self._limited is not None and self._limited.ended:
+            yield self._limited.ended.popleft()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for a message. Return False after the timeout."""
+        return bool(self.raw.poll(int(timeout_s * 1000)))
+
+    @property
+    def can_send(self) -> bool:
+        """Whether ``send`` would queue a message.
+
+        This stays False after a peer broke the protocol in the handshake: libzmq then gives up
+        the connection and its queue.
+        """
+        return bool(self.raw.poll(0, zmq.POLLOUT))
+
+    def connect(self, endpoint: str) -> None:
+        """Connect to another peer.
+
+        Raises ``UserError`` if the endpoint is malformed, or only one side uses encryption.
+        """
+        address, _, server_key = endpoint.partition(" ")
+        split_endpoint(address, "endpoint")
+        if bool(server_key) != (self._key is not None):
+            side = "this process" if server_key else f"the service at {address}"
+            raise UserError(f"only {side} has insecure = true; set it for both or for neither")
+        try:
+            if self._key is not None:
+                self.raw.setsockopt_string(zmq.CURVE_SERVERKEY, server_key)
+                self.raw.setsockopt_string(zmq.CURVE_PUBLICKEY, self._key.public)
+                self.raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
+            self.raw.setsockopt(zmq.IPV6, "[" in address)
+            self.raw.connect(address)
+        except zmq.ZMQError as error:
+            raise UserError(f"cannot connect to {endpoint}: {error.strerror}") from None
+
+    def close(self, *, linger_s: float = 1.0) -> None:
+        """Close. Queued messages are dropped after ``linger_s``."""
+        self.raw.close(linger=int(linger_s * 1000))
+
+    def _take(self) -> tuple[list[bytes], str]:
+        """Return the first parts of a message and its sender's key; raise ``zmq.Again`` if none."""
+        frame = self.raw.recv(zmq.DONTWAIT, copy=False)
+        parts = [frame.bytes]
+        descriptor = _property(frame, zmq.SRCFD, -1)
+        while frame.more and len(parts) < MAX_PARTS:
+            frame = self.raw.recv(zmq.DONTWAIT, copy=False)
+            parts.append(frame.bytes)
+        self._has_rest = frame.more
+        key = "" if self._zap is None else _property(frame, "User-Id", "")
+        if self._limited is not None:
+            self._connection = self._limited.deliver(descriptor, key)
+            if self._has_rest and self._connection is not None:
+                self._rest_from = self._connection
+                self._connection.disconnect("its message has too many parts", PENALTY_S)
+        return parts, key
+
+    def _drop_rest(self) -> None:
+        """Drop the rest of a message; raise ``zmq.Again`` if parts are left for the next call."""
+        for _ in range(MAX_DROPPED):
+            if not self._has_rest:
+                return
+            self._has_rest = self.raw.recv(zmq.DONTWAIT, False).more  # positional: faster
+        if self._has_rest:
+            if self._rest_from is not None:
+                self._rest_from.budget.block(LONG_PENALTY_S)
+            raise zmq.Again
+
+    def _on_subscription(self, parts: list[bytes], grant: Grant | None) -> None:
+        if len(parts) != 1:  # not a subscription
+            return
+        verb, wanted = parts[0][:1], parts[0][1:]
+        if self._connection is not None and self._limited is not None:
+            if verb == b"\x01":
+                self._limited.subscribe(self._connection, wanted)
+            else:
+                self._connection.topics.discard(wanted)
+            if self._connection.is_cut:
+                return
+        may = grant is None or may_follow(grant, wanted)  # everyone may without keys
+        if verb == b"\x00":
+            self.raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
+        elif verb == b"\x01" and may:
+            self.raw.setsockopt(zmq.SUBSCRIBE, wanted)
+            self._confirm_subscription(wanted)
+
+    def _confirm_subscription(self, wanted: bytes) -> None:
+        prefix = f"{Joined.kind}/".encode()
+        session = wanted.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
+        if wanted.startswith(prefix) and _SESSION.match(session):
+            self.send(Joined(session=session, publisher=self._name))
+            self._on_joined(session)
+
+
+def _property(frame: zmq.Frame, name: int | str, default: T) -> T:
+    """Return a property of a frame's connection, the default if the connection has ended."""
+    try:
+        return type(default)(frame.get(name))
+    except zmq.ZMQError:
+        return default
+
+
+class Poller:
+    """Waits for several sockets."""
+
+    def __init__(self) -> None:
+        self._poller = zmq.Poller()
+        self._sockets: dict[zmq.Socket[bytes], Socket] = {}
+
+    def add(self, socket: Socket) -> None:
+        """Watch a socket."""
+        self._sockets[socket.raw] = socket
+        self._poller.register(socket.raw, zmq.POLLIN)
+
+    def remove(self, socket: Socket) -> None:
+        """Stop watching a socket."""
+        del self._sockets[socket.raw]
+        self._poller.unregister(socket.raw)
+
+    def wait(self, timeout_s: float) -> list[Socket]:
+        """Return the readable sockets in the order in which they were added."""
+        ready = dict(self._poller.poll(max(0, int(timeout_s * 1000))))
+        for raw, socket in self._sockets.items():
+            if raw not in ready:
+                socket.note_empty()
+        return [socket for raw, socket in self._sockets.items() if raw in ready]
