@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeAlias
@@ -63,7 +64,7 @@ class NetworkPosition(NamedTuple):
     values: Floats  # (layers, heads, size) attention values
 
 
-class AcousticStream(Protocol):
+class AcousticStream(ABC):
     """State scores of one speaker's speech, segment by segment.
 
     The scores that a stream returns are settled: each frame gets them once. A stream may also have
@@ -72,17 +73,21 @@ class AcousticStream(Protocol):
 
     look_ahead_frames: int  # the settled scores of a frame come at most this many frames after it
     positions: list[NetworkPosition]  # new ones, if the stream keeps them; the caller clears it
+    provisional: Floats  # (k, states) of the frames after the settled ones; a change is a new array
 
-    @property
-    def provisional(self) -> Floats:
-        """Scores of the frames after the settled ones, (k, states). A change is a new array."""
+    def __init__(self, model: AcousticModel) -> None:
+        self._model = model
+        self.positions = []
+        self.provisional = no_scores(model.topology.num_states)
 
     def score(self, frames: Floats | None) -> Floats:
         """Score the front end's frames, (n, k), without other streams; None ends the segment.
 
         Returns the newly settled scores, (m, states).
         """
+        return self._model.score([(self, frames)])[0]
 
+    @abstractmethod
     def reset(self) -> None:
         """Forget the segment and the speaker."""
 
@@ -96,23 +101,26 @@ def no_scores(num_states: int) -> Floats:
 Work: TypeAlias = tuple[AcousticStream, Floats | None]
 
 
-class AcousticModel(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class AcousticModel(ABC):
     """A trained model, shared by any number of streams."""
 
-    @property
-    def topology(self) -> Topology:
-        """The HMMs whose states are scored."""
+    topology: Topology  # the HMMs whose states are scored
 
     @property
     def inventory(self) -> PhoneInventory:
         """The language's phones."""
+        return self.topology.inventory
 
+    @abstractmethod
     def create_front_end(self) -> FrontEnd:
         """Create the front end of one session."""
 
+    @abstractmethod
     def create_stream(self, *, keep_positions: bool = False) -> AcousticStream:
         """Create the stream of one speaker. Only a causal network has positions to keep."""
 
+    @abstractmethod
     def score(self, work: Sequence[Work]) -> list[Floats]:
         """Score several streams in one batch, with the same scores as one by one."""
 

@@ -49,28 +49,19 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import (
-    Floats,
-    NetworkPosition,
-    Topology,
-    Work,
-    no_scores,
-)
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, Work
 from kouxing.services.recognizer.acoustic.caches import CacheMemory, CacheSizes, Halves, cache_names
-from kouxing.services.recognizer.acoustic.model_file import (
-    Archive,
-    topology_arrays,
-    topology_from,
-    write_archive,
-)
+from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     MAX_POSITIONS,
+    NetworkModel,
+    check_outputs,
     open_session,
     position_table,
+    run_session,
 )
-from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
 
 FORMAT = "blocks 2"
 
@@ -84,18 +75,8 @@ _MAX_CACHE_BYTES = 3_000_000  # of a session
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlockModel:
-    """A network with its front end; implements ``AcousticModel``."""
-
-    topology: Topology
-    network: NDArray[np.uint8]  # an ONNX file, see training.blocks.export
-    log_prior: Floats  # (states,)
-    acoustic_scale: float
-
-    @property
-    def inventory(self) -> PhoneInventory:
-        """The language's phones."""
-        return self.topology.inventory
+class BlockModel(NetworkModel):
+    """A network that runs on blocks."""
 
     @cached_property
     def session(self) -> BlockSession:
@@ -106,10 +87,6 @@ class BlockModel:
     def caches(self) -> CacheMemory:
         """Keys and values of all sessions."""
         return CacheMemory(self.session.sizes.cache, _MAX_BATCH)
-
-    def create_front_end(self) -> WhisperMel:
-        """Create the front end of one session."""
-        return WhisperMel()
 
     def create_stream(self, *, keep_positions: bool = False) -> BlockStream:
         """Create the stream of one speaker; it keeps no positions."""
@@ -128,20 +105,20 @@ class BlockModel:
     def _run(self, streams: Sequence[BlockStream], rings: Halves) -> None:
         blocks = [stream.block() for stream in streams]
         log_posteriors, states, new = self.session.run(blocks, rings)
-        scores = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
+        scores = self.scores_of(log_posteriors)
         for row, stream in enumerate(streams):  # copies: a view would keep the whole batch
             stream.append_outputs(scores[row].copy(), states[row].copy(), new[row])
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
-        arrays = {
-            "format": np.array(FORMAT),
-            **topology_arrays(self.topology),
-            "network": self.network,
-            "log_prior": self.log_prior,
-            "acoustic_scale": np.array(self.acoustic_scale, np.float32),
-        }
-        write_archive(path, arrays)
+        write_model(
+            path,
+            FORMAT,
+            self.topology,
+            network=self.network,
+            log_prior=self.log_prior,
+            acoustic_scale=self.acoustic_scale,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,18 +159,7 @@ class Block:
 
 
 class BlockSession:
-    """A network that is ready to run on blocks, on one thread.
-
-    Parameters
-    ----------
-    file
-        An ONNX file's bytes.
-
-    Raises
-    ------
-    ValueError
-        If it is not a network of this kind.
-    """
+    """A network that is ready to run; ``ValueError`` if the file has another kind."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
         self._session = open_session(file)
@@ -203,26 +169,12 @@ class BlockSession:
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
 
     def run(self, blocks: Sequence[Block], rings: Halves) -> tuple[Floats, Floats, Halves]:
-        """Run the network on the next block of each of ``n`` sessions.
+        """Run the network on the next blocks of ``n`` sessions, with their caches.
 
-        Parameters
-        ----------
-        blocks
-            The sessions' next blocks.
-        rings
-            Their caches, (2 layers, n, heads, PAST, size).
-
-        Returns
-        -------
-        tuple
-            Log posteriors, (n, 2 (B + R), states), undefined for positions that a block lacks; the
-            recurrent layer's new state, (n, width); the block's keys of all layers and then its
-            values, (n, 2 layers, heads, B, size).
-
-        Raises
-        ------
-        ValueError
-            If the network does not run.
+        ``rings`` has the shape (2 layers, n, heads, PAST, size). Returns log posteriors,
+        (n, 2 (B + R), states), undefined for positions that a block lacks; the recurrent layer's
+        new state, (n, width); the block's keys of all layers and then its values,
+        (n, 2 layers, heads, B, size).
         """
         length = self.sizes.length
         frames = np.zeros((len(blocks), 2 * length + 3, NUM_MELS), np.float32)
@@ -236,28 +188,22 @@ class BlockSession:
             "state": np.stack([block.past.state for block in blocks]),
             **dict(zip(self._names, rings, strict=True)),
         }
-        try:
-            log_posteriors, state, new = self._session.run(_OUTPUTS, inputs)
-        except Exception as error:  # onnxruntime's errors have no common base
-            raise ValueError(f"its network does not run ({error})") from error
+        log_posteriors, state, new = run_session(self._session, _OUTPUTS, inputs)
         return log_posteriors, state, new
 
 
-class BlockStream:
+class BlockStream(AcousticStream):
     """Scores of one speaker's speech, segment by segment."""
 
+    _model: BlockModel
+
     def __init__(self, model: BlockModel) -> None:
-        self.positions: list[NetworkPosition] = []
-        self._model = model
+        super().__init__(model)
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
-        self._no_scores = no_scores(model.topology.num_states)
+        self._no_scores = self.provisional
         self.cache = model.caches.open()  # what lies beyond the past's positions is masked
         self.reset()
-
-    def score(self, frames: Floats | None) -> Floats:
-        """Score frames, shape (n, 80); None ends the segment. Return the settled scores."""
-        return self._model.score([(self, frames)])[0]
 
     def reset(self) -> None:
         """Forget the segment. The network has no memory of the speaker."""
@@ -307,17 +253,7 @@ class BlockStream:
         return Block(frames, self._row, num_positions, self.past)
 
     def append_outputs(self, scores: Floats, state: Floats, new: Halves) -> None:
-        """Append the network's outputs for ``block()``.
-
-        Parameters
-        ----------
-        scores
-            Shape (2 (B + R), states).
-        state
-            New state of the recurrent layer, (width,).
-        new
-            Keys and values, (2 layers, heads, B, size).
-        """
+        """Append the scores, new state, and keys and values of ``block()``; shapes as of a run."""
         sizes, block = self._sizes, self.block()
         ends_table = block.row + block.num_positions == MAX_POSITIONS
         if ends_table or (self._ended and block.num_positions == self._num_positions):
@@ -392,13 +328,7 @@ def _sizes_of(session: Any) -> BlockSizes:
 
 
 def blocks_from(archive: Archive) -> BlockModel:
-    """Build the model after checking every size.
-
-    Raises
-    ------
-    ValueError
-        If an array or the network does not fit.
-    """
+    """Build the model after checking every size; ``ValueError`` if something does not fit."""
     topology = topology_from(archive)
     model = BlockModel(
         topology=topology,
@@ -412,9 +342,5 @@ def blocks_from(archive: Archive) -> BlockModel:
     block = Block(frames, 0, sizes.length, stream.past)
     outputs = model.session.run([block], stream.cache.rings[:, np.newaxis])
     new = (1, 2 * sizes.layers, sizes.heads, sizes.block, sizes.head_size)
-    expected = [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new]
-    if [array.shape for array in outputs] != expected:
-        raise ValueError(f"its network scores {outputs[0].shape}, expected {expected[0]}")
-    if not all(np.isfinite(array).all() for array in outputs):
-        raise ValueError("its network scores with values that are not finite")
+    check_outputs(outputs, [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new])
     return model

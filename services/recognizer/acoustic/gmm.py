@@ -33,18 +33,12 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticModel,
+    AcousticStream,
     Floats,
-    NetworkPosition,
-    Topology,
     Work,
-    no_scores,
 )
-from kouxing.services.recognizer.acoustic.model_file import (
-    Archive,
-    topology_arrays,
-    topology_from,
-    write_archive,
-)
+from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     NUM_STATIC,
@@ -53,7 +47,6 @@ from kouxing.services.recognizer.front_end.features import (
     cepstra,
 )
 from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
-from kouxing.shared.phones.inventory import PhoneInventory
 
 FORMAT = "gmm 3"
 _MAX_MIXTURES = 1024
@@ -99,20 +92,14 @@ def mixture_scores(frames: Floats, matrix: Floats, num_mixtures: int) -> Floats:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GmmModel:
-    """A Gaussian mixture HMM with its front end; implements ``AcousticModel``."""
+class GmmModel(AcousticModel):
+    """A Gaussian mixture HMM with its front end."""
 
-    topology: Topology
     mixtures: GaussianMixtures
     rotation: Floats  # (39, 39)
     prior_mean: Floats  # (13,) cepstral mean of the training corpus
     half_width: int  # of the differences
     acoustic_scale: float = 1.0  # weight of the log scores: neighboring frames are correlated
-
-    @property
-    def inventory(self) -> PhoneInventory:
-        """The language's phones."""
-        return self.topology.inventory
 
     @cached_property
     def matrix(self) -> Floats:
@@ -133,31 +120,31 @@ class GmmModel:
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
-        arrays = {
-            "format": np.array(FORMAT),
-            **topology_arrays(self.topology),
-            "weights": self.mixtures.weights,
-            "means": self.mixtures.means,
-            "covars": self.mixtures.covars,
-            "rotation": self.rotation,
-            "prior_mean": self.prior_mean,
-            "half_width": np.array(self.half_width),
-            "acoustic_scale": np.array(self.acoustic_scale, np.float32),
-        }
-        write_archive(path, arrays)
+        write_model(
+            path,
+            FORMAT,
+            self.topology,
+            weights=self.mixtures.weights,
+            means=self.mixtures.means,
+            covars=self.mixtures.covars,
+            rotation=self.rotation,
+            prior_mean=self.prior_mean,
+            half_width=self.half_width,
+            acoustic_scale=self.acoustic_scale,
+        )
 
 
-class GmmStream:
+class GmmStream(AcousticStream):
     """Scores of one speaker's speech, segment by segment."""
 
+    _model: GmmModel
+
     def __init__(self, model: GmmModel) -> None:
-        self._model = model
+        super().__init__(model)
         self._vtln = VocalTractNormalizer()
         self._mean = LiveMean(model.prior_mean)
         self._differences = Differences(model.half_width)
         self.look_ahead_frames = self._differences.look_ahead_frames
-        self.provisional = no_scores(model.topology.num_states)
-        self.positions: list[NetworkPosition] = []
 
     def score(self, frames: Floats | None) -> Floats:
         """Score log-mel frames with their pitch, (n, 43); None ends the segment.
@@ -186,13 +173,7 @@ class GmmStream:
 
 
 def gmm_from(archive: Archive) -> GmmModel:
-    """Build the model after checking every size.
-
-    Raises
-    ------
-    ValueError
-        If an array does not fit.
-    """
+    """Build the model after checking every size; ``ValueError`` if an array does not fit."""
     topology = topology_from(archive)
     num_mixtures = archive.array("weights", None).shape[-1]
     if not 1 <= num_mixtures <= _MAX_MIXTURES:

@@ -78,4 +78,4 @@ def with_early_network(
     if not isinstance(model, blocks.BlockModel):
         return model
     early = load_model(look_ahead_ms=look_ahead_ms)
-    return TwoNetworks(cast(neural.NeuralModel, early), model)
+    return TwoNetworks(topology=model.topology, early=cast(neural.NeuralModel, early), late=model)

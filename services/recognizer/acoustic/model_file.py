@@ -82,6 +82,12 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     path.write_bytes(buffer.getvalue())
 
 
+def write_model(path: Path, form: str, topology: Topology, **arrays: Any) -> None:
+    """Write an acoustic model: its format, its HMMs and other arrays or numbers."""
+    others = {name: np.asarray(values) for name, values in arrays.items()}
+    write_archive(path, {"format": np.array(form), **topology_arrays(topology), **others})
+
+
 def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
     """Return the arrays of the HMMs, and of their phone language model if it is not shipped."""
     arrays, shipped = map(phone_lm_arrays, (topology.phone_lm, shipped_phone_lm()))
@@ -100,15 +106,7 @@ def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
 
 
 def topology_from(archive: Archive) -> Topology:
-    """Build the HMMs after checking every size.
-
-    Raises
-    ------
-    ValueError
-        If an array does not fit.
-    UserError
-        If the model's language is not installed.
-    """
+    """Build the HMMs after checking every size; raises as ``phone_lm_from``."""
     phone_lm = phone_lm_from(archive) if "lm_children" in archive else _shipped_for(archive)
     num_phones = len(phone_lm.inventory)
     first_state = archive.array("first_state", (num_phones + 1,)).astype(np.int64)

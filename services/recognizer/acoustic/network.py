@@ -1,8 +1,4 @@
-"""The neural model's network: an ONNX file that onnxruntime runs one position at a time.
-
-See :mod:`kouxing.services.recognizer.acoustic.neural` for what it computes and
-:mod:`kouxing.training.neural.export` for how the file is written.
-"""
+"""Networks of acoustic models: ONNX files that onnxruntime runs on one thread."""
 
 from __future__ import annotations
 
@@ -14,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.acoustic.caches import CacheSizes, cache_names
-from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.services.recognizer.onnx_session import open_network
 
 NUM_INPUTS = NUM_MELS
@@ -68,6 +64,24 @@ def input_names(num_layers: int) -> list[str]:
     return ["frames", "position", "output_layer", "past_mask", *cache_names(num_layers)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class NetworkModel(AcousticModel):
+    """A model whose scores come from the log posteriors of a network."""
+
+    network: NDArray[np.uint8]  # an ONNX file
+    log_prior: Floats  # (states,)
+    acoustic_scale: float
+
+    def create_front_end(self) -> WhisperMel:
+        """Create the front end of one session."""
+        return WhisperMel()
+
+    def scores_of(self, log_posteriors: Floats) -> Floats:
+        """Divide posteriors by priors (Bourlard and Morgan 1994), and weight the log scores."""
+        scores: Floats = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
+        return scores
+
+
 def open_session(file: NDArray[np.uint8]) -> Any:
     """Open a model's ONNX file, given as bytes; ValueError if it is not an ONNX file."""
     try:
@@ -76,36 +90,32 @@ def open_session(file: NDArray[np.uint8]) -> Any:
         raise ValueError(f"its network cannot be read ({error})") from error
 
 
+def run_session(session: Any, outputs: list[str], inputs: Mapping[str, NDArray[Any]]) -> Any:
+    """Return a network's outputs; ValueError if it does not run."""
+    try:
+        return session.run(outputs, inputs)
+    except Exception as error:
+        raise ValueError(f"its network does not run ({error})") from error
+
+
+def check_outputs(outputs: Sequence[NDArray[Any]], shapes: Sequence[tuple[int, ...]]) -> None:
+    """Raise ``ValueError`` if a network's outputs do not have these shapes or are not finite."""
+    if [array.shape for array in outputs] != list(shapes):
+        raise ValueError(f"its network scores {outputs[0].shape}, expected {shapes[0]}")
+    if not all(np.isfinite(array).all() for array in outputs):
+        raise ValueError("its network scores with values that are not finite")
+
+
 class NetworkSession:
-    """A network that is ready to run, on one thread.
-
-    Parameters
-    ----------
-    file
-        An ONNX file's bytes.
-
-    Raises
-    ------
-    ValueError
-        If it is not a network of this kind.
-    """
+    """The neural model's network, ready to run; ``ValueError`` if the file has another kind."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
         self._session = open_session(file)
         self.sizes = _sizes_of({node.name: node.shape for node in self._session.get_inputs()})
 
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[Floats]:
-        """Return log posteriors, keys and values.
-
-        Raises
-        ------
-        ValueError
-            If the network does not run.
-        """
-        try:
-            outputs: list[Floats] = self._session.run(_OUTPUTS, inputs)
-        except Exception as error:
-            raise ValueError(f"its network does not run ({error})") from error
+        """Return log posteriors, keys and values; ``ValueError`` if the network does not run."""
+        outputs: list[Floats] = run_session(self._session, _OUTPUTS, inputs)
         return outputs
 
 

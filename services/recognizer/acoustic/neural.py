@@ -50,32 +50,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticStream,
     Floats,
     NetworkPosition,
-    Topology,
     Work,
     no_scores,
 )
 from kouxing.services.recognizer.acoustic.caches import CacheMemory, Halves, cache_names
-from kouxing.services.recognizer.acoustic.model_file import (
-    Archive,
-    topology_arrays,
-    topology_from,
-    write_archive,
-)
+from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
     MAX_POSITIONS,
     NUM_INPUTS,
     SEEN_FRAMES,
     WINDOW,
+    NetworkModel,
     NetworkSession,
+    check_outputs,
     past_masks,
     position_table,
 )
 from kouxing.services.recognizer.front_end.features import HOP_S
-from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory
 
 FORMAT = "neural 6"
 
@@ -88,20 +83,11 @@ _PAST_MASKS = past_masks()
 
 
 @dataclass(frozen=True, kw_only=True)
-class NeuralModel:
-    """A network with its front end; implements ``AcousticModel``."""
+class NeuralModel(NetworkModel):
+    """A causal network with its look-aheads."""
 
-    topology: Topology
-    network: NDArray[np.uint8]  # an ONNX file
     look_aheads: NDArray[np.int64]  # feature frames, of each output layer
-    log_prior: Floats  # (states,)
-    acoustic_scale: float
     output_layer: int = 0  # the one in use
-
-    @property
-    def inventory(self) -> PhoneInventory:
-        """The language's phones."""
-        return self.topology.inventory
 
     @property
     def look_ahead_frames(self) -> int:
@@ -123,10 +109,6 @@ class NeuralModel:
         """Table of positions, shape (1500, width)."""
         return position_table(self.session.sizes.width)
 
-    def create_front_end(self) -> WhisperMel:
-        """Create the front end of one session."""
-        return WhisperMel()
-
     def create_stream(self, *, keep_positions: bool = False) -> NeuralStream:
         """Create the stream of one speaker."""
         return NeuralStream(self, keep_positions=keep_positions)
@@ -145,7 +127,7 @@ class NeuralModel:
         scores = []
         for stream, (_, frames) in zip(streams, work, strict=True):
             rows = stream.take_log_posteriors(is_end=frames is None)
-            scores.append(np.float32(self.acoustic_scale) * (rows - self.log_prior))
+            scores.append(self.scores_of(rows))
             if frames is None:
                 stream.reset()
         return scores
@@ -162,20 +144,9 @@ class NeuralModel:
     ) -> list[Floats]:
         """Run the network at the next position of every stream, with one of its output layers.
 
-        Parameters
-        ----------
-        streams
-            The sessions' streams.
-        rings
-            Their caches, (2 layers, sessions, heads, 128, size).
-        output_layer
-            Index into ``look_aheads``.
-
-        Returns
-        -------
-        list
-            Log posteriors, (rows, 2, states); keys and values, (rows, layers, heads, size). The
-            first rows are those of the streams.
+        ``rings`` are the streams' caches, (2 layers, sessions, heads, 128, size). Returns log
+        posteriors, (rows, 2, states), and keys and values, (rows, layers, heads, size); the first
+        rows are those of the streams.
         """
         rows = [*streams, streams[0]] if len(streams) < _MIN_ROWS else streams
         inputs: dict[str, NDArray[Any]] = {
@@ -188,13 +159,7 @@ class NeuralModel:
         return self.session.run({**inputs, **caches})
 
     def with_look_ahead(self, look_ahead_ms: float) -> NeuralModel:
-        """Return the model with another look-ahead.
-
-        Raises
-        ------
-        UserError
-            If the network was not trained with this look-ahead.
-        """
+        """Return the model with a look-ahead; ``UserError`` if it was not trained with it."""
         offered = [float(frames * HOP_S * 1000) for frames in self.look_aheads]
         if look_ahead_ms not in offered:
             choices = ", ".join(f"{choice:g}" for choice in offered)
@@ -207,33 +172,29 @@ class NeuralModel:
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
-        arrays = {
-            "format": np.array(FORMAT),
-            **topology_arrays(self.topology),
-            "network": self.network,
-            "look_aheads": self.look_aheads,
-            "log_prior": self.log_prior,
-            "acoustic_scale": np.array(self.acoustic_scale, np.float32),
-            "output_layer": np.array(self.output_layer),
-        }
-        write_archive(path, arrays)
+        write_model(
+            path,
+            FORMAT,
+            self.topology,
+            network=self.network,
+            look_aheads=self.look_aheads,
+            log_prior=self.log_prior,
+            acoustic_scale=self.acoustic_scale,
+            output_layer=self.output_layer,
+        )
 
 
-class NeuralStream:
+class NeuralStream(AcousticStream):
     """Scores and positions of one speaker's speech, segment by segment."""
 
+    _model: NeuralModel
+
     def __init__(self, model: NeuralModel, *, keep_positions: bool) -> None:
-        self.positions: list[NetworkPosition] = []
+        super().__init__(model)
         self._keep_positions = keep_positions
-        self._model = model
         self.look_ahead_frames = model.look_ahead_frames
-        self.provisional = no_scores(len(model.log_prior))
         self.cache = model.caches.open()  # what lies beyond a segment's positions is masked
         self.reset()
-
-    def score(self, frames: Floats | None) -> Floats:
-        """Score frames, shape (n, 80); None ends the segment. Return the new scores."""
-        return self._model.score([(self, frames)])[0]
 
     def reset(self) -> None:
         """Forget the segment. The network has no memory of the speaker."""
@@ -278,15 +239,7 @@ class NeuralStream:
         return self._frames[:SEEN_FRAMES].reshape(-1)
 
     def append_outputs(self, log_posteriors: Floats, values: Floats) -> None:
-        """Append the network's outputs at a position.
-
-        Parameters
-        ----------
-        log_posteriors
-            Shape (2, states).
-        values
-            Shape (layers, heads, size); the cache has them already.
-        """
+        """Append log posteriors, (2, states), and values, (layers, heads, size), of a position."""
         first = 2 * self._num_positions + _PADDING - self.look_ahead_frames
         if first == 1 and self._num_positions == 0:
             self._rows.append(log_posteriors[0])  # frame 0, which no position scores
@@ -306,13 +259,7 @@ class NeuralStream:
 
 
 def neural_from(archive: Archive) -> NeuralModel:
-    """Build the model after checking every size.
-
-    Raises
-    ------
-    ValueError
-        If an array or the network does not fit.
-    """
+    """Build the model after checking every size; ``ValueError`` if something does not fit."""
     topology = topology_from(archive)
     look_aheads = archive.array("look_aheads", None).astype(np.int64)
     if look_aheads.ndim != 1 or not len(look_aheads):
@@ -330,20 +277,11 @@ def neural_from(archive: Archive) -> NeuralModel:
         acoustic_scale=float(archive.floats("acoustic_scale")),
         output_layer=output_layer,
     )
-    _check_network(model)
-    return model
-
-
-def _check_network(model: NeuralModel) -> None:
-    """Run the network once with every output layer, and check what comes out."""
     sizes = model.session.sizes
     stream = model.create_stream()
     stream.append_frames(np.zeros((SEEN_FRAMES - _PADDING, NUM_INPUTS), np.float32))
     cached = (_MIN_ROWS, sizes.num_layers, sizes.num_heads, sizes.head_size)
     expected = [(_MIN_ROWS, 2, model.topology.num_states), cached, cached]
-    for output_layer in range(len(model.look_aheads)):
-        outputs = model.run([stream], stream.cache.rings[:, None], output_layer)
-        if [array.shape for array in outputs] != expected:
-            raise ValueError(f"its network scores {outputs[0].shape}, expected {expected[0]}")
-        if not all(np.isfinite(array).all() for array in outputs):
-            raise ValueError("its network scores with values that are not finite")
+    for number in range(len(look_aheads)):
+        check_outputs(model.run([stream], stream.cache.rings[:, None], number), expected)
+    return model

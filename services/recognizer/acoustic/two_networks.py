@@ -14,29 +14,23 @@ from typing import cast
 
 import numpy as np
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats, Topology, Work, no_scores
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticModel,
+    AcousticStream,
+    Floats,
+    Work,
+)
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.phones.inventory import PhoneInventory
 
 
-@dataclass(frozen=True)
-class TwoNetworks:
-    """Both models, with the same states; implements ``AcousticModel``."""
+@dataclass(frozen=True, kw_only=True)
+class TwoNetworks(AcousticModel):
+    """Both models, with the same states."""
 
     early: NeuralModel
     late: BlockModel
-
-    @property
-    def topology(self) -> Topology:
-        """The HMMs whose states are scored."""
-        return self.late.topology
-
-    @property
-    def inventory(self) -> PhoneInventory:
-        """The language's phones."""
-        return self.late.inventory
 
     def create_front_end(self) -> WhisperMel:
         """Create the front end of one session."""
@@ -56,21 +50,17 @@ class TwoNetworks:
         return settled
 
 
-class TwoNetworksStream:
+class TwoNetworksStream(AcousticStream):
     """Scores and positions of one speaker's speech, segment by segment."""
 
     def __init__(self, model: TwoNetworks, *, keep_positions: bool) -> None:
-        self._model = model
+        super().__init__(model)
         self.early = model.early.create_stream(keep_positions=keep_positions)
         self.late = model.late.create_stream()
         self.positions = self.early.positions
         self.look_ahead_frames = self.late.look_ahead_frames
-        self._no_scores = no_scores(model.topology.num_states)
+        self._no_scores = self.provisional
         self.reset()
-
-    def score(self, frames: Floats | None) -> Floats:
-        """Score frames, shape (n, 80); None ends the segment. Return the settled scores."""
-        return self._model.score([(self, frames)])[0]
 
     def reset(self) -> None:
         """Forget the segment."""
