@@ -81,16 +81,7 @@ def utterance(seed: int, num_phones: int) -> list[Phone]:
     for index in range(num_phones):
         symbol = str(rng.choice(["d", "g", "sh", "b"] if index % 2 == 0 else ["a", "i", "u"]))
         duration_s = float(rng.uniform(0.06, 0.25))
-        phones.append(
-            Phone(
-                index=index,
-                symbol=symbol,
-                onset_s=onset_s,
-                duration_s=duration_s,
-                confidence=1.0,
-                final=True,
-            )
-        )
+        phones.append(phone(index, symbol, onset_s, duration_s))
         onset_s += duration_s + (0.5 if rng.random() < 0.15 and index % 2 else 0.0)
     return phones
 

@@ -10,12 +10,9 @@ import time
 import glfw
 import numpy as np
 
-from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.head.head import Head, neutral_faps
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.window import Window
-from kouxing.services.driver.service import DriverService
-from tests.system import free_port
 
 
 def shown(window: Window) -> np.ndarray:
@@ -53,30 +50,6 @@ def size_and_close() -> None:
     assert not window.draw(neutral_faps())
     window.hide()
     window.close()
-
-
-def lost_stream() -> None:
-    control = f"tcp://127.0.0.1:{free_port()}"  # no control
-    service = DriverService(DriverConfig(control=control, view="window", width_px=64, height_px=48))
-    window = service.view._window
-    assert window is not None
-    try:
-        now_s = time.monotonic()
-        service.poses.add("demo", now_s)
-        service.poses.update("demo", np.full(68, 100, np.float32), now_s)
-        service.on_tick(now_s + 0.5)
-        assert title(window) == "kouxing: demo"
-        service.on_tick(now_s + 1.2)
-        assert title(window) == "kouxing: demo (no frames)"
-        service.poses.update("demo", np.full(68, 100, np.float32), now_s + 3.0)
-        service.on_tick(now_s + 3.0)
-        assert title(window) == "kouxing: demo"
-        service.poses.remove("demo")
-        service.on_tick(now_s + 3.1)
-        assert title(window) == "kouxing"
-    finally:
-        window.close()
-        service.bus.close()
 
 
 def switch() -> None:
@@ -146,10 +119,5 @@ def display() -> ctypes.c_void_p:
     return ctypes.c_void_p(glfw.get_x11_display())  # type: ignore[no-untyped-call]
 
 
-def title(window: Window) -> str:
-    text: str = glfw.get_window_title(window._window)
-    return text
-
-
 if __name__ == "__main__":
-    {"size_and_close": size_and_close, "lost_stream": lost_stream, "switch": switch}[sys.argv[1]]()
+    {"size_and_close": size_and_close, "switch": switch}[sys.argv[1]]()

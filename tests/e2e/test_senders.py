@@ -209,14 +209,6 @@ def test_changes_the_delay_of_all_targets(senders: Senders, receiver: socket.soc
         receiver.recv(2000)
 
 
-def test_sends_a_resting_face_without_frames(senders: Senders, receiver: socket.socket) -> None:
-    senders.show(0.0, open_mouth())
-    senders.start(parse_target(f"vmc://127.0.0.1:{receiver.getsockname()[1]}"))
-    start_s = time.monotonic()
-    receiver.recv(2000)
-    assert time.monotonic() - start_s > STALL_S / 2
-
-
 def test_media_time_continues_at_rest(senders: Senders, receiver: socket.socket) -> None:
     def next_time_s() -> float:
         while (first := next(iter(OscBundle(receiver.recv(2000))))).address != "/kouxing/time":
@@ -273,19 +265,6 @@ def test_waits_for_an_open_permission_window(senders: Senders) -> None:
         assert "press Allow" in problem(senders, url)
         stub.is_asking = False
         wait_until(lambda: bool(stub.frames))
-
-
-def test_asks_again_after_revocation(senders: Senders) -> None:
-    with VTubeStudioStub() as stub:
-        url = f"vts://127.0.0.1:{stub.port}"
-        senders.start(parse_target(url))
-        wait_until(lambda: bool(stub.frames))
-        stub.token = ""
-        stub.requests.clear()
-        wait_until(lambda: "AuthenticationTokenRequest" in stub.requests)
-        shown = len(stub.frames)
-        wait_until(lambda: len(stub.frames) > shown)
-        assert problem(senders, url) == ""
 
 
 def test_two_senders_share_one_permission(senders: Senders) -> None:

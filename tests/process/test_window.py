@@ -1,4 +1,4 @@
-"""The window on a separate display (Xvfb): drawing, size, closing, title and keys."""
+"""The window on a separate display (Xvfb): drawing, size, closing and keys."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def display() -> Iterator[str]:
         server.wait()
 
 
-@pytest.mark.parametrize("check", ["size_and_close", "lost_stream", "switch"])
+@pytest.mark.parametrize("check", ["size_and_close", "switch"])
 def test_on_a_display(display: str, check: str) -> None:
     environment = {**os.environ, **ONE_THREAD, "DISPLAY": display}
     environment.pop("WAYLAND_DISPLAY", None)

@@ -51,13 +51,6 @@ def test_has_no_sick_shape_at_any_opening(openings: list[float], num_points: int
     assert_no_sick_shape(openings)
 
 
-@given(openings=OPENINGS, num_points=st.integers(2, 60))
-def test_more_points_sample_the_same_curve(openings: list[float], num_points: int) -> None:
-    few = contour(openings, num_points)
-    many = contour(openings, 2 * num_points - 1)
-    assert np.allclose(few, many[:, :, ::2])
-
-
 @given(steps=KEY_FRAMES, smooth=st.booleans())
 def test_moves_without_jumps(steps: list[tuple[float, float]], smooth: bool) -> None:
     times_s = np.cumsum([length_s for length_s, _ in steps])

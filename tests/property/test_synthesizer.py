@@ -24,6 +24,7 @@ from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
+from tests import lips
 from tests.lips import INVENTORY, LIPS, advance, make_face
 
 pytestmark = pytest.mark.property
@@ -53,16 +54,7 @@ def utterances(draw: st.DrawFn, shortest_s: float = 0.03) -> list[Phone]:
     onset_s, phones = 0.3, []
     for index, symbol in enumerate(draw(st.lists(symbols, min_size=1, max_size=14))):
         duration_s = max(rate * draw(st.floats(0.03, 0.25)), shortest_s)
-        phones.append(
-            Phone(
-                index=index,
-                symbol=symbol,
-                onset_s=onset_s,
-                duration_s=duration_s,
-                confidence=1.0,
-                final=True,
-            )
-        )
+        phones.append(lips.phone(index, symbol, onset_s, duration_s))
         onset_s += duration_s + draw(st.sampled_from([0.0, 0.0, 0.0, 0.05, 0.4]))
     return phones
 

@@ -9,7 +9,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticu
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
 from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.shared.phones.events import Phone
-from tests.lips import LIPS, articulation_of, moment
+from tests.lips import LIPS, articulation_of, moment, phone
 
 pytestmark = pytest.mark.unit
 
@@ -18,21 +18,13 @@ JAW, UPPER_LIP, LOWER_LIP, WIDTH = 2, 3, 4, 5
 STEP_S = 0.02
 
 
-def syllables(rate_hz: float, phones: str = "d a", num: int = 12) -> list[Phone]:
-    """Return syllables of an initial and a vowel at a rate."""
-    initial, vowel = phones.split()
+def syllables(rate_hz: float, num: int = 12) -> list[Phone]:
+    """Return syllables "da" at a rate."""
     length_s = 1.0 / rate_hz
     return [
-        Phone(
-            index=2 * k + part,
-            symbol=(initial, vowel)[part],
-            onset_s=0.2 + k * length_s + part * 0.35 * length_s,
-            duration_s=(0.35, 0.65)[part] * length_s,
-            confidence=1.0,
-            final=True,
-        )
+        phone(2 * k + part, symbol, 0.2 + (k + start) * length_s, share * length_s)
         for k in range(num)
-        for part in range(2)
+        for part, (symbol, start, share) in enumerate((("d", 0.0, 0.35), ("a", 0.35, 0.65)))
     ]
 
 
@@ -53,7 +45,7 @@ def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[floa
 
 
 def test_louder_speech_opens_further_at_any_microphone_gain() -> None:
-    vowel = [Phone(index=0, symbol="a", onset_s=0.0, duration_s=9.0, confidence=1.0, final=True)]
+    vowel = [phone(0, "a", 0.0, 9.0)]
     articulation = articulation_of(vowel)
     for microphone_db in (-40.0, -20.0):
         levels = [microphone_db] * 300 + [microphone_db + 8.0] * 25 + [microphone_db - 8.0] * 25

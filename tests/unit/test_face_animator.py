@@ -13,7 +13,7 @@ from kouxing.services.synthesizer.lips.known_phones import KnownPhones
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion, State
-from kouxing.shared.phones.events import EndOfSound, Progress, SpeechChange
+from kouxing.shared.phones.events import EndOfSound, SpeechChange
 from tests.lips import DELAY_S, INVENTORY, LIPS, advance, make_face, phone
 
 pytestmark = pytest.mark.unit
@@ -45,10 +45,6 @@ def test_frames_have_the_frame_rate() -> None:
     assert faps.dtype == np.float32
 
 
-def test_face_rests_without_speech() -> None:
-    assert not values(advance(make_face(), 2.0)).any()
-
-
 def test_speech_opens_and_closes_the_mouth() -> None:
     face = make_face()
     frames = speak(face)
@@ -70,13 +66,6 @@ def test_an_early_end_of_speech_still_ends_it() -> None:
     speak(face)
     face.process(SpeechChange(active=False, time_s=0.35))
     assert not advance(face, 1.2)[-1][1].round(1).any()
-
-
-def test_flush_works_while_media_time_stands_still() -> None:
-    face = make_face()
-    speak(face)
-    face.flush()
-    assert not face.relax(8)[7][1].round(3).any()
 
 
 def test_flush_then_stall_rests_in_time() -> None:
@@ -174,22 +163,6 @@ def test_a_withdrawn_phone_does_not_move_the_face() -> None:
     np.testing.assert_array_equal(values(advance(face, 1.0)), values(advance(other, 1.0)))
 
 
-def test_an_equal_recognizer_changes_nothing() -> None:
-    face, plain = make_face(), make_face()
-    frames, expected = speak(face), speak(plain)
-    face.change_recognizer()
-    face.process(SpeechChange(active=True, time_s=0.3))
-    frames += advance(face, 0.6)  # already known
-    face.process(phone(0, "a", 0.42, 0.6, final=False))  # was number 1
-    for animator in (face, plain):
-        (frames if animator is face else expected).extend(advance(animator, 1.2))
-    assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in expected]
-    np.testing.assert_allclose(values(frames)[:, JAW], values(expected)[:, JAW], atol=30.0)
-    face.process(phone(0, "a", 0.42, 0.85))
-    face.process(phone(1, "i", 1.27, 0.1))
-    assert values(advance(face, 1.5))[:, JAW].max() > 100.0
-
-
 def test_withdraws_phones_that_a_new_recognizer_does_not_confirm() -> None:
     face, plain = make_face(), make_face()
     for animator in (face, plain):
@@ -199,20 +172,6 @@ def test_withdraws_phones_that_a_new_recognizer_does_not_confirm() -> None:
     plain.process(phone(1, "i", 0.4, 0.8))
     after, revised = (values(advance(animator, 1.0)) for animator in (face, plain))
     np.testing.assert_allclose(after, revised, atol=1.0)
-
-
-def test_resumes_from_another_face() -> None:
-    first, second, plain = (make_face(idle_motion_seed=5) for _ in range(3))
-    expected = speak(plain) + plain.relax(3) + advance(plain, 1.4)
-    shown = speak(first) + first.relax(3)
-    second.resume(shown[-1][0], len(shown), shown[-1][1])
-    assert speak(second) == []
-    frames = shown + advance(second, 1.4)
-    assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in expected]
-    step, usual = (
-        np.abs(np.diff(values(animator), axis=0)).max(axis=0) for animator in (frames, expected)
-    )
-    assert (step <= 1.2 * usual).all()
 
 
 def test_resumes_without_a_known_frame() -> None:
@@ -266,23 +225,6 @@ def test_a_longer_delay_is_closer_to_the_full_model() -> None:
         errors.append(float(np.sqrt(np.mean((values(frames)[:90] - whole) ** 2))))
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 0.1 * errors[0]
-
-
-def test_loud_speech_opens_the_mouth_but_no_closure() -> None:
-    spoken = [phone(0, "a", 0.0, 0.5), phone(1, "b", 0.5, 0.1), phone(2, "a", 0.6, 0.5)]
-    faps = []
-    for level_db in (-36.0, -26.0, -16.0):
-        face = make_face()
-        for animator in spoken:
-            face.process(animator)
-        frames = []
-        for step in range(140):
-            frames += face.process(Progress(time_s=step * 0.01, level_db=level_db))
-        faps.append(values(frames))
-    jaws = [animator[18:24, JAW].mean() for animator in faps]
-    assert jaws[0] < 0.95 * jaws[1] < 0.9 * jaws[2]
-    inner = np.array([4, 5, 8, 9, 10, 11]) - 1
-    assert all(np.abs(animator[26:29, inner]).max(axis=1).min() < 5.0 for animator in faps)
 
 
 def test_idle_motion_depends_on_the_seed_and_spares_the_mouth() -> None:

@@ -106,13 +106,6 @@ def test_no_jump_at_revisions_and_interruptions() -> None:
     assert after[8:].max() < 0.05
 
 
-def test_lips_rest_without_sound() -> None:
-    face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
-    openings(SAID[:42], face)
-    frames = np.array([faps for _, faps in face.relax(12)])
-    assert np.abs(frames[-1]).max() < 1e-6
-
-
 def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     samples = to_16_khz(samples, rate_hz)[:32_000]

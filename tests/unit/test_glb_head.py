@@ -98,22 +98,6 @@ def test_reads_arkit_shapes_in_any_order(
         assert off(head, original, VISEME_SHAPES[viseme]) < 0.5, viseme
 
 
-def test_a_few_arkit_shapes_open_and_round_the_mouth(original: Head, tmp_path: Path) -> None:
-    few = (
-        "jawOpen", "mouthClose", "mouthPucker", "mouthFunnel", "mouthSmileLeft", "mouthSmileRight",
-        "mouthLowerDownLeft", "mouthLowerDownRight", "mouthUpperUpLeft", "mouthUpperUpRight",
-        "eyeBlinkLeft", "eyeBlinkRight",
-    )  # fmt: skip
-    path = write_glb(tmp_path / "my.glb", meshes(original, {name: SHAPES[name] for name in few}))
-    head = read_glb(path)
-    points = original.feature_points
-    opened = skin(head, VISEME_SHAPES["aa"])
-    assert opened[points["2.2"], 1] - opened[points["2.3"], 1] > 0.1
-    rounded = skin(head, VISEME_SHAPES["ou"])
-    assert rounded[points["8.3"], 0] - rounded[points["8.4"], 0] < -0.1
-    assert skin(head, neutral_faps(close_t_l_eyelid=900))[points["3.1"], 1] < -0.08
-
-
 @pytest.mark.parametrize("short", [False, True], ids=["oculus", "ready player me"])
 def test_reads_oculus_visemes(original: Head, tmp_path: Path, short: bool) -> None:
     names = {"ih": "I", "oh": "O", "ou": "U"} if short else {}

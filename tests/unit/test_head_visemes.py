@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.head import Head
 from kouxing.services.synthesizer.lips.dynamic_visemes import visemes
 from kouxing.shared.face import high_level
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -23,7 +23,6 @@ def read_visemes() -> dict[str, NDArray[np.float32]]:
 
 VISEMES = read_visemes()
 PAIRS = (("2.2", "2.3"), ("2.6", "2.8"), ("2.7", "2.9"))
-SPOKEN = np.stack(list(VISEMES.values()))
 
 
 @pytest.fixture(scope="module", params=heads.NAMES)
@@ -81,19 +80,8 @@ def test_lips_do_not_cross(head: Head) -> None:
         assert gaps_mm(head, faps).min() > -0.7, name
 
 
-def test_lips_do_not_cross_between_visemes(head: Head) -> None:
-    rng = np.random.default_rng(2)
-    for share in rng.random(40, dtype=np.float32):
-        first, second = SPOKEN[rng.integers(0, len(SPOKEN), 2)]
-        assert gaps_mm(head, share * first + (1 - share) * second).min() > -0.7
-
-
 def test_lips_are_closed_in_b_p_m(head: Head) -> None:
     assert gaps_mm(head, VISEMES["b"]).max() <= 0.1
-
-
-def test_mouth_is_open_in_a(head: Head) -> None:
-    assert gaps_mm(head, VISEMES["a"]).min() > 8
 
 
 @pytest.mark.parametrize("name", ["u", "v"])
@@ -108,20 +96,6 @@ def test_teeth_show_in_i(head: Head) -> None:
     upper_lip, lower_lip, edge = place_mm(head, VISEMES["i"], "2.2", "2.3", "9.10")
     assert upper_lip[1] - edge[1] > 2
     assert edge[1] > lower_lip[1]
-
-
-def test_lower_teeth_are_visible_with_an_open_jaw(head: Head) -> None:
-    dropped = neutral_faps(open_jaw=300, raise_b_midlip=-580)  # as in a
-    for faps, shows in ((VISEMES["rest"], False), (VISEMES["v"], False), (dropped, True)):
-        lower_lip, edge = place_mm(head, faps, "2.3", "9.11")
-        assert (edge[1] > lower_lip[1]) == shows
-
-
-def test_tongue_body_rises_for_k_and_lies_low_for_a(head: Head) -> None:
-    raised, rest, low = (
-        place_mm(head, high_level.viseme_faps(select, 0, 63), "6.2")[0, 1] for select in (5, 0, 10)
-    )
-    assert low + 4 < rest < raised - 3
 
 
 @pytest.mark.parametrize("faps", [VISEMES["f"], high_level.viseme_faps(2, 0, 63)])
@@ -156,10 +130,3 @@ def test_nothing_penetrates_the_skin(head: Head) -> None:
         )
         inside = inside[inside[:, 2] > np.quantile(inside[:, 2], 0.6)]  # front vertices
         assert depth_mm(inside, vertices[around]).max() < 0.2, number
-
-
-def test_tongue_stays_away_from_the_upper_teeth(head: Head) -> None:
-    """The tip may touch the ridge behind the teeth, but stays behind their cutting edge."""
-    for name, faps in VISEMES.items():
-        tip, edge = place_mm(head, faps, "6.1", "9.10")
-        assert tip[2] < edge[2] - 1.5, name

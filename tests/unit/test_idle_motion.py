@@ -127,21 +127,3 @@ def test_eyes_look_away_more_often_in_pauses() -> None:
     assert share_on_viewer(State.SPEAKING) > 0.8
     assert share_on_viewer(State.LISTENING) > 0.7
     assert share_on_viewer(State.THINKING) < 0.65
-
-
-def test_head_motion_continues_after_a_gap() -> None:
-    face = make_face(idle_motion_seed=5)
-    before = show(face, levels((2.0, QUIET_DB)))[-1]
-    after = np.array([faps for _, faps in face.process(Progress(time_s=20.0, level_db=SILENT_DB))])
-    assert np.abs(after[0, [PITCH, YAW]] - before[[PITCH, YAW]]).max() < 300.0  # 0.2 degrees
-
-
-def test_a_late_start_converges_to_the_same_gaze() -> None:
-    first, second = (IdleMotion(3) for _ in range(2))
-    for number in range(3000):
-        first.apply(np.zeros(68, np.float32), number * 0.02, State.SPEAKING)
-    for time_s in (60.0, 60.2, 64.0, 71.0):
-        faps = np.zeros((2, 68), np.float32)
-        for motion, row in zip((first, second), faps, strict=True):
-            motion.apply(row, time_s, State.SPEAKING)
-    np.testing.assert_allclose(faps[0], faps[1], atol=1.0)

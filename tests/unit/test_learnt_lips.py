@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,12 +14,13 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learnt.closures import (
     ClosingPhones,
     ClosureRule,
-    closure_share,
 )
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.learnt.track import LipTrack
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from tests import lips
 from tests.lips import LIPS
 
 pytestmark = pytest.mark.unit
@@ -31,34 +34,24 @@ NEUTRAL = np.zeros(len(MOUTH_FAPS))
 OPEN = {3: 300.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -200.0)
 
 
-def lip_frame(
-    time_s: float, opening: float = 1.0, closure: float = 0.0, lip_to_teeth: float = 0.0
-) -> LipFrame:
+def lip_frame(time_s: float, opening: float = 1.0, closure: float = 0.0) -> LipFrame:
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
     for fap, value in OPEN.items():
         faps[MOUTH_FAPS.index(fap)] = opening * value
     return LipFrame(
-        time_s=time_s,
-        delay_s=LIPS_DELAY_S,
-        faps=faps,
-        closure=closure,
-        lip_to_teeth=lip_to_teeth,
+        time_s=time_s, delay_s=LIPS_DELAY_S, faps=faps, closure=closure, lip_to_teeth=0.0
     )
 
 
 def phone(symbol: str, onset_s: float, confidence: float = 0.95, index: int = 0) -> Phone:
-    return Phone(
-        index=index,
-        symbol=symbol,
-        onset_s=onset_s,
-        duration_s=0.07,
-        confidence=confidence,
-        final=False,
-    )
+    phone = lips.phone(index, symbol, onset_s, 0.07, final=False)
+    return replace(phone, confidence=confidence)
 
 
-def make_face(frame_rate_hz: float = 50.0, delay_s: float = DELAY_S) -> FaceAnimator:
-    return FaceAnimator(LearntLips(LIPS), frame_rate_hz=frame_rate_hz, delay_s=delay_s)
+def speaking_face(lips: LipModel | None = None, delay_s: float = DELAY_S) -> FaceAnimator:
+    face = FaceAnimator(lips or LearntLips(LIPS), frame_rate_hz=50.0, delay_s=delay_s)
+    speak(face)
+    return face
 
 
 def run(
@@ -98,13 +91,19 @@ def wave(time_s: float) -> LipFrame:
     return lip_frame(time_s, opening=0.5 - 0.5 * np.cos(2.0 * np.pi * 4.0 * time_s))
 
 
+def closing(
+    closure: float, begin_s: float = 0.46, end_s: float = 0.54
+) -> Callable[[float], LipFrame]:
+    """Return open lips whose predicted closure is high for some time."""
+    return lambda time_s: lip_frame(time_s, closure=closure if begin_s < time_s < end_s else 0.01)
+
+
 def nothing(_time_s: float) -> None:
     return None
 
 
 def test_follows_the_lip_frames() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
     frames = [frame for frame in run(face, 0.0, 2.0, wave) if frame[0] > 0.2]
     expected = [150.0 - 150.0 * np.cos(2.0 * np.pi * 4.0 * time_s) for time_s, _ in frames]
     assert np.abs(values(frames, JAW) - expected).max() < 0.04 * 300.0
@@ -112,8 +111,7 @@ def test_follows_the_lip_frames() -> None:
 
 
 def test_silence_closes_the_mouth_within_150_ms() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
     frames = run(face, 0.0, 1.0, lip_frame)
     assert at(frames, 0.8)[JAW] > 250.0
     last_s = 1.0 - 0.005 - LIPS_DELAY_S  # time of the newest lip frame
@@ -126,27 +124,10 @@ def test_silence_closes_the_mouth_within_150_ms() -> None:
     assert not np.array(late)[:, MOUTH].any()
 
 
-def test_a_late_lip_frame_changes_little() -> None:
-    frames = []
-    for lost in (-1, 25):
-        face = make_face()
-        speak(face)
-
-        def make(time_s: float, lost: int = lost) -> LipFrame | None:
-            return None if round(time_s / 0.02) == lost else wave(time_s)
-
-        frames.append(run(face, 0.0, 1.0, make))
-    assert np.abs(values(frames[0], JAW) - values(frames[1], JAW)).max() < 30.0
-
-
 def test_predicted_closure_needs_no_phone() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
 
-    def make(time_s: float) -> LipFrame:
-        return lip_frame(time_s, closure=0.95 if 0.46 < time_s < 0.54 else 0.02)
-
-    frames = run(face, 0.0, 1.0, make, [(0.5, phone("t", 0.47))])
+    frames = run(face, 0.0, 1.0, closing(0.95), [(0.5, phone("t", 0.47))])
     assert np.abs(at(frames, 0.5)[HEIGHTS]).max() < 10.0
     assert at(frames, 0.5)[JAW] > 250.0  # lips meet while the jaw stays
     assert np.abs(at(frames, 0.4)[HEIGHTS] + 200.0).max() < 1.0
@@ -160,25 +141,17 @@ def test_predicted_closure_needs_no_phone() -> None:
 def test_prediction_and_phone_decide_a_closure_together(
     closure: float, confidence: float, shuts: bool
 ) -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
 
-    def make(time_s: float) -> LipFrame:
-        return lip_frame(time_s, closure=closure if 0.46 < time_s < 0.54 else 0.01)
-
-    frames = run(face, 0.0, 1.0, make, [(0.52, phone("p", 0.46, confidence))])
+    frames = run(face, 0.0, 1.0, closing(closure), [(0.52, phone("p", 0.46, confidence))])
     height = np.abs(at(frames, 0.5)[HEIGHTS]).max()
     assert height < 10.0 if shuts else height > 190.0
 
 
 def test_closures_do_not_flutter() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
 
-    def make(time_s: float) -> LipFrame:
-        return lip_frame(time_s, closure=0.99 if abs(time_s - 0.51) < 0.01 else 0.01)
-
-    frames = run(face, 0.0, 1.0, make)
+    frames = run(face, 0.0, 1.0, closing(0.99, 0.5, 0.52))
     # lips meet at 0.51 and 0.53 s, between frames
     assert np.abs(at(frames, 0.52)[HEIGHTS]).max() < 40.0
     assert np.abs(at(frames, 0.54)[HEIGHTS]).max() < 100.0
@@ -186,8 +159,7 @@ def test_closures_do_not_flutter() -> None:
 
 
 def test_a_late_phone_still_closes_the_lips() -> None:
-    face = make_face(delay_s=0.06)
-    speak(face)
+    face = speaking_face(delay_s=0.06)
 
     def make(time_s: float) -> LipFrame:
         return lip_frame(time_s + LIPS_DELAY_S - 0.055, closure=0.1)
@@ -200,20 +172,15 @@ def test_a_late_phone_still_closes_the_lips() -> None:
 
 
 def test_a_withdrawn_phone_closes_nothing() -> None:
-    face = make_face()
-    speak(face)
-
-    def make(time_s: float) -> LipFrame:
-        return lip_frame(time_s, closure=0.1)
+    face = speaking_face()
 
     phones = [(0.5, phone("m", 0.46)), (0.52, phone("n", 0.46))]
-    frames = run(face, 0.0, 1.0, make, phones)
+    frames = run(face, 0.0, 1.0, partial(lip_frame, closure=0.1), phones)
     assert np.abs(at(frames, 0.5)[HEIGHTS]).min() > 150.0
 
 
 def test_f_moves_only_the_lower_lip_to_the_teeth() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
     frames = run(face, 0.0, 1.0, lip_frame, [(0.5, phone("f", 0.46))])
     assert at(frames, 0.5)[LOWER_LIP] > -10.0
     assert at(frames, 0.5)[3] == pytest.approx(-200.0)  # FAP 4, upper lip
@@ -221,12 +188,10 @@ def test_f_moves_only_the_lower_lip_to_the_teeth() -> None:
 
 def test_tongue_follows_the_dynamic_visemes() -> None:
     def tongue_of(face: FaceAnimator) -> list[Frame]:
-        speak(face)
         phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
         return run(face, 0.0, 1.0, lambda time_s: lip_frame(time_s, opening=0.0), phones)
 
-    learnt = tongue_of(make_face())
-    visemes = tongue_of(FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S))
+    learnt, visemes = tongue_of(speaking_face()), tongue_of(speaking_face(LIPS))
     tongue = values(learnt, TONGUE)
     np.testing.assert_array_equal(tongue, values(visemes, TONGUE))
     assert np.abs(tongue).max() > 50.0
@@ -237,8 +202,7 @@ def test_tongue_follows_the_dynamic_visemes() -> None:
 def test_amplitude_does_not_apply() -> None:
     jaws = []
     for level_db in (-40.0, -10.0):
-        face = make_face()
-        speak(face)
+        face = speaking_face()
         frames = []
         for number in range(1, 60):
             face.process(lip_frame(number * 0.02 - 0.005 - LIPS_DELAY_S))
@@ -248,8 +212,7 @@ def test_amplitude_does_not_apply() -> None:
 
 
 def test_flush_rests_within_150_ms_and_ignores_late_lip_frames() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
     before = run(face, 0.0, 1.0, lip_frame)
     face.flush()
     after = run(face, 1.0, 1.28, lip_frame)
@@ -263,8 +226,7 @@ def test_flush_rests_within_150_ms_and_ignores_late_lip_frames() -> None:
 
 
 def test_relaxes_and_returns_without_a_jump() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
     frames = run(face, 0.0, 1.0, lip_frame)
     frames += face.relax(10)
     assert not frames[-1][1].round(3).any()
@@ -274,8 +236,7 @@ def test_relaxes_and_returns_without_a_jump() -> None:
 
 
 def test_ignores_invalid_lip_frames() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
     frames = run(face, 0.0, 0.5, lip_frame)
     for bad in (
         lip_frame(np.nan),
@@ -291,10 +252,9 @@ def test_ignores_invalid_lip_frames() -> None:
 
 
 def test_dynamic_visemes_move_the_mouth_without_lip_frames() -> None:
-    faces = (make_face(), FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S))
+    faces = speaking_face(), speaking_face(LIPS)
     jaws = []
     for face in faces:
-        speak(face)
         phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
         jaws.append(values(run(face, 0.0, 0.6, nothing, phones), JAW))
     assert jaws[0].max() > 50.0
@@ -302,24 +262,6 @@ def test_dynamic_visemes_move_the_mouth_without_lip_frames() -> None:
     frames = run(faces[0], 0.6, 1.0, lip_frame)
     assert frames[-1][1][JAW] == pytest.approx(300.0)
     assert np.abs(np.diff(values(frames, JAW))).max() < 150.0
-
-
-def test_track_interpolates_its_frames_smoothly() -> None:
-    rng = np.random.default_rng(2)
-    track, values = LipTrack(NEUTRAL), rng.normal(size=(8, len(MOUTH_FAPS)))
-    for number, value in enumerate(values):
-        track.append(1.0 + number / 50.0, value)
-    track.hold_s = 0.04
-    at_frames = [track.at(1.0 + number / 50.0).value for number in range(8)]
-    np.testing.assert_allclose(at_frames, values, atol=1e-9)
-    step = 1e-6
-    for time_s in np.linspace(0.9, 1.4, 101) + step / 3.0:  # also at and after the frames
-        before, here, after = (track.at(float(time_s + k * step)) for k in (-1, 0, 1))
-        np.testing.assert_allclose(
-            here.velocity, (after.value - before.value) / (2 * step), atol=1e-2
-        )
-    assert not track.at(0.94).value.any()
-    assert not track.at(1.28).value.any()
 
 
 def test_a_new_frame_does_not_change_the_past() -> None:
@@ -334,8 +276,7 @@ def test_a_new_frame_does_not_change_the_past() -> None:
 
 
 def test_reduces_jitter_but_not_movement() -> None:
-    face = make_face()
-    speak(face)
+    face = speaking_face()
 
     def make(time_s: float) -> LipFrame:
         jitter = 0.01 * (-1.0) ** round(time_s / 0.02)  # times 300 FAP units
@@ -347,25 +288,6 @@ def test_reduces_jitter_but_not_movement() -> None:
         assert np.abs(np.diff(jaw)).max() < 0.25 * 6.0
     assert at(frames, 0.98)[JAW] == pytest.approx(150.0, abs=5.0)
     assert at(frames, 1.04)[JAW] == pytest.approx(300.0, abs=5.0)
-
-
-def test_lips_do_not_cross() -> None:
-    face = make_face()
-    speak(face)
-    frames = run(face, 0.0, 1.0, lambda time_s: lip_frame(time_s, opening=-0.2))
-    faps = at(frames, 0.8)
-    np.testing.assert_allclose(faps[HEIGHTS[::2]] + faps[HEIGHTS[1::2]], 0.0, atol=1.0)
-
-
-def test_phones_are_no_evidence_against_a_closure() -> None:
-    phones = ClosingPhones(LIPS.inventory, "b", ClosureRule(phone=3.0))
-    log_odds = [phones.log_odds(0.5)]
-    phones.add(phone("t", 0.46), 0.4)
-    log_odds.append(phones.log_odds(0.5))
-    assert log_odds == [0.0, 0.0]
-    phones.add(phone("p", 0.46, index=1), 0.4)
-    assert phones.log_odds(0.5) > 2.0
-    assert [closure_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
 
 
 def test_other_phones_are_evidence_against_a_closure_in_recordings() -> None:

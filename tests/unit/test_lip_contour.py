@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib import resources
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 
 from kouxing.services.synthesizer.lips.ferguson import drawing
@@ -21,13 +20,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 
 pytestmark = pytest.mark.unit
-
-
-def test_four_lines_with_16_points() -> None:
-    assert len({point for line in LINES.values() for point in line}) == 16
-    for upper, lower in (("outer upper", "outer lower"), ("inner upper", "inner lower")):
-        assert LINES[upper][0] == LINES[lower][0]
-        assert LINES[upper][-1] == LINES[lower][-1]
 
 
 @pytest.mark.parametrize("opening", [0.0, 1.7, 5.0])
@@ -72,23 +64,6 @@ def test_curves_have_two_continuous_derivatives() -> None:
                 for order in range(3):
                     before, after = curve([knot - 1e-9, knot + 1e-9], order)
                     assert before == pytest.approx(after, abs=1e-4)
-
-
-def test_closed_lips_meet_and_open_lips_separate() -> None:
-    closed, widest = contour([0.0, 5.0], num_points=101)
-    assert np.abs(closed[1] - closed[2]).max() < 1e-9
-    gap = widest[1, :, 1] - widest[2, :, 1]
-    assert gap.argmax() == 50
-    assert 0.15 < gap.max() < 0.3
-
-
-def test_jaw_follows_the_lower_lip() -> None:
-    faps = dict(zip(MOUTH_FAPS, faps_of([5.0])[0], strict=True))
-    assert faps[3] > 100.0
-    assert faps[5] < -300.0
-    assert not faps_of([0.0]).any()
-    # lips move only vertically
-    assert all(value == 0.0 for fap, value in faps.items() if FAPS[fap - 1].fapu == "MW")
 
 
 @pytest.mark.parametrize("opening", [-0.1, 5.1, float("nan")])

@@ -13,9 +13,9 @@ from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
 from tests import heads
+from tests.lips import phone
 from tests.receivers import SENT, received
 
 pytestmark = pytest.mark.unit
@@ -35,9 +35,9 @@ def phone_classes() -> dict[str, str]:
     """Return the rows of the table: the first phone of each viseme, and its kind."""
     inventory = load_inventory()
     classes: dict[str, tuple[str, str]] = {}
-    for phone, kind in zip(inventory.phones, inventory.kinds, strict=True):
+    for symbol, kind in zip(inventory.phones, inventory.kinds, strict=True):
         if kind != "silence":
-            classes.setdefault(inventory.visemes[phone][0][0], (phone, kind))
+            classes.setdefault(inventory.visemes[symbol][0][0], (symbol, kind))
     return dict(classes.values())
 
 
@@ -47,39 +47,31 @@ def frames_of(*symbols: str) -> Values:
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
     phones = [
-        Phone(
-            index=index,
-            symbol=symbol,
-            onset_s=index * PHONE_S,
-            duration_s=PHONE_S,
-            confidence=1.0,
-            final=True,
-        )
-        for index, symbol in enumerate(symbols)
+        phone(index, symbol, index * PHONE_S, PHONE_S) for index, symbol in enumerate(symbols)
     ]
     return synthesize(lips, phones, round(len(phones) * PHONE_S * FRAME_RATE_HZ), FRAME_RATE_HZ)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
-@pytest.mark.parametrize(("phone", "kind"), phone_classes().items())
-def test_every_class_of_phones_moves_every_output(phone: str, kind: str, output: str) -> None:
-    beside, instead = ("a", "a") if kind == "initial" else ("sil", "sil")
-    spoken, without = (frames_of(beside, each, beside) for each in (phone, instead))
-    own = slice(round(PHONE_S * FRAME_RATE_HZ), round(2 * PHONE_S * FRAME_RATE_HZ), 3)
+@pytest.mark.parametrize(("symbol", "kind"), phone_classes().items())
+def test_every_class_of_phones_moves_every_output(symbol: str, kind: str, output: str) -> None:
+    neighbor = "a" if kind == "initial" else "sil"
+    spoken, without = (frames_of(neighbor, middle, neighbor) for middle in (symbol, neighbor))
+    middle = slice(round(PHONE_S * FRAME_RATE_HZ), round(2 * PHONE_S * FRAME_RATE_HZ), 3)
     values, others = (
-        np.array([OUTPUTS[output](faps) for faps in frames[own]]) for frames in (spoken, without)
+        np.array([OUTPUTS[output](faps) for faps in frames[middle]]) for frames in (spoken, without)
     )
     assert np.abs(values - others).max() > VISIBLE
 
 
-@pytest.mark.parametrize(("name", "most_mm"), [("arkit", 0.5), ("oculus", 2.0), ("vrm", 1.9)])
-def test_shapes_lead_back_to_the_lips(name: str, most_mm: float) -> None:
+@pytest.mark.parametrize(("name", "max_mm"), [("arkit", 0.5), ("oculus", 2.0), ("vrm", 1.9)])
+def test_shapes_lead_back_to_the_lips(name: str, max_mm: float) -> None:
     head, shapes = heads.load("woman", "coarse"), SHAPE_SETS[name]
     points = [head.feature_points[point] for point in LIPS]
     errors_mm = []
-    for phone in phone_classes():
-        for faps in frames_of("a", phone, "a")[::3]:
+    for symbol in phone_classes():
+        for faps in frames_of("a", symbol, "a")[::3]:
             back = shapes.faps(shapes.weights(faps))
             error_m = (head.deform(back) - head.deform(faps))[points]
             errors_mm.append(1000 * np.linalg.norm(error_m, axis=1))
-    assert np.mean(errors_mm) < most_mm  # as docs/shapes.md states
+    assert np.mean(errors_mm) < max_mm  # as docs/shapes.md states

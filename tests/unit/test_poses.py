@@ -26,15 +26,6 @@ def poses_of(*sessions: str, configured: str = "newest") -> Poses:
     return poses
 
 
-def test_frames_of_two_sessions_do_not_mix() -> None:
-    poses = poses_of("a", "b")
-    for number in range(10):
-        now_s = 1.0 + 0.02 * number
-        poses.update("a", faps(100), now_s)
-        poses.update("b", faps(200), now_s)
-        assert poses.faps(now_s)[0] == 200
-
-
 def test_shows_the_newest_session_until_it_closes() -> None:
     poses = poses_of("a", "b", "c")
     shown = [poses.shown]
@@ -74,13 +65,6 @@ def test_returning_to_the_newest_follows_new_sessions_again() -> None:
     assert poses.shown == "c"
 
 
-@pytest.mark.parametrize(("step", "shown"), [(1, "a"), (-1, "b")])
-def test_can_switch_while_waiting_for_a_named_session(step: int, shown: str) -> None:
-    poses = poses_of("a", "b", configured="other")
-    poses.switch(step)
-    assert poses.shown == shown
-
-
 def test_a_stalled_face_fades_to_rest_and_returns() -> None:
     poses = poses_of("a")
     assert poses.faps(1.9)[0] == 1
@@ -94,21 +78,6 @@ def test_a_stalled_face_fades_to_rest_and_returns() -> None:
         came_back = poses.faps(3.0 + 0.02 * number)[0]
         assert came_back == pytest.approx(min(0.02 * number / FADE_S, 1.0), abs=0.01)
     assert not poses.is_stalled(3.5)
-
-
-def test_an_ended_face_rests_without_a_remark() -> None:
-    poses = poses_of("a")
-    poses.end("a")
-    assert not poses.faps(5.0).any()
-    assert poses.caption(2.0) == "a"
-
-
-def test_the_last_face_fades_after_its_session_closes() -> None:
-    poses = poses_of("a")
-    assert poses.faps(1.5)[0] == 1
-    poses.remove("a")
-    assert 0 < poses.faps(1.6)[0] < 1
-    assert not poses.faps(2.0).any()
 
 
 def test_resting_face_moves_and_does_not_jump() -> None:

@@ -39,18 +39,6 @@ def test_images_follow_media_time_at_any_frame_rate(renderer: Renderer, tmp_path
         assert sum(1 for _ in film.decode(video=0)) == 26
 
 
-def test_images_wait_for_their_frames(renderer: Renderer, tmp_path: Path) -> None:
-    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
-    assert not recording.step()
-    recording.add_frame(0.0, frame(0))
-    assert recording.step()
-    assert not recording.step()
-    recording.add_frame(0.05, frame(1))
-    assert recording.step()
-    assert not recording.step()
-    recording.close()
-
-
 def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)

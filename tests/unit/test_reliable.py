@@ -85,14 +85,6 @@ def test_resends_lost_messages(link: Link) -> None:
     assert link.received == [1, 2, 3, 4, 5]
 
 
-def test_ignores_repeated_messages(link: Link) -> None:
-    link.send(2)
-    link.deliver()
-    link.sender.tick(RESEND_AFTER_S)
-    link.deliver()
-    assert link.received == [1, 2]
-
-
 def test_a_new_epoch_starts_again_and_old_ones_are_ignored(link: Link) -> None:
     link.send(3)
     link.deliver()

@@ -13,7 +13,6 @@ from kouxing.services.driver.render import renderer as render
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.window import Window
 from kouxing.shared.errors import UserError
-from tests.heads import OPEN
 
 pytestmark = pytest.mark.unit
 
@@ -21,43 +20,6 @@ pytestmark = pytest.mark.unit
 @pytest.fixture(scope="module")
 def head() -> Head:
     return Head.load(detail="coarse")
-
-
-def test_picture_shows_a_face(head: Head) -> None:
-    renderer = Renderer(head, 160, 120, samples=0)
-    image = renderer.draw(neutral_faps())
-    renderer.close()
-    assert image.shape == (120, 160, 3)
-    assert image.dtype == np.uint8
-    red, green, blue = image[62, 80].astype(int)  # skin
-    assert red > green > blue
-    assert image[16, 80].mean() < 80  # dark hair above
-    assert image[60, 5, 2] > image[60, 5, 0]  # bluish background
-
-
-def test_a_and_b_differ_only_in_the_mouth(head: Head) -> None:
-    renderer = Renderer(head, 160, 120, samples=0)
-    closed, opened = (renderer.draw(f).astype(int) for f in (neutral_faps(), OPEN))
-    renderer.close()
-    change = np.abs(opened - closed).mean(axis=2)
-    assert change[74:92, 70:90].mean() > 8
-    assert change[:50].max() <= 2  # nothing above the eyes
-
-
-def test_transparent_background(head: Head) -> None:
-    renderer = Renderer(head, 160, 120, samples=0, background=None)
-    image = renderer.draw(neutral_faps())
-    renderer.close()
-    assert image.shape == (120, 160, 4)
-    assert image[5, 5, 3] == 0
-    assert image[62, 80, 3] == 255
-
-
-def test_resize(head: Head) -> None:
-    renderer = Renderer(head, 80, 60, samples=4)
-    renderer.resize(96, 72)
-    assert renderer.draw(neutral_faps()).shape == (72, 96, 3)
-    renderer.close()
 
 
 def test_drawing_into_a_window(head: Head, monkeypatch: pytest.MonkeyPatch) -> None:

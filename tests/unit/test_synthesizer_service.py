@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -99,23 +98,6 @@ def test_a_gap_does_not_delay_other_sessions(service: Watched) -> None:
     assert times == list(range(0, times[-1] + 1, to_samples(1 / RATE_HZ)))
     assert times[-1] >= to_samples(9.92)
     assert num_ticks > 100
-
-
-def test_sessions_with_gaps_take_turns(service: Watched) -> None:
-    for name in ("gap", "other"):
-        service.take(name, 1, 3.0)
-    for _ in range(10):
-        service.on_tick(0.0)
-    numbers = [len(service.frames(name)) for name in ("gap", "other")]
-    assert abs(numbers[0] - numbers[1]) <= round(MAX_BURST_S * RATE_HZ)
-    for _ in range(200):
-        service.on_tick(0.0)
-    gap, other = (
-        np.array([np.frombuffer(each.values, "<f4") for each in service.frames(name)])
-        for name in ("gap", "other")
-    )
-    assert len(gap) == 1 + round((3.0 - SynthesizerConfig().delay_ms / 1e3) * RATE_HZ)
-    assert np.array_equal(gap, other)
 
 
 def test_rejects_messages_beyond_the_queue(service: Watched) -> None:

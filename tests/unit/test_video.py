@@ -91,11 +91,3 @@ def test_rejects_invalid_settings(
     with pytest.raises(UserError, match=said):
         VideoWriter(tmp_path / "out.mp4", *size, frame_rate_hz, sample_rate_hz)
     assert not list(tmp_path.iterdir())
-
-
-def test_rejects_a_picture_of_a_wrong_size(tmp_path: Path) -> None:
-    with (
-        pytest.raises(ValueError, match="shape"),
-        VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer,
-    ):
-        writer.write_image(np.zeros((64, 48, 3), np.uint8))

@@ -84,8 +84,3 @@ def test_expressions_match_their_faps(
     faps = {morph.name: morph.faps for morph in AVATAR_MORPHS}[name]
     if name in VRM.names:
         assert np.array_equal(faps, VRM.basis[VRM.names.index(name)])
-
-
-def test_built_in_heads_are_free(avatar: dict[str, Any]) -> None:
-    assert avatar["meta"]["otherLicenseUrl"].endswith("publicdomain/zero/1.0/")
-    assert avatar["meta"]["avatarPermission"] == "everyone"
