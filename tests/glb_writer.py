@@ -1,4 +1,4 @@
-"""Writes small GLBs like other programs: dense accessors, no kouxing extras."""
+"""Writes small GLBs like other programs (dense accessors, no kouxing extras), and reads GLBs."""
 
 from __future__ import annotations
 
@@ -78,14 +78,27 @@ def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
         document["meshes"].append(entry)
         document["nodes"].append({"name": mesh.name, "mesh": len(document["meshes"]) - 1})
     document["buffers"] = [{"byteLength": len(binary)}]
+    write_chunks(path, document, binary)
+    return path
+
+
+def write_chunks(path: Path, document: dict[str, Any], binary: bytes | bytearray) -> None:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    length = 12 + 8 + len(text) + 8 + len(binary)
     path.write_bytes(
-        struct.pack("<4sII", b"glTF", 2, length)
+        struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
         + struct.pack("<I4s", len(text), b"JSON")
         + text
         + struct.pack("<I4s", len(binary), b"BIN\0")
         + bytes(binary)
     )
-    return path
+
+
+def read_chunks(path: Path) -> tuple[dict[str, Any], bytearray]:
+    """Return the description and the binary chunk of a GLB; check the headers."""
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    num_bytes, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert (kind, num_bytes) == (b"BIN\0", len(data) - 28 - size)
+    return json.loads(data[20 : 20 + size]), bytearray(data[28 + size :])

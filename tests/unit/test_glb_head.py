@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +18,7 @@ from kouxing.services.driver.render.scene import camera, load_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
-from tests.glb_writer import Mesh, write_glb
+from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
 from tests.meshes import meshes
 
 pytestmark = pytest.mark.unit
@@ -67,7 +66,7 @@ def test_reads_an_exported_head_unchanged(original: Head, tmp_path: Path) -> Non
 def test_reads_an_exported_head_by_its_arkit_shapes(original: Head, tmp_path: Path) -> None:
     path = tmp_path / "original.glb"
     export_glb(original, path)
-    document, binary = chunks(path)
+    document, binary = read_chunks(path)
     for mesh in document["meshes"]:
         names = mesh.get("extras", {}).get("targetNames", [])
         names[:] = [name if name in ARKIT.names else f"x{row}" for row, name in enumerate(names)]
@@ -120,18 +119,12 @@ def test_unit_position_and_direction_do_not_matter(original: Head, tmp_path: Pat
 
 
 def same_place(head: Head, original: Head) -> None:
-    """Compare heads except for their size and pivot."""
-    first, second = own_rows(head, original), head.vertices
-    scale = np.ptp(second[:, 1]) / np.ptp(first[:, 1])
-    shift = second - scale * first
+    """Compare the vertices of the parts in the GLB, except for their size and pivot."""
+    rows = [original.vertices[original.part(part.name).vertices] for part in head.parts]
+    first, second = np.concatenate(rows), head.vertices
+    shift = second - first * np.ptp(second[:, 1]) / np.ptp(first[:, 1])
     assert np.ptp(shift, axis=0).max() < 1e-4
     assert np.abs(shift).max() < 0.01
-
-
-def own_rows(head: Head, original: Head) -> np.ndarray:
-    """Return the vertices of the original head for the parts in the GLB."""
-    names = [part.name for part in head.parts]
-    return np.concatenate([original.vertices[original.part(name).vertices] for name in names])
 
 
 def test_shapes_move_the_gaze_without_eyeballs(original: Head, tmp_path: Path) -> None:
@@ -148,7 +141,7 @@ def test_shapes_move_the_gaze_without_eyeballs(original: Head, tmp_path: Path) -
 def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_path: Path) -> None:
     """Test with avatar nodes Hips > Neck > Head, and a mesh skinned to Hips and Head."""
     path = write_glb(tmp_path / "my.glb", meshes(original, SHAPES))
-    document, binary = chunks(path)
+    document, binary = read_chunks(path)
     count = len(document["nodes"])
     document["nodes"] += [
         {"name": "Hips", "children": [count + 1], "translation": [0, -1, 0]},
@@ -156,20 +149,18 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_pat
         {"name": "Head", "translation": [0, 0.1, 0]},
     ]
     document["scenes"][0]["nodes"].append(count)
-    document["skins"] = [{"joints": [count, count + 2]}]
     matrices = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
     matrices[0, 3, 1] = 1.0  # column-major: the bind pose cancels the position of the hips
-    add(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
-    document["skins"][0]["inverseBindMatrices"] = len(document["accessors"]) - 1
+    accessor = add(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
+    document["skins"] = [{"joints": [count, count + 2], "inverseBindMatrices": accessor}]
     for node in document["nodes"][:count]:
         attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
         rows = document["accessors"][attributes["POSITION"]]["count"]
         joints = np.zeros((rows, 4), "u1")
         joints[:, 0] = 0 if node["name"] == "garment" else 1
-        add(document, binary, joints, "VEC4", 5121)
-        attributes["JOINTS_0"] = len(document["accessors"]) - 1
-        add(document, binary, np.tile(np.array([1, 0, 0, 0], "<f4"), (rows, 1)), "VEC4", 5126)
-        attributes["WEIGHTS_0"] = len(document["accessors"]) - 1
+        weights = np.tile(np.array([1, 0, 0, 0], "<f4"), (rows, 1))
+        attributes["JOINTS_0"] = add(document, binary, joints, "VEC4", 5121)
+        attributes["WEIGHTS_0"] = add(document, binary, weights, "VEC4", 5126)
         node["skin"] = 0
     write_chunks(path, document, binary)
     head = read_glb(path)
@@ -182,36 +173,14 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_pat
 # --- broken files ---------------------------------------------------------------------------------
 
 
-def chunks(path: Path) -> tuple[dict[str, Any], bytearray]:
-    data = path.read_bytes()
-    (size,) = struct.unpack_from("<I", data, 12)
-    return json.loads(data[20 : 20 + size]), bytearray(data[28 + size :])
-
-
-def write_chunks(path: Path, document: dict[str, Any], binary: bytes | bytearray) -> None:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-    path.write_bytes(
-        head
-        + struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(binary), b"BIN\0")
-        + bytes(binary)
-    )
-
-
-def add(document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int) -> None:
+def add(document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int) -> int:
+    """Append an accessor; return its number."""
     document["bufferViews"].append({"byteOffset": len(binary), "byteLength": array.nbytes})
-    document["accessors"].append(
-        {
-            "bufferView": len(document["bufferViews"]) - 1,
-            "componentType": component,
-            "type": kind,
-            "count": len(array),
-        }
-    )
+    view = len(document["bufferViews"]) - 1
+    accessor = {"bufferView": view, "componentType": component, "type": kind, "count": len(array)}
+    document["accessors"].append(accessor)
     binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    return len(document["accessors"]) - 1
 
 
 @pytest.fixture
@@ -285,7 +254,7 @@ def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
 def test_rejects_bad_descriptions(
     small: Path, damage: Callable[[dict[str, Any]], None], said: str
 ) -> None:
-    document, binary = chunks(small)
+    document, binary = read_chunks(small)
     damage(document)
     write_chunks(small, document, binary)
     with pytest.raises(UserError, match=said):
@@ -300,14 +269,8 @@ def test_rejects_bad_descriptions(
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
         (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
-        (
-            struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]",
-            "glTF description is damaged",
-        ),
-        (
-            struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x",
-            "glTF description is damaged",
-        ),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "description is damaged"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "description is damaged"),
     ],
 )
 def test_rejects_bad_bytes(tmp_path: Path, data: bytes, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Rendering without a display."""
+"""Rendering without a display: framings, backgrounds, windows and errors."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import moderngl
 import numpy as np
 import pytest
 
+from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.head import Head, neutral_faps
 from kouxing.services.driver.render import renderer as render
-from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
+from kouxing.services.driver.render.scene import background, camera, load_head
 from kouxing.services.driver.render.window import Window
 from kouxing.shared.errors import UserError
 
@@ -55,3 +57,55 @@ def test_a_window_needs_a_display(head: Head, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(UserError, match="display"):
         Window(head, 160, 120)
+
+
+def seen(head: Head, framing: Framing, point: str, size: tuple[int, int] = (160, 90)) -> np.ndarray:
+    """Return the position of a feature point in the picture, -1 to 1."""
+    matrix = camera(head, framing).view_projection(*size)
+    place = matrix @ [*head.vertices[head.feature_points[point]], 1.0]
+    seen_at: np.ndarray = place[:2] / place[3]
+    return seen_at
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+def test_framed_parts_are_in_the_picture(head: Head, framing: Framing) -> None:
+    points = {"face": ("2.1", "11.1", "10.1"), "head": ("11.4",), "mouth": ("9.3", "2.1", "8.3")}
+    for point in points[framing]:
+        assert np.abs(seen(head, framing, point)).max() < 0.97
+
+
+def test_narrow_picture_shows_the_whole_face(head: Head) -> None:
+    assert abs(seen(head, Framing.FACE, "10.1", (90, 160))[0]) < 0.97
+
+
+def test_transparent_edges_keep_their_colors(head: Head) -> None:
+    renderer = Renderer(head, 160, 120, background=None)
+    image = renderer.draw(neutral_faps())
+    renderer.close()
+    renderer = Renderer(head, 160, 120, background=background("white"))
+    on_white = renderer.draw(neutral_faps()).astype(float)
+    renderer.close()
+    alpha = image[..., 3:].astype(float) / 255
+    assert ((alpha > 0.1) & (alpha < 0.9)).sum() > 100
+    over_white = image[..., :3] * alpha + 255 * (1 - alpha)
+    assert np.abs(over_white - on_white).mean() < 0.5
+    assert np.abs(over_white - on_white)[(alpha > 0)[..., 0]].mean() < 2
+
+
+def test_backgrounds() -> None:
+    assert background("studio") == BACKGROUND
+    assert background("transparent") is None
+    assert background("#Ff8000") == ((1.0, 128 / 255, 0.0),) * 2
+    assert background("white") == ((1.0, 1.0, 1.0),) * 2
+    for text in ("", "pink-ish", "#12345", "#gggggg"):
+        with pytest.raises(UserError, match="write studio, transparent, #rrggbb"):
+            background(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
+)
+def test_error_of_an_unknown_head(name: str, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        load_head(name)

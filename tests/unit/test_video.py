@@ -1,15 +1,22 @@
-"""Videos contain all pictures and the whole sound."""
+"""Videos and pictures, read back: pictures, sound, transparency and colors."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image, ImageSequence
 
-from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video.recording import Recording
+from kouxing.services.driver.video.writer import VideoWriter, open_writer, write_picture
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import NUM_FAPS
 
 pytestmark = pytest.mark.unit
 
@@ -70,24 +77,150 @@ def test_an_exception_leaves_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("path", ["no/out.mp4", "."])
-def test_unwritable_path(tmp_path: Path, path: str) -> None:
-    with pytest.raises(UserError, match="cannot write"):
-        VideoWriter(tmp_path / path, 64, 48, 25.0, 16000)
-    assert not list(tmp_path.iterdir())
+# --- formats ---
+
+PICTURE = np.zeros((48, 64, 4), np.uint8)
+PICTURE[10:30, 10:40] = [200, 50, 20, 255]
+PICTURE[30:40, 10:40] = [20, 50, 200, 128]
+
+
+def first_picture(path: Path) -> NDArray[np.uint8]:
+    """Decode VP9 with alpha, by libvpx."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        decoder = stream.codec_context
+        if decoder.name == "vp9":
+            assert stream.metadata["alpha_mode"] == "1"
+            decoder = av.CodecContext.create("libvpx-vp9", "r")
+        for packet in container.demux(stream):
+            for frame in decoder.decode(packet if packet.size else None):
+                return np.asarray(frame.to_ndarray(format="rgba"), dtype=np.uint8)
+    raise AssertionError("no picture")
+
+
+@pytest.mark.parametrize("name", ["out.mov", "out.webm"])
+def test_transparent_videos_have_alpha(tmp_path: Path, name: str) -> None:
+    with VideoWriter(tmp_path / name, 64, 48, 25.0, 16000, transparent=True) as writer:
+        for _ in range(5):
+            writer.write_image(PICTURE)
+            writer.write_sound(np.zeros(640, np.float32))
+    got = first_picture(tmp_path / name)
+    inner = np.zeros((48, 64), dtype=bool)
+    inner[12:28, 12:38] = inner[32:38, 12:38] = inner[:8] = True  # without smoothed edges
+    np.testing.assert_allclose(got[inner, 3].astype(int), PICTURE[inner, 3], atol=3)
+    np.testing.assert_allclose(got[20, 20].astype(int), [200, 50, 20, 255], atol=6)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_webp_is_an_animation(tmp_path: Path, channels: int) -> None:
+    path = tmp_path / "face.webp"
+    with VideoWriter(path, 64, 48, 20.0, 16000, transparent=channels == 4) as writer:
+        for number in range(3):
+            writer.write_image(np.roll(PICTURE[..., :channels], 4 * number, axis=1))
+            writer.write_sound(np.zeros(800, np.float32))
+    with Image.open(path) as moving:
+        images = [np.asarray(image.convert("RGBA")) for image in ImageSequence.Iterator(moving)]
+        assert (len(images), moving.info["loop"], moving.info["duration"]) == (3, 0, 50)
+    got = images[2].astype(int)
+    np.testing.assert_allclose(got[20, 28], [200, 50, 20, 255], atol=12)
+    assert (got[..., 3].min() == 255) == (channels == 3)
 
 
 @pytest.mark.parametrize(
-    ("size", "frame_rate_hz", "sample_rate_hz", "said"),
+    ("name", "codec"), [("a.mp4", "h264"), ("a.mov", "h264"), ("a.webm", "vp9")]
+)
+def test_opaque_videos_declare_their_colors(tmp_path: Path, name: str, codec: str) -> None:
+    with VideoWriter(tmp_path / name, 64, 48, 25.0, None) as writer:
+        for _ in range(5):
+            writer.write_image(np.ascontiguousarray(PICTURE[..., :3]))
+    with av.open(str(tmp_path / name)) as container:
+        assert container.streams.video[0].codec_context.name == codec
+        assert not container.streams.audio
+        frame = next(container.decode(video=0))
+        assert frame.colorspace == 1  # ITU-R BT.709
+        np.testing.assert_allclose(
+            frame.to_ndarray(format="rgb24")[20, 20].astype(int), [200, 50, 20], atol=8
+        )
+
+
+@pytest.mark.parametrize("name", ["frames", "face%03d.png"])
+def test_writes_a_picture_sequence(tmp_path: Path, name: str) -> None:
+    writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000, transparent=True)
+    for _ in range(3):
+        writer.write_image(PICTURE)
+        writer.write_sound(np.zeros(640, np.float32))
+    writer.close()
+    files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png"))
+    names = ["frames/00000.png", "frames/00001.png", "frames/00002.png"]
+    assert files == (names if name == "frames" else ["face000.png", "face001.png", "face002.png"])
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / files[2])), PICTURE)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "said"),
     [
-        ((63, 48), 25.0, 16000, "even"),
-        ((64, 48), 0.0001, 16000, "frame rate"),
-        ((64, 48), 25.0, 17000, "does not support"),
+        ("out.avi", {}, "ends in"),
+        ("out.png", {}, "number"),
+        ("no/frames", {}, "cannot write"),
+        ("no/out.mp4", {}, "cannot write"),
+        ("out.mp4", {"transparent": True}, "MP4 cannot be transparent"),
+        ("out.mp4", {"size": (63, 48)}, "even"),
+        ("out.mp4", {"frame_rate_hz": 0.0001}, "frame rate"),
+        ("out.mp4", {"sample_rate_hz": 17000}, "does not support"),
     ],
 )
 def test_rejects_invalid_settings(
-    tmp_path: Path, size: tuple[int, int], frame_rate_hz: float, sample_rate_hz: int, said: str
+    tmp_path: Path, name: str, settings: dict[str, Any], said: str
 ) -> None:
+    used = {"size": (64, 48), "frame_rate_hz": 25.0, "sample_rate_hz": 16000} | settings
     with pytest.raises(UserError, match=said):
-        VideoWriter(tmp_path / "out.mp4", *size, frame_rate_hz, sample_rate_hz)
+        open_writer(tmp_path / name, **used)
     assert not list(tmp_path.iterdir())
+
+
+def test_error_of_an_unwritable_picture(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot write"):
+        write_picture(tmp_path / "no" / "out.png", PICTURE)
+
+
+# --- recordings of sessions ---
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(Head.load(), 64, 48, samples=0)
+
+
+def frame(value: float) -> np.ndarray:
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[2] = value
+    return faps
+
+
+def test_images_follow_media_time_at_any_frame_rate(renderer: Renderer, tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
+    recording.add_sound(0, np.zeros(16000, np.float32))
+    for number in range(31):
+        recording.add_frame(number / 30, frame(number))
+    while recording.step():
+        pass
+    recording.close()
+    assert recording.num_images == 26
+    assert recording.duration_s == pytest.approx(26 / 25)
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 26
+
+
+def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
+    loud = np.full(8000, 0.5, np.float32)
+    recording.add_sound(8000, loud)
+    recording.add_sound(12000, loud)
+    recording.add_frame(0.0, frame(0))
+    recording.step()
+    recording.close()
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        heard = np.concatenate([f.to_ndarray()[0] for f in film.decode(audio=0)])
+    assert len(heard) == pytest.approx(20000, abs=2100)
+    assert np.abs(heard[:6000]).max() < 0.1
+    assert np.abs(heard[10000:18000]).mean() > 0.3

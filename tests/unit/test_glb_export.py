@@ -1,9 +1,7 @@
-"""The exported GLB is consistent, small and complete."""
+"""Exported GLBs and VRM 1.0 avatars are consistent and complete."""
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +9,12 @@ import numpy as np
 import pytest
 
 from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.services.driver.head.morphs import AVATAR_MORPHS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
-from kouxing.shared.face.shapes import ARKIT
+from kouxing.shared.face.shapes import ARKIT, VRM
 from tests import heads
+from tests.glb_writer import read_chunks
 
 pytestmark = pytest.mark.unit
 
@@ -23,25 +23,12 @@ COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 @pytest.fixture(scope="module")
-def glb(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = tmp_path_factory.mktemp("glb") / "head.glb"
     export_glb(heads.load("woman"), path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def document(glb: Path) -> dict[str, Any]:
-    data = glb.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON"
-    read: dict[str, Any] = json.loads(data[20 : 20 + size])
-    binary, kind = struct.unpack_from("<I4s", data, 20 + size)
-    assert kind == b"BIN\0"
-    read["binary"] = data[28 + size :]
-    assert read["buffers"][0]["byteLength"] <= binary == len(read["binary"])
-    return read
+    document, binary = read_chunks(path)
+    assert document["buffers"][0]["byteLength"] == len(binary)
+    return {**document, "binary": bytes(binary)}
 
 
 def test_opaque_parts_have_coarse_triangles(document: dict[str, Any]) -> None:
@@ -77,14 +64,15 @@ def test_accessors_match_their_views(document: dict[str, Any]) -> None:
             assert rows[-1] < accessor["count"]
 
 
+def target_names(document: dict[str, Any]) -> set[str]:
+    extras = [mesh.get("extras", {}) for mesh in document["meshes"]]
+    return {name for extra in extras for name in extra.get("targetNames", [])}
+
+
 def test_every_fap_is_a_target_or_a_rotation(document: dict[str, Any]) -> None:
     described = {fap["name"]: fap for fap in document["scenes"][0]["extras"]["kouxing"]["faps"]}
     assert list(described) == [fap.name for fap in FAPS[2:]]
-    targets = {
-        name
-        for mesh in document["meshes"]
-        for name in mesh.get("extras", {}).get("targetNames", [])
-    }
+    targets = target_names(document)
     turned = {name for name, fap in described.items() if "rotation" in fap}
     assert (targets | turned) - set(ARKIT.names) == set(described)
     names = {node["name"] for node in document["nodes"]}
@@ -108,11 +96,7 @@ def moved(document: dict[str, Any], mesh_name: str, target: str) -> dict[int, An
 
 
 def test_every_arkit_shape_is_a_target(document: dict[str, Any]) -> None:
-    targets = {
-        name
-        for mesh in document["meshes"]
-        for name in mesh.get("extras", {}).get("targetNames", [])
-    }
+    targets = target_names(document)
     assert set(ARKIT.names) <= targets
     described = document["scenes"][0]["extras"]["kouxing"]["arkit"]
     assert [shape["name"] for shape in described] == list(ARKIT.names)
@@ -141,7 +125,7 @@ def test_unwritable_path(tmp_path: Path) -> None:
         export_glb(heads.load("woman", "coarse"), tmp_path / "head.png")
 
 
-def read(document: dict[str, Any], binary: bytes, accessor: int) -> np.ndarray:
+def read(document: dict[str, Any], binary: bytearray, accessor: int) -> np.ndarray:
     """Return the floats of an accessor, flat."""
     view = document["bufferViews"][document["accessors"][accessor]["bufferView"]]
     return np.frombuffer(binary, np.float32, view["byteLength"] // 4, view["byteOffset"])
@@ -155,17 +139,15 @@ def test_animation_moves_the_head_like_its_faps(tmp_path: Path, *, as_arkit: boo
     faps[2, 48] = 0.1 / 1e-5  # the head rotates by 0.1 rad
     path = tmp_path / "speaks.glb"
     export_glb(head, path, [(0.02 * k, row) for k, row in enumerate(faps)], as_arkit=as_arkit)
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
+    document, binary = read_chunks(path)
     (animation,) = document["animations"]
     curves = {}
     for channel in animation["channels"]:
         sampler = animation["samplers"][channel["sampler"]]
         target = channel["target"]
         name = document["nodes"][target["node"]]["name"]
-        curves[name, target["path"]] = read(document, data[28 + size :], sampler["output"])
-        times_s = read(document, data[28 + size :], sampler["input"])
+        curves[name, target["path"]] = read(document, binary, sampler["output"])
+        times_s = read(document, binary, sampler["input"])
         np.testing.assert_allclose(times_s, [0.0, 0.02, 0.04])
     np.testing.assert_allclose(
         curves["head", "rotation"].reshape(3, 4)[2], [0, np.sin(0.05), 0, np.cos(0.05)], atol=1e-6
@@ -185,3 +167,67 @@ def test_animation_moves_the_head_like_its_faps(tmp_path: Path, *, as_arkit: boo
     expected = (faps[1] @ fields).reshape(-1, 3)
     error_m = np.abs(moved - expected).max()
     assert error_m < (0.1 if as_arkit else 0.01) * np.abs(expected).max()
+
+
+# --- VRM ---------------------------------------------------------------------------------------
+
+NEEDED_BONES = set(
+    "hips spine head leftUpperLeg leftLowerLeg leftFoot rightUpperLeg rightLowerLeg rightFoot"
+    " leftUpperArm leftLowerArm leftHand rightUpperArm rightLowerArm rightHand".split()
+)
+EMOTIONS = {"happy", "angry", "sad", "surprised"}
+
+
+@pytest.fixture(scope="module")
+def vrm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("vrm") / "woman.vrm"
+    export_glb(heads.load("woman", "coarse"), path)
+    document, _ = read_chunks(path)
+    assert document["extensionsUsed"] == ["VRMC_vrm"]
+    avatar = document["extensions"]["VRMC_vrm"]
+    assert avatar["specVersion"] == "1.0"
+    return {**document, "avatar": avatar}
+
+
+def test_bones_are_in_t_pose(vrm: dict[str, Any]) -> None:
+    nodes = vrm["nodes"]
+    parents = {
+        child: number for number, node in enumerate(nodes) for child in node.get("children", ())
+    }
+
+    def place(number: int | None) -> np.ndarray:
+        if number is None:
+            return np.zeros(3)
+        shift = np.array(nodes[number].get("translation", (0, 0, 0)))
+        placed: np.ndarray = place(parents.get(number)) + shift
+        return placed
+
+    humanoid = vrm["avatar"]["humanoid"]["humanBones"]
+    bones = {name: place(bone["node"]) for name, bone in humanoid.items()}
+    assert set(bones) == NEEDED_BONES
+    assert bones["head"][1] == pytest.approx(1.5)
+    assert bones["leftFoot"][1] == pytest.approx(0.08)
+    assert bones["leftHand"][1] == bones["leftUpperArm"][1] == bones["rightHand"][1]
+    assert bones["leftHand"][0] == pytest.approx(-bones["rightHand"][0])
+    assert bones["leftHand"][0] > 0.6
+    head = nodes[humanoid["head"]["node"]]
+    assert {"eye_left", "hair"} <= {nodes[child]["name"] for child in head["children"]}
+
+
+def test_every_sent_weight_has_an_expression(vrm: dict[str, Any]) -> None:
+    expressions = vrm["avatar"]["expressions"]
+    assert set(expressions["preset"]) == set(VRM.names) | EMOTIONS
+    assert set(expressions["custom"]) == set(ARKIT.names)
+
+
+@pytest.mark.parametrize("name", [*VRM.names, *sorted(EMOTIONS), "jawOpen"])
+def test_expressions_match_their_faps(name: str, vrm: dict[str, Any]) -> None:
+    every = vrm["avatar"]["expressions"]["preset"] | vrm["avatar"]["expressions"]["custom"]
+    bound = set()
+    for bind in every[name]["morphTargetBinds"]:
+        mesh = vrm["meshes"][vrm["nodes"][bind["node"]]["mesh"]]
+        bound.add(mesh["extras"]["targetNames"][bind["index"]])
+    assert bound == {name}
+    faps = {morph.name: morph.faps for morph in AVATAR_MORPHS}[name]
+    if name in VRM.names:
+        assert np.array_equal(faps, VRM.basis[VRM.names.index(name)])
