@@ -110,7 +110,7 @@ def numbered_vertices(mesh: Path, pieces: list[Piece]) -> tuple[Float64, dict[st
         elif words[:1] in (["o"], ["g"]) and len(words) > 1:
             starts.setdefault(words[1], len(rows))
     vertices = np.array(rows)
-    ends = [*list(starts.values())[1:], len(rows)]
+    ends = [*starts.values(), len(rows)][1:]  # none if the file names no mesh
     named = {
         name: vertices[a:b] for (name, a), b in zip(starts.items(), ends, strict=True) if b > a
     }
