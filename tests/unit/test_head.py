@@ -9,7 +9,8 @@ import pytest
 
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAPS, NUM_FAPS
+from kouxing.shared.face.faps import FAPS
+from kouxing.shared.face.high_level import VISEMES, expression_faps, viseme_faps
 from tests import heads
 
 pytestmark = pytest.mark.unit
@@ -61,20 +62,6 @@ def test_lip_faps_are_independent(head: Head) -> None:
         for point in LIP_POINTS:
             if point not in fap.feature_points:
                 assert abs(shift[head.feature_points[point], 1]) < 0.05 * travel, (fap.name, point)
-
-
-def test_open_jaw_does_not_open_the_lips(head: Head) -> None:
-    shift = head.deform(heads.only(3, 500.0)) - head.vertices
-    inner = [head.feature_points[f"2.{n}"] for n in range(2, 10)]
-    assert np.abs(shift[inner, 1]).max() < 0.05 * 500 * head.fapu["MNS"] / 1024
-
-
-def test_deformation_is_linear(head: Head) -> None:
-    rng = np.random.default_rng(1)
-    faps = rng.normal(0, 80, NUM_FAPS).astype(np.float32)
-    faps[[22, 23, 24, 25, 47, 48, 49]] = 0  # the rotations
-    once, twice = head.deform(faps) - head.vertices, head.deform(2 * faps) - head.vertices
-    np.testing.assert_allclose(2 * once, twice, atol=2e-6)
 
 
 def test_fine_and_coarse_heads_move_equally() -> None:
@@ -134,11 +121,6 @@ def test_unknown_fap_name() -> None:
         neutral_faps(open_jar=1.0)
 
 
-def test_unknown_head() -> None:
-    with pytest.raises(UserError, match=DEFAULT_HEAD):
-        Head.load("nobody")
-
-
 @pytest.mark.parametrize(
     "damage",
     ["cut", "text", "format", "missing", "index", "part_names", "part_vertices", "eye_centres",
@@ -171,3 +153,33 @@ def test_rejects_a_damaged_file(
         np.savez(broken, allow_pickle=False, **arrays)
     with pytest.raises(UserError, match="broken"):
         Head.load(broken)
+
+
+# --- FAP 1 and FAP 2 ---
+
+
+def test_blend() -> None:
+    np.testing.assert_array_equal(viseme_faps(1, 10, 63), VISEMES[1])
+    np.testing.assert_array_equal(viseme_faps(1, 10, 0), VISEMES[10])
+    np.testing.assert_allclose(
+        viseme_faps(1, 10, 21), VISEMES[1] / 3 + VISEMES[10] * 2 / 3, rtol=1e-5
+    )
+
+
+def test_visemes_and_expressions_move_the_face() -> None:
+    head = heads.load("woman", "coarse")
+    lower = head.feature_points["2.3"]
+    assert head.deform(viseme_faps(10, 0, 63))[lower, 1] < head.vertices[lower, 1] - 0.008
+    corner = head.feature_points["8.3"]
+    assert head.deform(expression_faps(1, 63))[corner, 1] > head.vertices[corner, 1] + 0.004
+
+
+@pytest.mark.parametrize("select", [-1, 15])
+def test_unknown_viseme(select: int) -> None:
+    with pytest.raises(UserError, match="viseme_select"):
+        viseme_faps(select, 0, 63)
+
+
+def test_rejects_excessive_intensity() -> None:
+    with pytest.raises(UserError, match="expression_intensity"):
+        expression_faps(1, 64)

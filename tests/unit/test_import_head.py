@@ -12,14 +12,14 @@ import pytest
 from kouxing.services.driver.head.head import Head, neutral_faps
 from kouxing.services.driver.head.import_head import import_head
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAPS, NUM_FAPS
-from tests.glb_writer import Mesh, write_glb
+from kouxing.shared.face.faps import Fap
+from tests import heads
+from tests.glb_writer import write_glb
 from tests.heads import OPEN
 from tests.meshes import meshes, write_obj
 
 pytestmark = pytest.mark.unit
 
-AXES = {"down": (1, -1), "up": (1, 1), "left": (0, 1), "right": (0, -1), "forward": (2, 1)}
 TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
 
 
@@ -42,8 +42,7 @@ def imported(original: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
     folder = tmp_path_factory.mktemp("import")
 
     def place(points: np.ndarray) -> np.ndarray:
-        placed: np.ndarray = points * [100, 112, 100] * TURN + [30, 150, -7]
-        return placed
+        return points * [100, 112, 100] * TURN + [30, 150, -7]  # type: ignore[no-any-return]
 
     parts = meshes(original)
     for part in parts:
@@ -75,21 +74,14 @@ def test_parts_textures_and_units(imported: Head, original: Head) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "fap",
-    [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"],
-    ids=lambda fap: fap.name,
-)
-def test_feature_points_move_as_defined(imported: Head, fap: object) -> None:
-    axis, sign = AXES[fap.direction]  # type: ignore[attr-defined]
+@pytest.mark.parametrize("fap", heads.DISPLACING, ids=lambda fap: fap.name)
+def test_feature_points_move_as_defined(imported: Head, fap: Fap) -> None:
     for value in (300.0, -120.0):
-        faps = np.zeros(NUM_FAPS)
-        faps[fap.number - 1] = value  # type: ignore[attr-defined]
-        wanted = sign * value * imported.fapu[fap.fapu] / 1024  # type: ignore[attr-defined]
-        for point in fap.feature_points:  # type: ignore[attr-defined]
-            vertex = imported.feature_points.get(point)
-            if vertex is not None:
-                assert moved(imported, faps)[vertex, axis] == pytest.approx(wanted, rel=0.05)
+        axis, wanted = heads.travel_m(imported, fap, value)
+        shift = moved(imported, heads.only(fap.number, value))
+        for point in imported.feature_points.keys() & fap.feature_points:
+            vertex = imported.feature_points[point]
+            assert shift[vertex, axis] == pytest.approx(wanted, rel=0.05)
 
 
 def test_open_jaw_moves_only_lower_teeth_and_tongue(imported: Head) -> None:
@@ -230,47 +222,31 @@ def exchange(rows: str, *names: str) -> str:
     return "".join(f"{name}\t{place}\n" for name, place in (places | shifted).items())
 
 
-def no_faces(folder: Path) -> Path:
-    (folder / "face.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n", encoding="utf-8")
-    return folder / "face.obj"
-
-
-def garbage(folder: Path) -> Path:
-    (folder / "face.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n")
-    return folder / "face.ply"
-
-
-def too_large(folder: Path) -> Path:
-    side = 260
-    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), [0.0]), -1).reshape(-1, 3)
-    return write_glb(folder / "face.glb", [Mesh("a", grid, np.array([[0, 1, side]]))])
-
-
-def no_coordinate(folder: Path) -> Path:
-    path = folder / "face.OBJ"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 7 8\n", encoding="utf-8")
-    return path
-
-
-def other_form(folder: Path) -> Path:
-    return folder / "face.fbx"
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+LARGE = "".join(f"v {n} {n % 2} 0\n" for n in range(65_538)) + "".join(
+    f"f {n} {n + 1} {n + 2}\n" for n in range(1, 65_538, 3)
+)
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("name", "text", "said"),
     [
-        (no_faces, "has no faces"),
-        (garbage, "is damaged or is not a mesh"),
-        (too_large, "67600 vertices; reduce it to at most 65535"),
-        (no_coordinate, "not a (mesh|valid vertex)"),
-        (other_form, "one of the formats .obj, .glb, .ply"),
-        (lambda folder: folder / "absent.obj", "no such file"),
+        ("no_faces.obj", TRIANGLE, "has no faces"),
+        ("garbage.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", "damaged or is not a mesh"),
+        ("large.obj", LARGE, "65538 vertices; reduce it to at most 65535"),
+        ("nameless.obj", TRIANGLE + "f 1 2 3\n", "points are missing"),
+        ("flat.OBJ", TRIANGLE + "f 1 2 3\nv 7 8\n", "not a (mesh|valid vertex)"),
+        ("face.fbx", "", "one of the formats .obj, .glb, .ply"),
+        ("", "", "no such file"),
     ],
 )
-def test_rejects_bad_meshes(tmp_path: Path, make: Callable[[Path], Path], said: str) -> None:
-    (tmp_path / "points.tsv").write_text("2.1 0\n", encoding="utf-8")
+def test_rejects_bad_meshes(tmp_path: Path, name: str, text: str, said: str) -> None:
+    mesh = tmp_path / (name or "absent.obj")
+    if name:
+        mesh.write_text(text)
+    (tmp_path / "points.tsv").write_text("2.1 0\n")
     with pytest.raises(UserError, match=said):
-        import_head(make(tmp_path), tmp_path / "points.tsv", tmp_path / "out.npz")
+        import_head(mesh, tmp_path / "points.tsv", tmp_path / "out.npz")
 
 
 def test_reports_joined_lips(original: Head, tmp_path: Path) -> None:
