@@ -15,15 +15,8 @@ from kouxing.shared.keys import Key
 def connect(control: str, *, key: Key | None = None, timeout_s: float = 10.0) -> Iterator[Client]:
     """Connect to control; on leaving, raise a ``KouxingError`` as a ``UserError``.
 
-    Parameters
-    ----------
-    control
-        Where control takes commands, as ``control_endpoint`` returns it: the address and, unless
-        nothing is encrypted, its public key.
-    key
-        Key of the client; None: the user's own key.
-    timeout_s
-        Time limit for an answer.
+    ``control`` is the address and, unless nothing is encrypted, control's public key, as
+    ``control_endpoint`` returns it. If ``key`` is None, it is the user's own key.
     """
     try:
         insecure = " " not in control

@@ -27,18 +27,8 @@ class ReliableSender:
         self._session = session
         self.epoch = epoch
         self._next = 1
-        self._unacknowledged: deque[Message] = deque()
+        self.unacknowledged: deque[Message] = deque()  # oldest first; their owner limits them
         self._progress_s = 0.0
-
-    @property
-    def unacknowledged(self) -> tuple[Message, ...]:
-        """The unacknowledged messages, oldest first."""
-        return tuple(self._unacknowledged)
-
-    @property
-    def backlog(self) -> int:
-        """Number of unacknowledged messages; their owner limits it."""
-        return len(self._unacknowledged)
 
     def send(self, message: Message, now_s: float) -> Message:
         """Send a message with the next number; return the numbered message."""
@@ -46,41 +36,34 @@ class ReliableSender:
             message, session=self._session, epoch=self.epoch, sequence=self._next
         )
         self._next += 1
-        if not self._unacknowledged:
+        if not self.unacknowledged:
             self._progress_s = now_s
-        self._unacknowledged.append(numbered)
+        self.unacknowledged.append(numbered)
         self._socket.send(numbered)
         return numbered
 
     def acknowledge(self, up_to: int, now_s: float) -> list[Message]:
         """Drop the messages up to a number, which the receiver has; return them."""
         acknowledged = []
-        while self._unacknowledged and self._unacknowledged[0].sequence <= up_to:
-            acknowledged.append(self._unacknowledged.popleft())
+        while self.unacknowledged and self.unacknowledged[0].sequence <= up_to:
+            acknowledged.append(self.unacknowledged.popleft())
             self._progress_s = now_s
         return acknowledged
 
     def tick(self, now_s: float) -> int:
         """Resend all messages if acknowledgements have stopped; return how many were resent."""
-        if not self._unacknowledged or now_s - self._progress_s < RESEND_AFTER_S:
+        if not self.unacknowledged or now_s - self._progress_s < RESEND_AFTER_S:
             return 0
         self._progress_s = now_s
-        for message in self._unacknowledged:
+        for message in self.unacknowledged:
             self._socket.send(message)
-        return len(self._unacknowledged)
+        return len(self.unacknowledged)
 
 
 class ReliableReceiver:
     """The receiving end for one session: each message once and in order.
 
-    Parameters
-    ----------
-    socket
-        ROUTER socket at which the messages arrive.
-    session
-        Name of the session.
-    make_acknowledgement
-        Returns an acknowledgement; the receiver sets its session, epoch and sequence number.
+    The receiver sets session, epoch and sequence number of what ``make_acknowledgement`` returns.
     """
 
     def __init__(
@@ -127,10 +110,10 @@ class ReliableReceiver:
         if self._peer is NO_PEER:
             return
         self._acknowledged = self._last
-        acknowledgement = dataclasses.replace(
+        answer = dataclasses.replace(
             self._make_acknowledgement(),
             session=self._session,
             epoch=self._epoch,
             sequence=self._last,
         )
-        self._socket.send(acknowledgement, to=self._peer)
+        self._socket.send(answer, to=self._peer)

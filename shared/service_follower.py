@@ -17,16 +17,8 @@ from kouxing.shared.wire.session import Joined
 class ServiceFollower(Follower):
     """Passes a session's messages to handlers; counts missed frames in the service's metrics.
 
-    Parameters
-    ----------
-    service
-        Reads the sockets.
-    session
-        Name of the session.
-    handlers
-        Functions by class of message; these classes are subscribed to.
-    live, on_complete, on_new_epoch
-        As for ``Follower``.
+    ``handlers`` has functions by class of message; these classes are subscribed to. The other
+    parameters are those of ``Follower``.
     """
 
     def __init__(

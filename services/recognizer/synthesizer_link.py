@@ -29,7 +29,7 @@ class SynthesizerLink:
     @property
     def backlog(self) -> int:
         """Number of messages that are not acknowledged yet."""
-        return self._sender.backlog if self._sender is not None else 0
+        return len(self._sender.unacknowledged) if self._sender is not None else 0
 
     def connect(self, socket: Socket, session: str, epoch: int, now_s: float) -> None:
         """Send to this synthesizer from now on, first what a new one needs."""

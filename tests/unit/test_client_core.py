@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from array import array
 from concurrent.futures import Future
 from typing import Any, cast
 
-import numpy as np
 import pytest
 from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Phone, Refused, Result
-from kouxing_client.audio import to_pcm
-from kouxing_client.audio_stream import ANSWER_S
+from kouxing_client.audio import ANSWER_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.messages import Joined
 from kouxing_client.session_core import (
@@ -106,33 +103,6 @@ def sequences(connection: FakeConnection) -> list[int]:
 def failure_of(future: Future[Any]) -> BaseException | None:
     assert future.done()
     return future.exception()
-
-
-FLOATS = [0.0, 0.5, -1.0, 2.0]
-INTEGERS = array("h", [0, 16384, -32767, 32767])
-
-
-@pytest.mark.parametrize(
-    "audio",
-    [
-        INTEGERS.tobytes(),
-        INTEGERS,
-        FLOATS,
-        array("f", FLOATS),
-        np.array(FLOATS),
-        np.array(FLOATS, np.float32).reshape(2, 2),
-        np.array(INTEGERS, np.int16)[::1],
-    ],
-    ids=lambda audio: type(audio).__name__,
-)
-def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
-    assert to_pcm(audio, "s16le") == INTEGERS.tobytes()
-
-
-def test_floats_stay_floats_on_a_wire_of_floats() -> None:
-    assert to_pcm(FLOATS, "f32le") == array("f", FLOATS).tobytes()
-    scaled = array("f", to_pcm(INTEGERS, "f32le"))
-    assert scaled == pytest.approx([0.0, 0.5, -1.0, 1.0], abs=1e-4)
 
 
 def test_names_of_shapes_are_those_of_the_product() -> None:

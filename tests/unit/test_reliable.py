@@ -70,7 +70,7 @@ def test_delivers_each_message_once_and_in_order(link: Link) -> None:
     link.deliver()
     assert link.received == [1, 2, 3, 4, 5]
     link.acknowledge()
-    assert link.sender.backlog == 0
+    assert not link.sender.unacknowledged
 
 
 def test_resends_lost_messages(link: Link) -> None:

@@ -172,7 +172,11 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str) -> None:
 def test_rejects_invalid_settings(
     tmp_path: Path, name: str, settings: dict[str, Any], said: str
 ) -> None:
-    used = {"size": (64, 48), "frame_rate_hz": 25.0, "sample_rate_hz": 16000} | settings
+    used: dict[str, Any] = {
+        "size": (64, 48),
+        "frame_rate_hz": 25.0,
+        "sample_rate_hz": 16000,
+    } | settings
     with pytest.raises(UserError, match=said):
         open_writer(tmp_path / name, **used)
     assert not list(tmp_path.iterdir())

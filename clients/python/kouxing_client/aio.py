@@ -18,8 +18,6 @@ from kouxing_client.base import (
 )
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
-from kouxing_client.session_core import Inbox, SessionCore
-from kouxing_client.thread import ClientThread
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -100,9 +98,7 @@ class AsyncClient(BaseClient):
 class AsyncSession(BaseSession):
     """One session; ``BaseSession`` describes what it does by itself."""
 
-    def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
-        super().__init__(thread, core, options)
-        self._signal = cast(AsyncSignal, core.signal)
+    _signal: AsyncSignal
 
     async def __aenter__(self) -> AsyncSession:
         return self
@@ -159,28 +155,25 @@ class AsyncSession(BaseSession):
 
     def events(self) -> AsyncResults[Event]:
         """Return control's events about the session, as ``Session.events``."""
-        inbox = self._read_events()
-        return AsyncResults(inbox, self._stop_events(inbox))
+        return AsyncResults(*self._read_events())
 
     async def _join(
         self, classes: tuple[type[Result], ...], shape_set: str = "", keep_all: bool = False
     ) -> AsyncResults[Any]:
-        subscription, joined = self._subscribe(classes, shape_set, keep_all)
+        inbox, close, joined = self._subscribe(classes, shape_set, keep_all)
         try:
             await asyncio.wait_for(asyncio.wrap_future(joined), self._thread.timeout_s)
         except TimeoutError:
             raise KouxingError(NOT_JOINED) from None
         if added := self._add_shapes(shape_set):
             await asyncio.wrap_future(added)
-        return AsyncResults(subscription.inbox, self._unsubscribe(subscription))
+        return AsyncResults(inbox, close)
 
 
 class AsyncResults(BaseResults, Generic[T]):
     """Results of one session; iteration ends with the session's last face."""
 
-    def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
-        super().__init__(inbox, close)
-        self._signal = cast(AsyncSignal, inbox.signal)
+    _signal: AsyncSignal
 
     def __aiter__(self) -> AsyncResults[T]:
         return self

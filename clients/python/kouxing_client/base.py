@@ -90,9 +90,12 @@ class BaseSession:
     Leaving the session as a context manager closes it.
     """
 
+    _signal: Any  # wakes what waits for the session
+
     def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
         self._thread = thread
         self._core = core
+        self._signal = core.signal
         self._options = options
         self._num_added = 0  # audio messages
         self._has_finished = False
@@ -106,8 +109,7 @@ class BaseSession:
     def info(self) -> Fields:
         """The fields of ``session-opened`` with the current epoch and endpoints.
 
-        Of a session that another program opened, only ``session``, ``epoch``, ``facts`` and the
-        endpoints are known.
+        Another program's session has only ``session``, ``epoch``, ``facts`` and the endpoints.
         """
         return {**self._core.endpoints, "epoch": self._core.epoch}
 
@@ -150,10 +152,8 @@ class BaseSession:
             If the session is over.
         """
         self._check_open()
-        errors = []
-        while self._core.errors:
-            errors.append(self._core.errors.popleft())
-        return errors
+        errors = self._core.errors
+        return [errors.popleft() for _ in range(len(errors))]
 
     def _num_frames(self, pcm: bytes) -> int:
         if self._options is None:
@@ -206,9 +206,9 @@ class BaseSession:
         shape_set: str,
         keep_all: bool,
         on_result: Callable[[Any], None] | None = None,
-    ) -> tuple[Subscription, Future[None]]:
-        """Start a subscription; the future is done once it is in effect."""
-        joined = new_future()
+    ) -> tuple[Inbox, Callable[[], None], Future[None]]:
+        """Start a subscription; return its inbox, how to close it, and when it is in effect."""
+        thread, core, joined = self._thread, self._core, new_future()
 
         def on_joined(failure: KouxingError | None) -> None:
             if failure is None:
@@ -216,18 +216,10 @@ class BaseSession:
             else:
                 joined.set_exception(failure)
 
-        is_limited = self._core.is_live and not keep_all
-        inbox = Inbox(self._thread.make_signal(), MAX_LIVE if is_limited else None)
-        subscription = Subscription(self._core, classes, shape_set, inbox, on_joined, on_result)
-        self._thread.call(lambda: self._core.subscribe(subscription))
-        return subscription, joined
-
-    def _unsubscribe(self, subscription: Subscription) -> Callable[[], None]:
-        return lambda: self._thread.call(lambda: self._core.unsubscribe(subscription))
-
-    def _stop_events(self, inbox: Inbox) -> Callable[[], None]:
-        core = self._thread.core
-        return lambda: self._thread.call(lambda: core.remove_inbox(self.name, inbox))
+        inbox = Inbox(thread.make_signal(), MAX_LIVE if core.is_live and not keep_all else None)
+        subscription = Subscription(core, classes, shape_set, inbox, on_joined, on_result)
+        thread.call(lambda: core.subscribe(subscription))
+        return inbox, lambda: thread.call(lambda: core.unsubscribe(subscription)), joined
 
     def _add_shapes(self, name: str) -> Future[Fields] | None:
         """Request a set of blend shapes, unless the session has it already."""
@@ -235,10 +227,12 @@ class BaseSession:
             return None
         return self._request("set-face", {"face": {"shapes": [name]}})
 
-    def _read_events(self) -> Inbox:
-        inbox = Inbox(self._thread.make_signal(), MAX_EVENTS)
-        self._thread.call(lambda: self._thread.core.add_inbox(self.name, inbox))
-        return inbox
+    def _read_events(self) -> tuple[Inbox, Callable[[], None]]:
+        """Return an inbox, and the function that closes it."""
+        thread, core = self._thread, self._thread.core
+        inbox = Inbox(thread.make_signal(), MAX_EVENTS)
+        thread.call(lambda: core.add_inbox(self.name, inbox))
+        return inbox, lambda: thread.call(lambda: core.remove_inbox(self.name, inbox))
 
     def _check(self) -> None:
         """Raise an error that has occurred since the last call."""
@@ -263,37 +257,29 @@ class BaseSession:
         stream = self._core.stream
         if stream is None:
             return 0
-        num_new = self._num_added - stream.sequence  # the thread has not taken them yet
-        return num_new + stream.num_unacknowledged
+        return self._num_added - stream.sequence + stream.num_unacknowledged  # new and sent ones
 
 
 class BaseResults:
-    """Results of one session, or its events."""
+    """Results of one session, or its events; after ``close()`` no more arrive."""
+
+    _signal: Any  # wakes what waits for results
 
     def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
         self._inbox = inbox
-        self._close = close
+        self._signal = inbox.signal
+        self.close = close
 
     @property
     def has_ended(self) -> bool:
         """Whether the session's last face has arrived, or the session is closed."""
         return self._inbox.is_over
 
-    def close(self) -> None:
-        """Receive no more results."""
-        self._close()
-
     def _has_news(self) -> bool:
         return self._inbox.is_over or bool(self._inbox.messages)
 
     def _take(self) -> Any:
-        """Return the next result; None if no result is left.
-
-        Raises
-        ------
-        KouxingError
-            If the session failed before its last face.
-        """
+        """Return the next result; None if no result is left."""
         if self._inbox.messages:
             return self._inbox.messages.popleft()
         if self._inbox.failure is not None:

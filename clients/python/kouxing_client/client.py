@@ -19,8 +19,6 @@ from kouxing_client.base import (
 )
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
-from kouxing_client.session_core import Inbox, SessionCore
-from kouxing_client.thread import ClientThread
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -80,7 +78,7 @@ class Client(BaseClient):
         name
             Session name. If empty, control chooses one.
         sample_rate_hz, num_channels
-            Format of the audio: 8000 to 48000 Hz, 1 or 2 channels.
+            8000 to 48000 Hz, 1 or 2 channels.
         encoding
             ``s16le`` or ``f32le``, of bytes that are pushed and on the wire.
         shapes
@@ -94,15 +92,10 @@ class Client(BaseClient):
         return Session(self._thread, core, fields)
 
     def follow(self, name: str = "", *, paced: bool = True) -> Session:
-        """Follow a session that another program opened.
+        """Follow a session that another program opened; if the name is empty, the newest one.
 
-        Parameters
-        ----------
-        name
-            Session name. If empty, the newest session.
-        paced
-            Whether old frames are dropped after this process was suspended, as is right for a face
-            that is shown live. If false, no result is dropped, however late it is.
+        If ``paced`` is set, old frames are dropped after this process was suspended, as is right
+        for a face that is shown live. Otherwise no result is dropped, however late it is.
         """
         core = self._thread.submit(lambda core: core.follow(name, is_live=paced)).result()
         return Session(self._thread, core, None)
@@ -123,9 +116,7 @@ class Client(BaseClient):
 class Session(BaseSession):
     """One session; ``BaseSession`` describes what it does by itself."""
 
-    def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
-        super().__init__(thread, core, options)
-        self._signal = cast(ThreadSignal, core.signal)
+    _signal: ThreadSignal
 
     def __enter__(self) -> Session:
         return self
@@ -203,8 +194,6 @@ class Session(BaseSession):
 
         Parameters
         ----------
-        classes
-            Classes of results, such as ``FapFrame`` and ``Phone``.
         shapes
             Name of the set of blend shapes, if the classes include ``Shapes``.
         keep_all
@@ -216,8 +205,7 @@ class Session(BaseSession):
 
     def events(self) -> Results[Event]:
         """Return control's events about the session from now on, even after it is closed."""
-        inbox = self._read_events()
-        return Results(inbox, self._stop_events(inbox))
+        return Results(*self._read_events())
 
     def _join(
         self,
@@ -226,22 +214,20 @@ class Session(BaseSession):
         keep_all: bool = False,
         on_result: Callable[[Any], None] | None = None,
     ) -> Results[Any]:
-        subscription, joined = self._subscribe(classes, shape_set, keep_all, on_result)
+        inbox, close, joined = self._subscribe(classes, shape_set, keep_all, on_result)
         try:
             joined.result(self._thread.timeout_s)
         except FutureTimeout:
             raise KouxingError(NOT_JOINED) from None
         if added := self._add_shapes(shape_set):
             added.result()
-        return Results(subscription.inbox, self._unsubscribe(subscription))
+        return Results(inbox, close)
 
 
 class Results(BaseResults, Generic[T]):
     """Results of one session; iteration ends with the session's last face."""
 
-    def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
-        super().__init__(inbox, close)
-        self._signal = cast(ThreadSignal, inbox.signal)
+    _signal: ThreadSignal
 
     def __iter__(self) -> Results[T]:
         return self
@@ -264,13 +250,7 @@ class Results(BaseResults, Generic[T]):
         return cast("T | None", self._take())
 
     def available(self, timeout_s: float = 0.0) -> Iterator[T]:
-        """Yield the results that have arrived, waiting up to the timeout for the first one.
-
-        Raises
-        ------
-        KouxingError
-            As ``get``.
-        """
+        """Yield the results that have arrived, waiting for the first one; raises as ``get``."""
         while (result := self.get(timeout_s)) is not None:
             yield result
             timeout_s = 0.0

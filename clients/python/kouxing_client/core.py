@@ -24,13 +24,7 @@ from kouxing_client.messages import (
     kind_of,
     topic,
 )
-from kouxing_client.session_core import (
-    SILENT_S,
-    Inbox,
-    SessionCore,
-    Signal,
-    refused,
-)
+from kouxing_client.session_core import SILENT_S, Inbox, SessionCore, Signal, refused
 
 if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
@@ -53,24 +47,11 @@ class _Request:
 class ClientCore:
     """Sends requests to control, and passes its messages to the sessions.
 
-    Parameters
-    ----------
-    sockets
-        The client's connections.
-    control
-        Address of control and, if traffic is encrypted, a space and its public key.
-    timeout_s
-        Time limit for an answer.
-    make_signal
-        Creates what wakes the threads that wait for a session.
+    The parameters are those of ``ClientThread``; ``control`` includes control's public key.
     """
 
     def __init__(
-        self,
-        sockets: Sockets,
-        control: str,
-        timeout_s: float,
-        make_signal: Callable[[], Signal],
+        self, sockets: Sockets, control: str, timeout_s: float, make_signal: Callable[[], Signal]
     ) -> None:
         self.sessions: list[SessionCore] = []
         self._sockets = sockets
@@ -183,14 +164,11 @@ class ClientCore:
         address, _, key = self._control.partition(" ")
         if not self._is_refused:
             return f"control at {address} does not answer. Start it with 'kouxing run'"
-        if not key:
-            return (
-                f"control at {address} refuses this client: insecure = true is set here, but not"
-                " there; or see control's log"
-            )
-        return (
-            f"control at {address} does not accept this key. If it runs on this machine, restart"
-            " it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here"
+        return f"control at {address} " + (
+            "does not accept this key. If it runs on this machine, restart it; otherwise run there"
+            " 'kouxing keys add NAME --role client' and copy the file here"
+            if key
+            else "refuses this client: insecure = true is set here, but not there; or see its log"
         )
 
     def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:
@@ -314,13 +292,18 @@ def forward_errors(future: Future[Any]) -> Iterator[None]:
         future.set_exception(error)
 
 
-def then(asked: Future[T], make: Callable[[T], U]) -> Future[U]:
-    """Return the future of what a function makes of an answer."""
-    made = new_future()
+def forward(asked: Future[T], make: Callable[[T], U], made: Future[U]) -> None:
+    """Set a future to what a function makes of an answer."""
 
-    def pass_on(answer: Future[T]) -> None:
+    def on_answer(answer: Future[T]) -> None:
         with forward_errors(made):
             made.set_result(make(answer.result()))
 
-    asked.add_done_callback(pass_on)
+    asked.add_done_callback(on_answer)
+
+
+def then(asked: Future[T], make: Callable[[T], U]) -> Future[U]:
+    """Return the future of what a function makes of an answer."""
+    made = new_future()
+    forward(asked, make, made)
     return made

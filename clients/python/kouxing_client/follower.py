@@ -14,10 +14,7 @@ KEEP_S = 3.0  # how long a connection that may be dead stays open for what TCP s
 CATCH_UP_S = 0.1  # after this process was suspended: time in which queued messages arrive
 MAX_OLD = 8  # how many of these live frames are kept
 END = "end-of-faps"
-_PUBLISHER_OF = {  # name of the endpoint by kind of message; all other kinds are at "phones"
-    "fap-frame": "faps",
-    END: "faps",
-}
+_PUBLISHER_OF = {"fap-frame": "faps", END: "faps"}  # endpoint; other kinds are at "phones"
 _Number = tuple[int, int]  # epoch and sequence, or media time and sequence
 _NONE = (-1, -1)
 
@@ -63,15 +60,9 @@ class Follower:
 
     Parameters
     ----------
-    transport
-        Opens connections, and passes messages on.
-    session
-        Name of the session.
     classes
         Classes of messages to subscribe to. They have the attribute ``kind``, and their instances
         ``epoch``, ``sequence`` and ``media_time``.
-    on_message
-        Called with each message.
     live
         Whether late frames are worthless. If so, only the newest ``MAX_OLD`` of the frames that
         queued while this process was suspended are passed on.
@@ -80,21 +71,6 @@ class Follower:
         each ``start``.
     on_new_epoch
         Called when the session continues in a new epoch, before the first message of that epoch.
-
-    Attributes
-    ----------
-    epoch
-        Highest epoch of any message or of the first ``start``; 0 if unknown.
-    is_complete
-        Whether every publisher has confirmed.
-    has_ended
-        Whether the last FAP frame has arrived; requires ``EndOfFaps`` among the classes.
-    num_missed
-        Published FAP frames that did not arrive, by gaps in their sequence numbers.
-    num_outdated
-        Messages that were dropped because their epoch is over.
-    received_at_s
-        When the last message or confirmation arrived.
     """
 
     def __init__(
@@ -109,11 +85,12 @@ class Follower:
         on_new_epoch: Callable[[], None] = lambda: None,
     ) -> None:
         self.session = session
-        self.epoch = 0
-        self.is_complete = False
-        self.has_ended = False
-        self.num_missed = self.num_outdated = 0
-        self.received_at_s = transport.now_s
+        self.epoch = 0  # highest epoch of any message or of the first start; 0 if unknown
+        self.is_complete = False  # every publisher has confirmed
+        self.has_ended = False  # the last FAP frame has arrived; needs EndOfFaps in the classes
+        self.num_missed = 0  # FAP frames, by gaps in their sequence numbers
+        self.num_outdated = 0  # messages that were dropped because their epoch is over
+        self.received_at_s = transport.now_s  # time of the last message or confirmation
         self._transport = transport
         self._classes = classes
         self._on_message = on_message
@@ -138,14 +115,9 @@ class Follower:
         self._held_frames: deque[Any] = deque(maxlen=MAX_OLD)
 
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
-        """Subscribe. When called again, subscribe where the session is published now.
+        """Subscribe to ``endpoints``; when called again, where the session is published now.
 
-        Parameters
-        ----------
-        epoch
-            Epoch when the session is first followed; 0 if unknown. Messages report later epochs.
-        endpoints
-            Addresses of the session's publishers, by name (``phones``, ``faps``).
+        The first ``epoch`` may be 0 if it is unknown. Messages report later epochs.
 
         Raises
         ------

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
-from kouxing_client.audio_stream import AudioStream
+from kouxing_client.audio import AudioStream
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.follower import Follower
 from kouxing_client.messages import (
@@ -38,20 +38,12 @@ class Signal(Protocol):
 
 
 class Inbox:
-    """Messages that wait for the program; any thread may use it.
-
-    Attributes
-    ----------
-    is_over
-        Whether no more messages arrive.
-    failure
-        Why; None if that was requested, or the session has ended.
-    """
+    """Messages that wait for the program; any thread may use it."""
 
     def __init__(self, signal: Signal, capacity: int | None) -> None:
         self.messages: deque[Any] = deque(maxlen=capacity)
-        self.is_over = False
-        self.failure: KouxingError | None = None
+        self.is_over = False  # no more messages arrive
+        self.failure: KouxingError | None = None  # why it ended too early
         self.signal = signal
 
     def add(self, message: Any) -> None:
@@ -70,18 +62,14 @@ class Subscription:
 
     Parameters
     ----------
-    session
-        The session.
-    classes
-        Results to subscribe to.
     shape_set
-        Name of the set of blend shapes, if ``classes`` has ``Shapes``; if empty, all sets.
+        Name of the set of blend shapes, if ``classes`` has ``Shapes``.
     inbox
-        Ends with the session.
+        Gets the results; ends with the session.
     on_joined
         Called once: with None when the subscription is in effect, with an error when it fails.
     on_result
-        Called with each result; None: ``inbox`` gets it.
+        Called with each result, in place of the inbox.
     """
 
     def __init__(
@@ -143,8 +131,6 @@ class SessionCore:
 
     Parameters
     ----------
-    sockets
-        The client's connections.
     opened
         Control's answer: ``session``, ``epoch``, and endpoints by name.
     options
@@ -186,12 +172,12 @@ class SessionCore:
 
     def connect(self) -> None:
         """Connect to the recognizer, if this client sends audio."""
-        if self.stream is not None:
-            if self._audio is not None:
-                self.sockets.close_connection(self._audio)
-            self._audio = self.sockets.connect(
-                self.endpoints["audio"], self._on_answer, queue=AUDIO_QUEUE
-            )
+        if self.stream is None:
+            return
+        if self._audio is not None:
+            self.sockets.close_connection(self._audio)
+        audio = self.endpoints["audio"]
+        self._audio = self.sockets.connect(audio, self._on_answer, queue=AUDIO_QUEUE)
 
     def add_audio(self, num_frames: int, fields: Fields) -> None:
         """Send a chunk of ``num_frames`` samples per channel."""

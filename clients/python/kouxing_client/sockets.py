@@ -23,11 +23,7 @@ RECONNECT_MS = (20, 50)  # first and longest pause between attempts to connect
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
 SUSPENDED_S = 0.5  # a wait that takes this much longer than requested: the process was suspended
-_MONITORED = (
-    zmq.EVENT_CONNECTED,
-    zmq.EVENT_HANDSHAKE_SUCCEEDED,
-    zmq.EVENT_CONNECT_RETRIED,
-)
+_MONITORED = zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CONNECT_RETRIED
 
 Connection = zmq.Socket[bytes]
 
@@ -38,22 +34,12 @@ class Sockets:
     Only ``call`` may be used by any thread. All other methods are for the thread that calls
     ``step``, and for the constructor's thread before that.
 
-    Parameters
-    ----------
-    key
-        The key of this program; None if nothing is encrypted.
-
-    Attributes
-    ----------
-    connect_ms
-        Limit for one attempt to connect, of sockets that are opened from now on.
-    resumed_at_s
-        When this process last resumed after a suspension; minus infinity before the first.
+    The key is this program's; None if nothing is encrypted.
     """
 
     def __init__(self, key: KeyPair | None) -> None:
-        self.connect_ms = CONNECT_MS
-        self.resumed_at_s = -math.inf
+        self.connect_ms = CONNECT_MS  # limit for one attempt, of sockets opened from now on
+        self.resumed_at_s = -math.inf  # when this process last resumed after a suspension
         self._key = key
         self._context = zmq.Context()
         self._poller = zmq.Poller()
@@ -98,18 +84,10 @@ class Sockets:
         queue: int = QUEUE,
         on_refused: Callable[[bool], None] | None = None,
     ) -> Connection:
-        """Connect to a ROUTER socket.
+        """Connect to a ROUTER socket, whose public key may follow its address after a space.
 
-        Parameters
-        ----------
-        endpoint
-            Address and, if traffic is encrypted, a space and the server's public key.
-        on_message
-            Called with the parts of each message.
-        queue
-            How many messages may wait.
-        on_refused
-            Called when an attempt to connect shows whether the server refuses this key.
+        ``on_message`` is called with the parts of each message, and ``on_refused`` when an attempt
+        to connect shows whether the server refuses this key.
 
         Raises
         ------
@@ -225,7 +203,7 @@ class Sockets:
 
     def _monitor(self, raw: Connection, on_refused: Callable[[bool], None]) -> None:
         """Report refusals: a server that refuses a key accepts the connection, then closes it."""
-        monitor = raw.get_monitor_socket(sum(_MONITORED))
+        monitor = raw.get_monitor_socket(_MONITORED)
         state = {"connected": False}
 
         def on_event(parts: list[bytes]) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-from kouxing_client.core import ClientCore, new_future
+from kouxing_client.core import ClientCore, forward, new_future
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import KeyPair
 from kouxing_client.session_core import SessionCore, Signal
@@ -24,7 +24,7 @@ class ClientThread:
     Parameters
     ----------
     control
-        Address of control, ``tcp://HOST:PORT``; its public key may follow after a space.
+        Address of control; its public key may follow after a space.
     key
         The key of this program; None if nothing is encrypted.
     timeout_s
@@ -63,17 +63,10 @@ class ClientThread:
 
     def submit(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
         """Let the thread call a function; return the future that this function returns."""
-        answer = new_future()
-
-        def pass_on(asked: Future[T]) -> None:
-            if error := asked.exception():
-                answer.set_exception(error)
-            else:
-                answer.set_result(asked.result())
-
         if not self.is_running:
             raise KouxingError("the client is closed")
-        self._sockets.call(lambda: function(self.core).add_done_callback(pass_on))
+        answer = new_future()
+        self._sockets.call(lambda: forward(function(self.core), lambda result: result, answer))
         return answer
 
     def forget(self, session: SessionCore) -> Future[None]:

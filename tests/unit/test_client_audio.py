@@ -1,9 +1,12 @@
-"""Which audio a client sends, sends again and forgets."""
+"""A client's audio: conversion to PCM; what it sends, resends and drops."""
 
 from __future__ import annotations
 
+from array import array
+
+import numpy as np
 import pytest
-from kouxing_client.audio_stream import NEAREST_MS, RESEND_S, AudioStream
+from kouxing_client.audio import NEAREST_MS, RESEND_S, AudioStream, to_pcm
 
 pytestmark = pytest.mark.unit
 CHUNK = 1600  # samples: 100 ms
@@ -90,3 +93,30 @@ def test_flushed_audio_is_not_sent_but_the_end_is() -> None:
     stream.flush()
     stream.move(2, 0.5)
     assert sent(stream) == [5]
+
+
+FLOATS = [0.0, 0.5, -1.0, 2.0]
+INTEGERS = array("h", [0, 16384, -32767, 32767])
+
+
+@pytest.mark.parametrize(
+    "audio",
+    [
+        INTEGERS.tobytes(),
+        INTEGERS,
+        FLOATS,
+        array("f", FLOATS),
+        np.array(FLOATS),
+        np.array(FLOATS, np.float32).reshape(2, 2),
+        np.array(INTEGERS, np.int16)[::1],
+    ],
+    ids=lambda audio: type(audio).__name__,
+)
+def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
+    assert to_pcm(audio, "s16le") == INTEGERS.tobytes()
+
+
+def test_floats_stay_floats_on_a_wire_of_floats() -> None:
+    assert to_pcm(FLOATS, "f32le") == array("f", FLOATS).tobytes()
+    scaled = array("f", to_pcm(INTEGERS, "f32le"))
+    assert scaled == pytest.approx([0.0, 0.5, -1.0, 1.0], abs=1e-4)
