@@ -1,12 +1,10 @@
 // <kouxing-face>: a GLB or VRM model that is moved by a session or by a recording.
 
 import * as THREE from "three";
-import { DrawRate } from "./page/draw-rate.js";
-import { ImageQueue, drawsInSoftware } from "./page/image-queue.js";
-import { NUM_FAPS } from "./page/messages.js";
-import { FapTrack, Playout } from "./page/playout.js";
+import { DrawRate, ImageQueue, drawsInSoftware } from "./page/draw-rate.js";
+import { Player } from "./page/player.js";
+import { FapTrack } from "./page/playout.js";
 import { Sound } from "./page/sound.js";
-import { StreamActivity } from "./page/stream-activity.js";
 import { loadAvatar } from "./avatar.js";
 import { readRecording } from "./recording.js";
 import { Viewer } from "./viewer.js";
@@ -27,13 +25,10 @@ export class KouxingFace extends HTMLElement {
   #avatar = null;
   #loadId = 0; // of the newest load
   #viewer = null;
-  #playout = new Playout();
-  #track = new FapTrack();
-  #activity = new StreamActivity();
   #sound = new Sound(() => {});
+  #player = new Player(this.#sound);
   #values = null; // shown values of the avatar's set
   #names = [];
-  #rest = null; // values at rest
   #recording = null; // { frames, names, nowS, onEnded }
   #drawnMs = 0;
   #animationFrame = 0;
@@ -145,33 +140,14 @@ export class KouxingFace extends HTMLElement {
     const [session, token] = ["session", "token"].map((name) => this.getAttribute(name) ?? "");
     const shapes = this.set === "faps" ? "" : this.set;
     const gateway = this.getAttribute("gateway") ?? location.origin;
-    const frame = (mediaTime, values) => {
-      const nowMs = performance.now();
-      if (this.#track.push(mediaTime, values)) this.#playout.frameArrived(nowMs, mediaTime);
-      this.#activity.frameArrived(nowMs);
-    };
-    const frameHandlers = shapes
-      ? {
-          weights: (mediaTime, weights, names) => {
-            this.#names = names;
-            frame(mediaTime, weights);
-          },
-          restWeights: (weights, names) => {
-            this.#names = names;
-            this.#rest = weights;
-          },
-        }
-      : { frame, rest: (values) => (this.#rest = values) };
     const handlers = {
-      ...frameHandlers,
-      sound: (mediaTime, samples) => {
-        const nowMs = performance.now();
-        this.#playout.soundArrived(nowMs, mediaTime, samples.length);
-        this.#sync(nowMs);
-        this.#sound.push(mediaTime, samples);
-      },
+      frame: (mediaTime, faps) => shapes || this.#player.addFrame(mediaTime, faps),
+      rest: (faps) => shapes || this.#setRest(faps, []),
+      weights: (mediaTime, weights) => this.#player.addFrame(mediaTime, weights),
+      restWeights: (weights, names) => this.#setRest(weights, names),
+      sound: (mediaTime, samples) => this.#player.addSound(mediaTime, samples),
       session: (message) => {
-        if (message.session !== null) this.#reset();
+        if (message.session !== null) this.#player.reset();
         this.dispatchEvent(new CustomEvent("session", { detail: message }));
       },
       phone: (message) => this.dispatchEvent(new CustomEvent("phone", { detail: message })),
@@ -184,44 +160,31 @@ export class KouxingFace extends HTMLElement {
     this.#viewer?.close();
     this.#viewer = null;
     this.#recording?.onEnded();
-    this.#recording = this.#rest = this.#values = null;
+    this.#recording = this.#values = null;
     this.#names = [];
-    this.#reset();
+    this.#player.reset();
   }
 
-  #reset() {
-    this.#playout.reset();
-    this.#track.reset();
+  /** Set the face at rest. The first one starts the player. */
+  #setRest(values, names) {
+    if (this.#values === null) {
+      this.#player = new Player(this.#sound, undefined, values.length);
+      this.#values = values;
+      this.#names = names;
+    }
+    this.#player.restFaps = values;
   }
 
   #draw(nowMs) {
     this.#animationFrame = requestAnimationFrame((nextMs) => this.#draw(nextMs));
-    this.#playout.imageDelayMs = this.#drawRate.visibleDelayMs;
-    this.#sync(nowMs);
+    this.#player.update(nowMs, this.#drawRate.visibleDelayMs); // also keeps the sound in sync
     if (this.#avatar === null || !this.#images.isDue(nowMs)) return;
     if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize();
     if (this.#recording) this.#poseRecording();
-    else this.#poseStream(nowMs);
+    else if (this.#viewer !== null && this.#values !== null) this.#show(this.#player.faps, this.#names);
     this.#avatar.update(Math.min(MAX_STEP_S, (nowMs - this.#drawnMs) / 1000));
     this.#drawnMs = nowMs;
     this.#images.draw(nowMs, () => this.#renderer.render(this.#scene, this.#camera));
-  }
-
-  /** Keep sound and image in sync. While the page is hidden, only arriving sound calls this. */
-  #sync(nowMs) {
-    this.#playout.isAudible = this.#sound.isPlaying;
-    this.#playout.outputLatencyMs = this.#sound.outputLatencyMs;
-    this.#playout.adjust(nowMs);
-    if (this.#playout.offsetMs !== null) this.#sound.align(nowMs, this.#playout.offsetMs);
-  }
-
-  #poseStream(nowMs) {
-    const mediaTime = this.#playout.mediaAt(nowMs + this.#playout.imageDelayMs); // when it is visible
-    const values = new Float32Array(this.#names.length || NUM_FAPS);
-    const isStreaming = mediaTime !== null && this.#track.sample(mediaTime, values) !== null;
-    const share = this.#activity.update(nowMs, isStreaming);
-    const rest = this.#rest;
-    if (isStreaming || rest) this.#show(isStreaming ? mix(rest ?? values, values, share) : rest, this.#names);
   }
 
   #poseRecording() {
@@ -255,10 +218,6 @@ export class KouxingFace extends HTMLElement {
     this.#camera.aspect = clientWidth / clientHeight;
     this.#camera.updateProjectionMatrix();
   }
-}
-
-function mix(rest, stream, share) {
-  return stream.map((value, i) => rest[i] + share * (value - rest[i]));
 }
 
 customElements.define("kouxing-face", KouxingFace);

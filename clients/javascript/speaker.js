@@ -1,6 +1,6 @@
 // Sends speech into a new session.
 
-import { socketUrl } from "./address.js";
+import { socketUrl } from "./viewer.js";
 
 const MESSAGE_BYTES = 32000;
 const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits

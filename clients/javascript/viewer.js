@@ -1,9 +1,22 @@
 // Receives the frames, sound and events of a session; see proto/GATEWAY.md.
 
-import { socketUrl } from "./address.js";
 import { ViewerSocket } from "./page/viewer-socket.js";
 
 const EVENTS = ["session", "phone", "syllable", "speech", "end", "error", "status", "lips"];
+
+/**
+ * Return the URL of one of the gateway's WebSockets.
+ *
+ * @param gateway address of the gateway, such as "http://localhost:8080"
+ * @param path "/viewer" or "/microphone"
+ * @param fields of the query; empty ones are left out
+ */
+export function socketUrl(gateway, path, fields) {
+  const url = new URL(path, gateway);
+  url.protocol = url.protocol.replace("http", "ws");
+  for (const [name, value] of Object.entries(fields)) if (value) url.searchParams.set(name, value);
+  return url.href;
+}
 
 /** Follows one session, or always the newest. Reconnects by itself until it is closed. */
 export class Viewer {

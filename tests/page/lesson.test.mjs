@@ -1,8 +1,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { curvePath, extent, figures, verdict } from "../../services/gateway/page/lip-curves.js";
-import { FaceRecording, LANDMARKS } from "../../services/gateway/page/face-recording.js";
-import { MouthProfileStore } from "../../services/gateway/page/mouth-profile.js";
+import { FaceRecording } from "../../services/gateway/page/face-recording.js";
 
 const RATE_HZ = 48000;
 const CHUNK = Int16Array.from({ length: 960 }, (_, i) => i);
@@ -58,15 +57,6 @@ test("times increase from the first sample on, even if clocks disagree", async (
   assert.deepEqual((await parse(recording)).times, [0.01, 0.03]);
 });
 
-test("images without a face are dropped", async () => {
-  const { header } = await parse(record({ seconds: 2, hasFace: (ms) => ms % 400 !== 0 }));
-  assert.equal(header.times, 45);
-});
-
-test("a recording of 40 seconds fits the gateway's limit", () => {
-  assert.ok(record({ seconds: 43 }).encode().size < 8 * 1024 * 1024);
-});
-
 test("the reader is advised when the face is missing or the sound is too quiet", () => {
   const good = record({ seconds: 6 });
   assert.equal(good.advice(7000), null);
@@ -81,10 +71,6 @@ test("a recording without a face or a voice has a problem", () => {
   assert.equal(record({ seconds: 6, rms: 0.001 }).problem(), "tooQuiet");
   assert.equal(new FaceRecording(RATE_HZ).problem(), "noFace");
   assert.equal(record({ seconds: 6, everyMs: 120 }).problem(), "tooSlow");
-});
-
-test("landmarks are unique and sorted", () => {
-  assert.deepEqual(LANDMARKS, [...new Set(LANDMARKS)].sort((a, b) => a - b));
 });
 
 test("a curve is scaled to its box and has gaps at missing values", () => {
@@ -108,33 +94,4 @@ test("figures are summed up by a verdict", () => {
   assert.equal(verdict(withOpening(0.4)), "lessonWorse");
   const poor = { opening: 0.1, width: 0.1, jaw: 0 };
   assert.equal(verdict({ before: poor, after: { ...poor, opening: 0.3 } }), "lessonWorse");
-});
-
-class FakeStorage {
-  items = new Map();
-  getItem(key) { return this.items.get(key) ?? null; }
-  setItem(key, text) { this.items.set(key, text); }
-  removeItem(key) { this.items.delete(key); }
-}
-
-test("a mouth profile is stored until it is deleted", () => {
-  const storage = new FakeStorage();
-  const learned = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
-  new MouthProfileStore(storage).keep(learned);
-  const later = new MouthProfileStore(storage);
-  assert.deepEqual(later.current, learned);
-  later.forget();
-  assert.equal(later.current, null);
-  assert.equal(new MouthProfileStore(storage).current, null);
-});
-
-test("a mouth profile needs no storage, and invalid content is ignored", () => {
-  const now = new MouthProfileStore(null);
-  now.keep({ profile: "YWJj" });
-  assert.equal(now.current.profile, "YWJj");
-  for (const text of ["{", "1", '{"profile": 5}', '{"profile": ""}']) {
-    const storage = new FakeStorage();
-    storage.getItem = () => text;
-    assert.equal(new MouthProfileStore(storage).current, null);
-  }
 });

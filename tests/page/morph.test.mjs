@@ -67,9 +67,3 @@ test("only the normals of moved triangles rotate", () => {
   assert.deepEqual([...normal.slice(9)], [0, 0, 1, 0, 0, 1, 0, 0, 1]);
 });
 
-test("three.js gets no morph targets", () => {
-  const mesh = twoTriangles();
-  new MorphedMesh(mesh, [JAW, { name: "absent", number: 4, unitsPerWeight: 1 }]);
-  assert.deepEqual(mesh.geometry.morphAttributes, {});
-  assert.equal(mesh.morphTargetInfluences, undefined);
-});

@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import test from "node:test";
 import { languageFor, say, setLanguage } from "../../services/gateway/page/language.js";
-import { Preferences } from "../../services/gateway/page/preferences.js";
+import { MouthProfileStore, Preferences } from "../../services/gateway/page/storage.js";
 import { TEXTS } from "../../services/gateway/page/texts.js";
 
 const PAGE = new URL("../../services/gateway/page/", import.meta.url);
@@ -66,5 +66,27 @@ test("every text that the page uses exists, and every text is used", () => {
   }
   for (const key of Object.keys(TEXTS)) {
     assert.ok(key.includes(".") || source.includes(`"${key}"`), `${key} is not used`);
+  }
+});
+
+test("a mouth profile is stored until it is deleted", () => {
+  const storage = new FakeStorage();
+  const learned = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
+  new MouthProfileStore(storage).keep(learned);
+  const later = new MouthProfileStore(storage);
+  assert.deepEqual(later.current, learned);
+  later.keep(null);
+  assert.equal(later.current, null);
+  assert.equal(new MouthProfileStore(storage).current, null);
+});
+
+test("a mouth profile needs no storage, and invalid content is ignored", () => {
+  const now = new MouthProfileStore(null);
+  now.keep({ profile: "YWJj" });
+  assert.equal(now.current.profile, "YWJj");
+  for (const text of ["{", "1", '{"profile": 5}', '{"profile": ""}']) {
+    const storage = new FakeStorage();
+    storage.items["kouxing.voice"] = text;
+    assert.equal(new MouthProfileStore(storage).current, null);
   }
 });

@@ -1,9 +1,11 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { LevelMeter, rms, SILENT_DB } from "../../services/gateway/page/level.js";
-import { PhoneTrack } from "../../services/gateway/page/phones.js";
+import { LevelMeter, SILENT_DB } from "../../services/gateway/page/level.js";
+import { PhoneTrack } from "../../services/gateway/page/caption.js";
 import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
+import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 import {
+  GatewayState,
   delayText,
   drawingText,
   errorText,
@@ -29,31 +31,11 @@ test("the phone at a media time is shown with the phones before it", () => {
   assert.deepEqual(phones.at(3300), { current: "i", past: ["·", "n"] });
 });
 
-test("a phone can be revised", () => {
-  const phones = track("n", "i");
-  phones.add({ index: 1, symbol: "v", media_time: 1600, duration: 800 });
-  assert.deepEqual(phones.at(1700), { current: "v", past: ["n"] });
-});
-
 test("a phone can be removed", () => {
   const phones = track("n", "i", "u");
   phones.add({ index: 1, symbol: "sil", media_time: 1600, duration: 0, final: true });
   phones.add({ index: 9, symbol: "sil", media_time: 1600, duration: 0, final: true });
   assert.deepEqual(phones.at(3300), { current: "u", past: ["n"] });
-});
-
-test("the last phone is shown for some seconds", () => {
-  const phones = track("n", "i");
-  assert.equal(phones.at(3200 + 8 * 16000).current, "i");
-  assert.deepEqual(phones.at(3201 + 8 * 16000), { current: "", past: ["n", "i"] });
-});
-
-test("only the newest phones are kept and shown", () => {
-  const phones = track(...Array.from({ length: 200 }, (_, i) => `p${i}`));
-  const { current, past } = phones.at(199 * 1600);
-  assert.equal(current, "p199");
-  assert.deepEqual(past, ["p191", "p192", "p193", "p194", "p195", "p196", "p197", "p198"]);
-  assert.deepEqual(phones.at(99 * 1600).past, []);
 });
 
 test("the level is that of the sound that is audible", () => {
@@ -64,19 +46,6 @@ test("the level is that of the sound that is audible", () => {
   meter.advance(320, true);
   assert.ok(Math.abs(meter.nextDecibels() + 6.02) < 0.01);
   assert.ok(meter.nextDecibels() < -6.9, "it falls");
-});
-
-test("sound that is not shown does not change the level", () => {
-  const meter = new LevelMeter();
-  meter.push(0, Int16Array.of(16384));
-  meter.advance(0, false);
-  assert.equal(meter.nextDecibels(), SILENT_DB);
-  meter.raise(1);
-  assert.ok(Math.abs(meter.nextDecibels()) < 0.01);
-});
-
-test("the root mean square of full scale is 1", () => {
-  assert.equal(rms(Int16Array.of(-32768, -32768)), 1);
 });
 
 test("the face fades in with frames and fades to rest when they stall", () => {
@@ -161,4 +130,45 @@ test("reduced quality and the head's rotation are described", () => {
   assert.equal(turnText({ left: 0.2, up: -0.3 }), "from the front");
   assert.equal(turnText({ left: -20, up: 10 }), "turned 20° to the right, 10° up");
   assert.equal(turnText({ left: 69, up: -9.8 }), "turned 69° to the left, 10° down");
+});
+
+const SESSION = { session: "one", epoch: 1, sample: false, lips: "learnt" };
+
+test("a greater epoch of the same session is a restart", () => {
+  const state = new GatewayState();
+  assert.deepEqual(state.setSession(SESSION), { isOther: true, isRestart: false });
+  assert.deepEqual(state.setSession({ ...SESSION, epoch: 2 }), { isOther: false, isRestart: true });
+  assert.deepEqual(state.setSession({ ...SESSION, session: "two" }), { isOther: true, isRestart: false });
+});
+
+test("the lips of a session that has ended stay known", () => {
+  const state = new GatewayState();
+  state.setSession(SESSION);
+  state.setSession({ session: null, epoch: 0, sample: false, lips: "" });
+  assert.deepEqual([state.session, state.lips], [null, "learnt"]);
+});
+
+test("a failed first connection counts as refused", () => {
+  const state = new GatewayState();
+  state.setConnected(false);
+  assert.deepEqual([state.isRefused, state.wasConnected], [true, false]);
+  state.setConnected(true);
+  state.setSession(SESSION);
+  state.setConnected(false);
+  assert.deepEqual([state.isRefused, state.wasConnected, state.session], [false, true, null]);
+});
+
+test("the state of a sender is its contents and rate, or its problem", () => {
+  const sender = { contents: "VRM shapes", rate_hz: 49.8, delay_ms: 0, problem: "" };
+  assert.equal(senderText(sender), "VRM shapes, 50 frames/s");
+  assert.equal(senderText({ ...sender, delay_ms: 90 }), "VRM shapes, 50 frames/s, delayed 90 ms");
+  assert.equal(senderText({ ...sender, problem: "no program is listening" }), "no program is listening");
+});
+
+test("a sender is out of sync if its delay differs from that of the sound", () => {
+  const [now, later] = [{ delay_ms: 0 }, { delay_ms: 90 }];
+  assert.equal(isOutOfSync([now], null), false);
+  assert.equal(isOutOfSync([], 90), false);
+  assert.equal(isOutOfSync([later], 100), false);
+  assert.equal(isOutOfSync([later, now], 90), true);
 });

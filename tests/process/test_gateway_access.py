@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import socket
 import ssl
 import stat
 import subprocess
-import sys
 from collections.abc import Iterator
 from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
@@ -18,9 +16,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.process.gateway_system import wait_until
+from tests.process.gateway_system import spawn, wait_until
 from tests.scripted_system import Gateway
-from tests.system import ROOT, free_port
+from tests.system import free_port
 
 pytestmark = pytest.mark.process
 
@@ -103,8 +101,6 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         ("viewer?shapes=vrm&format=xml", UPGRADE, 400),
         ("..%2Fservice.py", {}, 404),
         ("package.json", {}, 404),
-        ("tests%2Fplayout.test.js", {}, 404),
-        ("tests/playout.test.js", {}, 404),
         ("modules/three/build/..%2Fpackage.json", {}, 404),
         ("modules/face_mesh/package.json", {}, 404),
         ("modules/face_mesh/..%2F..%2Fthree%2Fpackage.json", {}, 404),
@@ -216,13 +212,7 @@ def test_only_the_owner_can_read_the_certificate(public: Site) -> None:
 
 def gateway_process(**settings: str) -> subprocess.Popen[str]:
     names = {f"KOUXING_{name.upper()}": value for name, value in settings.items()}
-    return subprocess.Popen(
-        [sys.executable, "-m", "kouxing.services.gateway"],
-        cwd=ROOT,
-        env={**os.environ, "KOUXING_CONTROL": NO_CONTROL, "KOUXING_GATEWAY_PORT": "0", **names},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return spawn(KOUXING_CONTROL=NO_CONTROL, KOUXING_INSECURE="0", **names)
 
 
 def test_plain_http_for_a_proxy_creates_and_prints_a_token() -> None:

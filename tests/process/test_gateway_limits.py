@@ -115,13 +115,6 @@ async def test_closes_connections_without_a_request(
 
 
 @async_test
-async def test_closes_idle_connections_after_a_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
-        reader = await served.connect(b"GET / HTTP/1.1\r\nHost: a\r\n\r\nGET / HT")
-        assert (await read_to_end(reader)).endswith(b"here")
-
-
-@async_test
 async def test_ends_slow_answers_except_on_unlimited_paths(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

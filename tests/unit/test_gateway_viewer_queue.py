@@ -23,18 +23,6 @@ def drain(viewer_queue: ViewerQueue) -> list[str | bytes]:
     return asyncio.run(take_all())
 
 
-def test_keeps_the_order_of_messages() -> None:
-    queue = ViewerQueue()
-    num_dropped = [
-        queue.put(MessageKind.TEXT, "session"),
-        queue.put(MessageKind.SOUND, b"s"),
-        queue.put(MessageKind.FRAME, b"f"),
-    ]
-
-    assert drain(queue) == ["session", b"s", b"f"]
-    assert num_dropped == [0, 0, 0]
-
-
 def test_drops_sound_and_old_frames_but_not_text() -> None:
     queue = ViewerQueue()
     queue.put(MessageKind.TEXT, "session")

@@ -1,6 +1,10 @@
-// Captures a stream's audio in chunks, with an audio worklet.
+// Captures the audio of a microphone or a file in chunks, with an audio worklet.
+
+import { UserError, say } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
+const MAX_FILE_BYTES = 200 << 20;
+const MAX_FILE_S = 3600;
 
 /** Return an audio context with a sample rate of at most 48 kHz. */
 export async function openCaptureContext() {
@@ -29,4 +33,30 @@ export function capture(context, stream, onChunk) {
     onChunk(chunk, rms, performance.now() - (Date.now() - recordedMs));
   context.createMediaStreamSource(stream).connect(node);
   context.resume();
+}
+
+/**
+ * Return { stream, play(onEnded) } for a sound file or the sound of a video.
+ *
+ * @throws {UserError} if the file is too large, too long or cannot be decoded
+ */
+export async function openFileSpeech(context, file) {
+  if (file.size > MAX_FILE_BYTES) throw new UserError(say("fileTooLarge"));
+  let buffer;
+  try {
+    buffer = await context.decodeAudioData(await file.arrayBuffer());
+  } catch {
+    throw new UserError(say("fileUnreadable", { file: file.name }));
+  }
+  if (buffer.duration > MAX_FILE_S) throw new UserError(say("fileTooLong"));
+  const source = new AudioBufferSourceNode(context, { buffer });
+  const destination = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });
+  source.connect(destination);
+  return {
+    stream: destination.stream,
+    play(onEnded) {
+      source.onended = onEnded;
+      source.start();
+    },
+  };
 }

@@ -1,5 +1,5 @@
-// How often and with how many pixels the head is drawn, so that a slow machine keeps up. Time is
-// injected.
+// How often and with how many pixels the head is drawn, so that a slow machine keeps up. Images are drawn
+// one after another: the next one starts when the last one is done.
 
 import { SlidingWindow } from "./sliding-window.js";
 
@@ -12,10 +12,13 @@ const MAX_DELAY_MS = 1000; // after a longer delay the page was hidden
 const WINDOW_MS = 2000; // over which delays are measured
 const TOLERANCE_MS = 8; // half a tick of the display; an image starts later than its tick
 const PERIOD_MS = 50; // 20 images per second
+const POLL_MS = 2; // interval of checking whether an image is done
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const MIN_REST_MS = 10;
 const SLOW_MS = 36; // images that take longer get fewer pixels
 const FAST_MS = 16; // images that take less time get more pixels
 
+/** Decides when to draw and with how many pixels. Time is injected. */
 export class DrawRate {
   imageMs = 0; // duration of drawing, mean since the ratio changed
   visibleDelayMs = 0; // from a face to the middle of the time for which it is visible, median
@@ -68,5 +71,71 @@ export class DrawRate {
     if (visibleMs - faceMs > MAX_DELAY_MS) return;
     this.#delays.add(visibleMs, visibleMs - faceMs + this.#shownMs / 2);
     this.visibleDelayMs = this.#delays.percentile(0.5);
+  }
+}
+
+/** Return whether the processor draws instead of a graphics card. */
+export function drawsInSoftware(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  return SOFTWARE.test(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+}
+
+export class ImageQueue {
+  numDrawn = 0;
+  #gl;
+  #drawRate;
+  #isDrawing = false;
+
+  /** @param gl a WebGL 2 context; @param {DrawRate} drawRate decides how often to draw */
+  constructor(gl, drawRate) {
+    this.#gl = gl;
+    this.#drawRate = drawRate;
+  }
+
+  /**
+   * Whether it is time for an image and the last one is done. A slow machine must draw fewer images
+   * instead of a queue of late ones that block the page.
+   */
+  isDue(nowMs) {
+    return !this.#isDrawing && this.#drawRate.isDue(nowMs);
+  }
+
+  /**
+   * Draw an image.
+   *
+   * @param nowMs time of its face
+   * @param render function that draws it
+   * @param onVisible called with the time at which it becomes visible, ms
+   */
+  draw(nowMs, render, onVisible = () => {}) {
+    this.#isDrawing = true;
+    const startMs = performance.now();
+    render();
+    this.#whenDone(() => {
+      this.#isDrawing = false;
+      this.numDrawn++;
+      const doneMs = performance.now();
+      this.#drawRate.recordDrawn(startMs, doneMs);
+      requestAnimationFrame((tickMs) => {
+        const visibleMs = Math.max(tickMs, doneMs); // a busy page gets a tick late
+        this.#drawRate.recordVisible(nowMs, visibleMs);
+        onVisible(visibleMs);
+      });
+    });
+  }
+
+  #whenDone(callback) {
+    const gl = this.#gl;
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const poll = () => {
+      if (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) {
+        setTimeout(poll, POLL_MS);
+      } else {
+        gl.deleteSync(fence);
+        callback();
+      }
+    };
+    setTimeout(poll);
   }
 }

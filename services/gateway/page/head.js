@@ -3,9 +3,7 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
-import { coarsen } from "./coarse-mesh.js";
-import { DrawRate } from "./draw-rate.js";
-import { ImageQueue, drawsInSoftware } from "./image-queue.js";
+import { DrawRate, ImageQueue, drawsInSoftware } from "./draw-rate.js";
 import { findJoints, rotateJoints } from "./joints.js";
 import {
   physicalMaterial,
@@ -224,4 +222,24 @@ export class Head {
     this.#renderer.setPixelRatio(this.#drawRate.ratio);
     this.#renderer.setSize(width, height, false);
   }
+}
+
+/** Replace the triangles by the coarser ones in the file, for drawing without a graphics card. */
+async function coarsen(gltf) {
+  const meshes = [];
+  gltf.scene.traverse((node) => {
+    if (node.userData.coarse !== undefined) meshes.push(node);
+  });
+  for (const { geometry, userData } of meshes) {
+    const index = await gltf.parser.getDependency("accessor", userData.coarse);
+    const count = 1 + index.array.reduce((max, vertex) => Math.max(max, vertex), 0);
+    geometry.setIndex(index); // it uses only the first `count` vertices
+    const { attributes, morphAttributes } = geometry;
+    for (const name in attributes) attributes[name] = truncate(attributes[name], count);
+    morphAttributes.position = morphAttributes.position?.map((target) => truncate(target, count));
+  }
+}
+
+function truncate({ array, itemSize, normalized }, count) {
+  return new THREE.BufferAttribute(array.subarray(0, count * itemSize), itemSize, normalized);
 }

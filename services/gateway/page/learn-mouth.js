@@ -8,7 +8,7 @@ import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
 import { UserError, say } from "./language.js";
 import { curvePath, extent, figures, verdict } from "./lip-curves.js";
-import { READING_TEXTS } from "./reading-texts.js";
+import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
@@ -44,8 +44,8 @@ export class MouthLesson {
       "lesson-finish": () => this.#finish(),
       "lesson-resend": () => this.#learn(),
       "lesson-again": () => this.#record(),
-      "lesson-keep": () => this.#keep(),
-      "lesson-forget": () => this.#forget(),
+      "lesson-keep": () => this.#keep(this.#learned),
+      "lesson-forget": () => this.#keep(null),
     })) {
       element(id).onclick = act;
     }
@@ -234,14 +234,8 @@ export class MouthLesson {
     this.#show("result");
   }
 
-  #keep() {
-    this.#profiles.keep(this.#learned);
-    this.#handlers.profileChanged();
-    dialog.close();
-  }
-
-  #forget() {
-    this.#profiles.forget();
+  #keep(profile) {
+    this.#profiles.keep(profile);
     this.#handlers.profileChanged();
     dialog.close();
   }

@@ -3,21 +3,17 @@
 import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
-import { GatewayState } from "./gateway-state.js";
 import { say } from "./language.js";
 import { MouthLesson } from "./learn-mouth.js";
 import { LevelMeter } from "./level.js";
-import { MouthProfileStore } from "./mouth-profile.js";
-import { Notice } from "./notice.js";
 import { Player } from "./player.js";
-import { Preferences } from "./preferences.js";
 import { SendersPanel } from "./senders-panel.js";
 import { Settings } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
-import { StatusBar, showLevel } from "./status-bar.js";
-import { errorText } from "./status.js";
+import { GatewayState, Notice, StatusBar, errorText, showLevel } from "./status.js";
+import { MouthProfileStore, Preferences } from "./storage.js";
 import { ViewerSocket } from "./viewer-socket.js";
 
 const STATUS_INTERVAL_MS = 250;
@@ -79,7 +75,7 @@ const socket = new ViewerSocket(
       player.addSound(mediaTime, samples);
       meter.push(mediaTime, samples);
     },
-    rest: (values) => player.setRest(values),
+    rest: (values) => (player.restFaps = values),
     text: handleMessage,
   },
 );

@@ -2,8 +2,7 @@
 
 import { socketUrl } from "./address.js";
 import { AudioUplink } from "./audio-uplink.js";
-import { capture, openCaptureContext } from "./capture.js";
-import { openFileSpeech } from "./file-speech.js";
+import { capture, openCaptureContext, openFileSpeech } from "./capture.js";
 import { UserError, say } from "./language.js";
 
 const RETRY_MS = 500;

@@ -9,12 +9,12 @@ const DELAY_WINDOW_MS = 2000;
 
 export class Player {
   playout = new Playout();
-  faps = new Float32Array(NUM_FAPS); // the face that is shown
+  faps; // the face that is shown
+  restFaps; // shown while no session moves the face
   numFrames = 0; // received
   #track = new FapTrack();
   #activity = new StreamActivity();
-  #streamFaps = new Float32Array(NUM_FAPS);
-  #restFaps = new Float32Array(NUM_FAPS);
+  #streamFaps;
   #imageDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to the image
   #frameDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to its frame
   #sound;
@@ -24,10 +24,14 @@ export class Player {
    * @param {Sound} sound plays the session's sound
    * @param voiceAgeMs (nowMs, mediaTime): how long ago this browser's user spoke, ms; null if the
    *   session is not the user's
+   * @param numValues of a face; other than 68 for blend shapes
    */
-  constructor(sound, voiceAgeMs) {
+  constructor(sound, voiceAgeMs = () => null, numValues = NUM_FAPS) {
     this.#sound = sound;
     this.#voiceAgeMs = voiceAgeMs;
+    this.faps = new Float32Array(numValues);
+    this.restFaps = new Float32Array(numValues);
+    this.#streamFaps = new Float32Array(numValues);
   }
 
   /** Start again with another session or epoch. */
@@ -52,11 +56,6 @@ export class Player {
     this.#sync(nowMs); // nothing else calls it while the page is hidden
     this.#activity.soundArrived(nowMs);
     this.#sound.push(mediaTime, samples);
-  }
-
-  /** Set the face that is shown while no session moves it. */
-  setRest(faps) {
-    this.#restFaps = faps;
   }
 
   isLive(nowMs) {
@@ -86,14 +85,12 @@ export class Player {
 
   /** Median delay from the user's voice to the image, ms; null while unknown. */
   get voiceToImageMs() {
-    this.#imageDelays.dropOld(performance.now());
-    return this.#imageDelays.percentile(0.5);
+    return this.#imageDelays.medianAt(performance.now());
   }
 
   /** Median delay from the user's voice to the arrival of its frame, ms; null while unknown. */
   get voiceToFrameMs() {
-    this.#frameDelays.dropOld(performance.now());
-    return this.#frameDelays.percentile(0.5);
+    return this.#frameDelays.medianAt(performance.now());
   }
 
   /** How much later than its image sound is audible, ms; null without sound. */
@@ -116,9 +113,9 @@ export class Player {
 
   /** Mix the stream's face with the face at rest; return whether the result has changed. */
   #mix(share) {
-    const [faps, stream, rest] = [this.faps, this.#streamFaps, this.#restFaps];
+    const [faps, stream, rest] = [this.faps, this.#streamFaps, this.restFaps];
     let hasChanged = false;
-    for (let i = 0; i < NUM_FAPS; i++) {
+    for (let i = 0; i < faps.length; i++) {
       const value = Math.fround(rest[i] + share * (stream[i] - rest[i]));
       hasChanged ||= value !== faps[i];
       faps[i] = value;

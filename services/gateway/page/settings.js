@@ -20,6 +20,8 @@ export class Settings {
   constructor(preferences, offers, handlers) {
     this.#preferences = preferences;
     this.#offers = offers;
+    const order = Object.keys(TEXTS);
+    offers.heads.sort((a, b) => order.indexOf(`head.${a}`) - order.indexOf(`head.${b}`));
     for (const [name, title] of Object.entries(offers.lips)) TEXTS[`lips.${name}`] = title;
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);

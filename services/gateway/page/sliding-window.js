@@ -15,10 +15,10 @@ export class SlidingWindow {
 
   add(nowMs, value) {
     this.#entries.push([nowMs, value]);
-    this.dropOld(nowMs);
+    this.#dropOld(nowMs);
   }
 
-  dropOld(nowMs) {
+  #dropOld(nowMs) {
     while (this.#entries[0]?.[0] < nowMs - this.#windowMs) this.#entries.shift();
   }
 
@@ -34,6 +34,12 @@ export class SlidingWindow {
   maxSince(sinceMs) {
     const values = this.#entries.filter((entry) => entry[0] > sinceMs).map((entry) => entry[1]);
     return values.length ? Math.max(...values) : Infinity;
+  }
+
+  /** Return the median of the values that are not too old at a time; null without values. */
+  medianAt(nowMs) {
+    this.#dropOld(nowMs);
+    return this.percentile(0.5);
   }
 
   /** Return a percentile, given as a fraction from 0 to 1; null without values. */

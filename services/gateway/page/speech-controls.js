@@ -21,10 +21,7 @@ export class SpeechControls {
     this.#sound = sound;
     this.#handlers = handlers;
     this.#microphone = new Microphone({
-      mouthProfile: handlers.mouthProfile,
-      lips: handlers.lips,
-      level: handlers.level,
-      error: handlers.error,
+      ...handlers,
       state: (state) => this.#onState(state),
       session: (name) => this.#onSession(name),
     });

@@ -4,8 +4,11 @@ import { element, setText } from "./elements.js";
 import { Head } from "./head.js";
 import { UserError, say } from "./language.js";
 import { drawingText, turnText } from "./status.js";
-import { BACKGROUND, VideoRecorder } from "./video.js";
 
+const BACKGROUND = "#e9e8ea"; // the page's own background is not on the canvas
+const VIDEO_RATE_HZ = 30;
+// The first type that the browser supports is used.
+const VIDEO_TYPES = ["video/mp4;codecs=avc1.42E01F,mp4a.40.2", "video/mp4", "video/webm"];
 const TURN_DEGREES = {
   ArrowLeft: [10, 0],
   ArrowRight: [-10, 0],
@@ -13,6 +16,41 @@ const TURN_DEGREES = {
   ArrowDown: [0, -10],
   Home: [], // to the front
 };
+
+/** Records the canvas and the sound with the browser's recorder. The video is saved as a download. */
+class VideoRecorder {
+  #recorder = null;
+
+  get isRecording() {
+    return this.#recorder !== null;
+  }
+
+  /** Start recording a canvas and an audio stream. */
+  start(canvas, sound) {
+    const mimeType = VIDEO_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
+    const tracks = [...canvas.captureStream(VIDEO_RATE_HZ).getTracks(), ...sound.getTracks()];
+    this.#recorder = new MediaRecorder(new MediaStream(tracks), { mimeType });
+    const chunks = [];
+    this.#recorder.ondataavailable = ({ data }) => chunks.push(data);
+    this.#recorder.onstop = () => save(new Blob(chunks, { type: mimeType }));
+    this.#recorder.start(1000);
+  }
+
+  /** Stop recording and save the video. */
+  stop() {
+    this.#recorder.stop();
+    this.#recorder = null;
+  }
+}
+
+function save(video) {
+  const link = document.createElement("a");
+  const suffix = video.type.startsWith("video/mp4") ? "mp4" : "webm";
+  link.download = `kouxing-${new Date().toISOString().slice(0, 19).replaceAll(":", "-")}.${suffix}`;
+  link.href = URL.createObjectURL(video);
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+}
 
 export class Stage {
   #head = null; // until it is loaded

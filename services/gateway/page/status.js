@@ -1,7 +1,43 @@
-// Texts about the page's state.
+// The page's state: texts, the status line, the sound level, notices, and hints about problems.
 
+import { element, setText } from "./elements.js";
 import { say } from "./language.js";
+import { SILENT_DB } from "./level.js";
 import { TEXTS } from "./texts.js";
+
+const NEWS_MS = 8000; // for which news is shown
+
+/** What the gateway reports: the connection, the session that is shown, missing services. */
+export class GatewayState {
+  isConnected = false;
+  wasConnected = false;
+  session = null; // name of the session that is shown
+  epoch = 0; // of the session; it increases with each restart
+  isSample = false; // whether the session is the sample sentence that this page asked for
+  lips = null; // lip model of the session; null: unknown
+  missing = []; // services that are not running
+
+  /** Whether the gateway refused the first connection, although it served this page. */
+  isRefused = false;
+
+  setConnected(isConnected) {
+    this.isConnected = isConnected;
+    this.wasConnected ||= isConnected;
+    this.isRefused = !this.wasConnected;
+    if (!isConnected) this.session = null;
+  }
+
+  /** Take a "session" message; return { isRestart, isOther }: whether the epoch or session changed. */
+  setSession({ session, epoch, sample, lips }) {
+    const isOther = session !== this.session;
+    const isRestart = !isOther && session !== null && epoch > this.epoch;
+    this.session = session;
+    this.epoch = epoch;
+    this.isSample = sample;
+    if (session !== null) this.lips = lips || null; // a session that has ended is still visible
+    return { isOther, isRestart };
+  }
+}
 
 /** Return the kind of state, which colors the status light: "lost", "waiting" or "live". */
 export function stateKind({ isConnected, isLive }) {
@@ -74,4 +110,72 @@ export function hintText({ isConnected, wasConnected, isRefused, isMicrophoneInt
 /** Return the text of the gateway's error message. */
 export function errorText({ code, text }) {
   return TEXTS[`error.${code}`] === undefined ? text : say(`error.${code}`, { text });
+}
+
+export class StatusBar {
+  #parts;
+  #wasLive = false; // in the session that is shown
+
+  /** @param parts { gateway, player, speech, sound, notice, senders }: where the state is */
+  constructor(parts) {
+    this.#parts = parts;
+  }
+
+  /** Another session is shown. */
+  reset() {
+    this.#wasLive = false;
+  }
+
+  show() {
+    const { gateway, player, speech, sound, notice, senders } = this.#parts;
+    const { isConnected, session } = gateway;
+    const isLive = isConnected && player.isLive(performance.now());
+    this.#wasLive ||= isLive;
+    const isMicrophoneInterrupted = speech.state === "interrupted";
+    const isStalled = this.#wasLive && session !== null && session === speech.session;
+    const isInterrupted = isMicrophoneInterrupted || isStalled;
+    element("status").dataset.state = stateKind({ isConnected, isLive });
+    element("status").title = session === null ? "" : `session ${session}`;
+    setText(element("state"), stateText({ isConnected, isLive, isInterrupted }));
+
+    const { playout, voiceToImageMs } = player;
+    const isAudible = isLive && sound.state === "on";
+    const soundMs = isAudible ? playout.delayMs : null;
+    const frameMs = isAudible ? playout.frameWaitMs : null;
+    setText(element("delay"), isLive ? delayText(voiceToImageMs, soundMs) : "");
+    setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
+    senders.frameWaitMs = frameMs;
+    notice.showHint(hintText({ ...gateway, isMicrophoneInterrupted }));
+  }
+}
+
+/** Show a level on the meter, dB of full scale. */
+export function showLevel(decibels) {
+  const share = (1 - decibels / SILENT_DB).toFixed(3);
+  element("meter").firstElementChild.style.transform = `scaleX(${share})`;
+  element("meter").setAttribute("aria-valuenow", Math.round(decibels));
+}
+
+/** The notice at the top: recent news and errors, else a hint about a lasting problem. */
+export class Notice {
+  #newsTimer = null;
+
+  /** Show an "error", or news as a "hint", for some seconds. */
+  showNews(text, kind) {
+    clearTimeout(this.#newsTimer);
+    this.#newsTimer = setTimeout(() => (this.#newsTimer = null), NEWS_MS);
+    showNotice(text, kind);
+  }
+
+  /** Show a hint unless news is shown; "" shows no hint. */
+  showHint(text) {
+    if (this.#newsTimer === null) showNotice(text, "hint");
+  }
+}
+
+function showNotice(text, kind) {
+  const box = element("notice");
+  box.dataset.kind = kind;
+  box.hidden = text === "";
+  setText(box, text);
 }
