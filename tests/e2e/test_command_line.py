@@ -188,7 +188,7 @@ def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> Non
         (["speak", SENTENCE, "--session", "two words"], "letters, digits"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
         (["express", "heard", "glee=1"], "joy, sadness, anger"),
-        (["express", "heard", "joy=2"], "0 to 1"),
+        (["express", "heard", "joy=2"], "between 0 and 1"),
         (["express", "heard", "joy"], "joy=0.4"),
         (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
         (["express", "nobody", "joy=1"], "no session 'nobody'"),
