@@ -11,6 +11,7 @@ class FakeStorage {
   items = {};
   getItem(key) { return this.items[key] ?? null; }
   setItem(key, value) { this.items[key] = value; }
+  removeItem(key) { delete this.items[key]; }
 }
 
 test("preferences are stored for the next visit", () => {
@@ -76,6 +77,7 @@ test("a mouth profile is stored until it is deleted", () => {
   const later = new MouthProfileStore(storage);
   assert.deepEqual(later.current, learned);
   later.keep(null);
+  assert.deepEqual(storage.items, {});
   assert.equal(later.current, null);
   assert.equal(new MouthProfileStore(storage).current, null);
 });

@@ -19,9 +19,11 @@ class StoredValue {
     }
   }
 
+  /** Store a value; null deletes it. */
   write(value) {
     try {
-      this.#storage?.setItem(this.#key, JSON.stringify(value));
+      if (value === null) this.#storage?.removeItem(this.#key);
+      else this.#storage?.setItem(this.#key, JSON.stringify(value));
     } catch {
       // the storage is full
     }
