@@ -14,9 +14,10 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.services.synthesizer.lips.lip_model import Articulation
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
 
@@ -25,6 +26,22 @@ LIPS = DynamicVisemes(load_parameters(), INVENTORY)
 DELAY_S = lip_model_info("dynamic-visemes").delay_ms / 1e3
 SILENT_DB = -120.0
 JAW, LOWER_LIP, WIDTH = (MOUTH_FAPS.index(fap) for fap in (3, 5, 6))
+
+
+UPPER, LOWER = np.array([[4, 8, 9, 51, 55, 56], [5, 10, 11, 52, 57, 58]]) - 1  # of lips, in FAPs
+
+
+def viseme_faps(viseme: str) -> NDArray[np.float32]:
+    """Return the FAPs (68,) of a viseme's target."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[np.array(MOUTH_FAPS) - 1] = LIPS.parameters.target[VISEME_INDEX[viseme]]
+    return faps
+
+
+def lip_gaps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return how far the upper lip (..., 6) is from the lower lip, FAP units."""
+    gaps: NDArray[np.float32] = -(faps[..., UPPER] + faps[..., LOWER])
+    return gaps
 
 
 def make_face(

@@ -142,27 +142,23 @@ def assert_closed_in_time(frames: Sequence[Frame], lips: str) -> None:
 
 cuts = st.integers(0, 10_000).map(lambda number: number % (len(events()) - 60) + 40)
 lip_models = st.sampled_from(["learnt", "dynamic-visemes", "ferguson"])
-few_examples = settings(max_examples=8)
 
 
-@few_examples
-@given(lips=lip_models, cut=cuts)
-def test_another_synthesizer_continues_anywhere(lips: str, cut: int) -> None:
-    frames = with_another_synthesizer(lips, cut)
-    assert_unseen(frames, lips)
-    assert_closed_in_time(frames, lips)
+MOVES = [with_another_synthesizer, with_another_recognizer]
 
 
-@few_examples
-@given(lips=lip_models, cut=cuts)
-def test_another_recognizer_continues_anywhere(lips: str, cut: int) -> None:
-    frames = with_another_recognizer(lips, cut)
+@settings(max_examples=16)
+@given(move=st.sampled_from(MOVES), lips=lip_models, cut=cuts)
+def test_another_process_continues_anywhere(
+    move: Callable[[str, int], list[Frame]], lips: str, cut: int
+) -> None:
+    frames = move(lips, cut)
     assert_unseen(frames, lips)
     assert_closed_in_time(frames, lips)
 
 
 @pytest.mark.parametrize("fap", [JAW, LOWER_LIP, EYELID, HEAD_PITCH])
-@pytest.mark.parametrize("move", [with_another_synthesizer, with_another_recognizer])
+@pytest.mark.parametrize("move", MOVES)
 def test_continues_during_the_largest_movement(
     move: Callable[[str, int], list[Frame]], fap: int
 ) -> None:

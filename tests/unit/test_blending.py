@@ -1,7 +1,9 @@
-"""Blending, the full model and its parameters: Li et al. 2011, eq. 8-11; Wang & Cai 2003, eq. 6."""
+"""Dominance, blending, full model, parameters: Li et al. 2011, eq. 5-11; Wang & Cai 2003, eq. 6-7."""
 
 import dataclasses
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,13 @@ from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
     blend,
+)
+from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
+    log_closure,
+    log_dominance,
+    log_left_silence,
+    log_pause,
+    log_right_silence,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -115,16 +124,6 @@ def test_full_model_does_not_depend_on_block_size() -> None:
     assert synthesize(lips, [], 3).shape == (3, 68)
 
 
-def test_built_in_parameters_open_a_and_round_u() -> None:
-    shipped = load_parameters()
-    target = {shape: shipped.target[VISEME_INDEX[shape]] for shape in ("a", "i", "u", "zh")}
-    protrusion, width = MOUTH_FAPS.index(17), MOUTH_FAPS.index(6)
-    assert target["a"][JAW] > 1.3 * target["i"][JAW] > 1.3 * target["zh"][JAW] > 0.0
-    assert target["a"][LOWER_LIP] < target["i"][LOWER_LIP] < target["u"][LOWER_LIP] < 0.0
-    assert target["u"][width] < 3.0 * target["i"][width] < 0.0
-    assert target["u"][protrusion] > 3.0 * target["i"][protrusion]
-
-
 def test_parameters_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
     parameters = initial_parameters()
@@ -148,28 +147,58 @@ def test_parameters_round_trip(tmp_path: Path) -> None:
         ("silence", {}),
         ("visemes", []),
         ("learnt_from", None),
+        ("alpha", [float("nan")]),
     ],
 )
 def test_rejects_bad_parameter_files(tmp_path: Path, key: str, value: object) -> None:
     path = tmp_path / "parameters.json"
     save_parameters(initial_parameters(), path, "a test")
     data = json.loads(path.read_text())
-    data[key] = value
-    path.write_text(json.dumps(data))
-    with pytest.raises(UserError, match=r"parameters\.json"):
-        load_parameters(path)
+    (data["visemes"]["a"] if key == "alpha" else data)[key] = value
+    for text in (json.dumps(data), "no JSON"):
+        path.write_text(text)
+        with pytest.raises(UserError, match=r"parameters\.json"):
+            load_parameters(path)
 
 
-def test_rejects_parameters_out_of_range(tmp_path: Path) -> None:
-    path = tmp_path / "parameters.json"
-    save_parameters(initial_parameters(), path, "a test")
-    data = json.loads(path.read_text())
-    data["visemes"]["a"]["alpha"][0] = float("nan")
-    path.write_text(json.dumps(data))
-    with pytest.raises(UserError, match="alpha"):
-        load_parameters(path)
-    path.write_text("no JSON")
-    with pytest.raises(UserError, match="cannot read"):
-        load_parameters(path)
-    with pytest.raises(UserError, match="cannot read"):
-        load_parameters(tmp_path / "absent.json")
+def array(*values: float) -> NDArray[np.float64]:
+    return np.array(values)
+
+
+def test_viseme_matches_a_manual_calculation() -> None:
+    # alpha 2, theta 3 before the apex and 5 after it, c 1.5
+    got = np.exp(log_dominance(array(0.25, 0.0, -0.25), array(2.0), array(3.0), array(5.0), 1.5))
+    want = [2.0 * math.exp(-3.0 * 0.125), 2.0, 2.0 * math.exp(-5.0 * 0.125)]
+    np.testing.assert_allclose(got, want)
+
+
+@pytest.mark.parametrize(("model", "sign"), [(log_left_silence, 1.0), (log_right_silence, -1.0)])
+def test_silence_falls_or_grows_with_time(
+    model: Callable[..., NDArray[np.float64]], sign: float
+) -> None:
+    # sigma = t_l - t: positive before the apex
+    got = np.exp(model(array(0.25, 0.0, -0.25), array(2.0), array(3.0), 1.5))
+    np.testing.assert_allclose(got, 2.0 * np.exp(sign * array(0.375, 0.0, -0.375)))
+
+
+def test_log_weights_are_finite_far_away() -> None:
+    far, one = array(1e6, -1e6), array(1.0)
+    for weights in (
+        log_dominance(far, one, 40.0 * one, 40.0 * one, 1.3),
+        log_left_silence(far, one, 40.0 * one, 1.3),
+        log_right_silence(far, one, 40.0 * one, 1.3),
+    ):
+        assert np.isfinite(weights).all()
+
+
+def test_silence_vanishes_between_touching_phones() -> None:
+    strength = [float(log_pause(array(0.0), array(0.0), array(s))[0]) for s in (1e-6, 0.05, 0.5)]
+    assert strength[0] < -10.0 < strength[1] < strength[2]
+    # the intersection is never above the lower model
+    assert float(log_pause(array(3.0), array(-2.0), array(1.0))[0]) <= -2.0
+
+
+def test_closure_has_the_ends_of_wang_and_cai_eq_7() -> None:
+    viseme, others = array(-1.0, -1.0, -1.0), array(2.0, 2.0, 2.0)
+    got = log_closure(viseme, others, array(0.07, 0.0, -0.2), reach_s=0.07, closure_ratio=25.0)
+    np.testing.assert_allclose(got, [-1.0, math.log(25.0) + 2.0, -1.0])

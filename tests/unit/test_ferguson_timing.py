@@ -133,14 +133,6 @@ def test_key_frames_do_not_overshoot() -> None:
     np.testing.assert_allclose(frames.openings_at([0.0, 1.0, 2.0], smooth=True), [0.0, 4.0, 4.0])
 
 
-@pytest.mark.parametrize(
-    ("times", "openings"), [([0.0, 0.0], [1.0, 1.0]), ([0.0], [5.1]), ([], []), ([0.0], [1.0, 2.0])]
-)
-def test_rejects_invalid_key_frames(times: list[float], openings: list[float]) -> None:
-    with pytest.raises(ValueError, match=r"times_s|opening"):
-        KeyFrames(np.array(times), np.array(openings))
-
-
 def test_key_frames_of_phones_and_pauses() -> None:
     spoken = {"m": 1.0, "a": 1.1, "sil": 1.2, "i": 2.0}
     phones = [phone(0, symbol, onset_s, 0.1) for symbol, onset_s in spoken.items()]

@@ -14,11 +14,9 @@ from kouxing.services.driver.render.camera import Camera
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from tests import heads
-from tests.lips import LIPS
+from tests.lips import viseme_faps
 
 pytestmark = pytest.mark.unit
 
@@ -30,8 +28,7 @@ MIN_CHANGE = 0.13  # each by this share of the region's mean brightness
 
 def spoken(viseme: str) -> NDArray[np.float32]:
     """FAPs (68,) of a viseme's target as the services send it by default."""
-    faps = np.zeros(NUM_FAPS, np.float32)
-    faps[np.array(MOUTH_FAPS) - 1] = LIPS.parameters.target[VISEME_INDEX[viseme]]
+    faps = viseme_faps(viseme)
     Expressiveness(SynthesizerConfig().expressiveness).scale(faps)
     return faps
 

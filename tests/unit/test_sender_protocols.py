@@ -39,9 +39,6 @@ def osc_messages(url: str, frame: FaceFrame) -> Messages:
     return read_osc(list(connect(parse_target(url)).encode(frame)))  # type: ignore[attr-defined]
 
 
-# --- VMC -----------------------------------------------------------------------------------------
-
-
 def test_vmc_sends_the_names_of_vrm_0_and_vrm_1() -> None:
     messages = osc_messages("vmc://", frame_of("vrm", 2.5, aa=0.6, blinkLeft=0.5))
     assert messages[:2] == [("/VMC/Ext/OK", [1]), ("/VMC/Ext/T", [2.5])]
@@ -93,9 +90,6 @@ def test_mouth_only_leaves_out_the_rest_of_the_face() -> None:
     assert not any(name.startswith(("Eye", "Face", "Brow")) for name in parameters)
 
 
-# --- Live Link Face and OSC ----------------------------------------------------------------------
-
-
 def test_live_link_datagram() -> None:
     frame = frame_of(jawOpen=0.6, eyeBlinkRight=0.4, head_yaw=0.2e5, pitch_l_eyeball=0.1e5)
     datagram = LiveLinkConnection(parse_target("livelink://?name=Ada")).encode_at(frame, 3600.51)
@@ -129,9 +123,6 @@ def test_osc_has_one_address_per_shape() -> None:
     assert len(messages) == 2 + 15
     prefixed = dict(osc_messages("osc://?prefix=/avatar/parameters/", frame))
     assert "/avatar/parameters/jawOpen" in prefixed
-
-
-# --- VTube Studio --------------------------------------------------------------------------------
 
 
 def parameters_of(shapes: str = "arkit", **weights: float) -> dict[str, float]:
@@ -170,6 +161,12 @@ def response(kind: str, **data: object) -> str:
     return json.dumps({"apiName": "VTubeStudioPublicAPI", "messageType": kind, "data": data})
 
 
+def next_request(dialogue: Dialogue, kind: str, **data: object) -> tuple[str, dict[str, object]]:
+    """Return the kind and the data of what follows a response."""
+    request = json.loads(dialogue.reply(response(kind, **data)))
+    return request["messageType"], request["data"]
+
+
 def test_vtube_studio_requests_a_token_once() -> None:
     saved: list[str] = []
     dialogue = Dialogue("", saved.append)
@@ -177,15 +174,11 @@ def test_vtube_studio_requests_a_token_once() -> None:
     assert request["messageType"] == "AuthenticationTokenRequest"
     assert request["data"] == {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
     assert "Allow" in dialogue.problem
-    request = json.loads(
-        dialogue.reply(response("AuthenticationTokenResponse", authenticationToken="t"))
-    )
+    kind, data = next_request(dialogue, "AuthenticationTokenResponse", authenticationToken="t")
     assert saved == ["t"]
-    assert request["messageType"] == "AuthenticationRequest"
-    assert request["data"]["authenticationToken"] == "t"
-    request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=True)))
-    assert request["messageType"] == "InputParameterListRequest"
-    assert not dialogue.is_ready
+    assert (kind, data["authenticationToken"]) == ("AuthenticationRequest", "t")
+    kind, _ = next_request(dialogue, "AuthenticationResponse", authenticated=True)
+    assert (kind, dialogue.is_ready) == ("InputParameterListRequest", False)
     known = [{"name": "MouthOpen"}, {"name": "FaceAngleX"}]
     listed = response("InputParameterListResponse", defaultParameters=known, customParameters=[])
     assert dialogue.reply(listed) == ""
@@ -200,8 +193,8 @@ def test_vtube_studio_requests_a_token_once() -> None:
 def test_vtube_studio_requests_a_new_token_after_revocation() -> None:
     dialogue = Dialogue("old", lambda _: None)
     assert json.loads(dialogue.first_message())["messageType"] == "AuthenticationRequest"
-    request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=False)))
-    assert request["messageType"] == "AuthenticationTokenRequest"
+    kind, _ = next_request(dialogue, "AuthenticationResponse", authenticated=False)
+    assert kind == "AuthenticationTokenRequest"
 
 
 def test_vtube_studio_errors() -> None:
@@ -220,9 +213,6 @@ def test_vtube_studio_errors() -> None:
     for nonsense in ("x", "[]", "{}", response("AuthenticationTokenResponse")):
         with pytest.raises(UserError, match="not VTube Studio"):
             dialogue.reply(nonsense)
-
-
-# --- addresses -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -261,9 +251,6 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
 def test_error_of_an_invalid_address(url: str, reason: str) -> None:
     with pytest.raises(UserError, match=reason):
         parse_target(url)
-
-
-# --- playout -------------------------------------------------------------------------------------
 
 
 def test_playout_removes_jitter() -> None:

@@ -1,0 +1,261 @@
+"""Modifiers of the face: expressions, expressiveness and amplitude."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
+from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
+from kouxing.services.synthesizer.modifiers.expression import mix
+from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.expressions import ExpressionName, check_expressions
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.phones.events import Phone, SpeechChange
+from tests.lips import (
+    LIPS,
+    LOWER,
+    UPPER,
+    advance,
+    articulation_of,
+    lip_gaps,
+    make_face,
+    moment,
+    phone,
+    viseme_faps,
+)
+
+pytestmark = pytest.mark.unit
+
+JAW, WIDTH, CORNER, PUSH = np.array([3, 6, 12, 17]) - 1
+BROW = FAP_NUMBER["raise_l_m_eyebrow"] - 1
+CLOSED = 20.0  # FAP units between lips
+FRAME_S = 0.02
+
+
+def shown(face: FaceAnimator, until_s: float) -> NDArray[np.float32]:
+    return np.array([faps for _, faps in advance(face, until_s)])
+
+
+@pytest.mark.parametrize("name", ExpressionName)
+def test_expressions_ease_in_stay_and_fade(name: ExpressionName) -> None:
+    face = make_face()
+    advance(face, 1.0)
+    face.set_expressions({name: 1.0}, 2.0)
+    faps = shown(face, 5.0)
+    moved = int(np.abs(faps).max(axis=0).argmax())
+    curve = np.abs(faps[:, moved])
+    full = curve[99]  # 2 s later
+    assert full > 40.0
+    assert curve[0] < 0.05 * full
+    np.testing.assert_allclose(curve[40:100], full, rtol=0.02)
+    assert curve[150] < 0.5 * full
+    assert curve[-1] < 0.01 * full
+    assert np.abs(np.diff(curve, n=2)).max() < 0.02 * full  # no corners
+
+
+def test_strengths_add_up_and_the_newest_request_counts() -> None:
+    face = make_face()
+    face.set_expressions({"joy": 0.4, "brow_up": 1.0}, 10.0)
+    both = shown(face, 2.0)[-1]
+    face.set_expressions({"joy": 0.4}, 10.0)
+    joy = shown(face, 6.0)[-1]
+    face.set_expressions({}, 10.0)
+    none = shown(face, 10.0)[-1]
+    assert both[BROW] > 40.0 > abs(joy[BROW])
+    assert joy[CORNER] == pytest.approx(0.4 * 353.2, rel=0.01)
+    assert both[CORNER] == pytest.approx(joy[CORNER], rel=0.01)
+    assert np.abs(none).max() < 1.0
+
+
+def test_surprise_opens_the_mouth_only_without_speech() -> None:
+    face = make_face()
+    face.set_expressions({"surprise": 1.0}, 60.0)
+    assert lip_gaps(shown(face, 3.0)[-1]).max() > 300.0
+    face.process(SpeechChange(active=True, time_s=3.0))
+    closing = shown(face, 3.3)
+    assert lip_gaps(closing[-1]).max() <= CLOSED
+    assert closing[-1][JAW] < 5.0
+    assert closing[-1][BROW] > 100.0
+
+
+symbols = st.lists(
+    st.sampled_from(["b", "p", "m", "f", "a", "u", "i", "t"]), min_size=1, max_size=8
+)
+strengths = st.dictionaries(st.sampled_from([*ExpressionName]), st.floats(0.0, 1.0), max_size=4)
+
+
+@settings(max_examples=20)
+@given(symbols=symbols, wanted=strengths, from_s=st.floats(0.0, 1.0))
+def test_expressions_do_not_open_closures(
+    symbols: list[str], wanted: dict[str, float], from_s: float
+) -> None:
+    """Closures without expression stay closed with any expression, from the start of the sound."""
+    plain, expressive = make_face(), make_face()
+    for face in (plain, expressive):
+        face.process(SpeechChange(active=True, time_s=0.2))
+        for index, symbol in enumerate(symbols):
+            face.process(phone(index, symbol, 0.4 + 0.12 * index, 0.12))
+    frames = shown(plain, 2.0)
+    begun = shown(expressive, from_s)
+    expressive.set_expressions(wanted, 60.0)
+    mixed = np.concatenate([begun.reshape(-1, NUM_FAPS), shown(expressive, 2.0)])
+    from_sound = slice(round(0.3 / FRAME_S), None)
+    before, after = lip_gaps(frames)[from_sound], lip_gaps(mixed)[from_sound]
+    closed = before <= CLOSED
+    assert (after[closed] <= before[closed] + 0.01).all()
+    assert (after[~closed] >= CLOSED - 0.01).all()
+
+
+@settings(max_examples=20)
+@given(wanted=strengths)
+def test_expressions_keep_the_lower_lip_of_f_at_the_teeth(wanted: dict[str, float]) -> None:
+    face = make_face()
+    face.set_expressions(wanted, 60.0)
+    expression = shown(face, 2.0)[-1]
+    teeth = viseme_faps("f")
+    mixed = teeth.copy()
+    mix(mixed, expression, 0.0)
+    assert (mixed[LOWER] >= teeth[LOWER] - 0.01).all()
+
+
+def test_blinks_close_the_eyes_in_every_expression() -> None:
+    upper, lower = FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_b_l_eyelid"] - 1
+    faces = make_face(idle_motion_seed=3), make_face(idle_motion_seed=3)
+    faces[1].set_expressions({"joy": 1.0, "squint": 1.0}, 60.0)
+    plain, squinting = (shown(face, 9.0)[100:] for face in faces)
+    blink = int(plain[:, upper].argmax())
+    closed = plain[blink, upper] + plain[blink, lower]
+    assert squinting[blink, upper] + squinting[blink, lower] == pytest.approx(closed, abs=20.0)
+
+
+@pytest.mark.parametrize(
+    ("strengths", "hold_s", "named"),
+    [
+        ({"happy": 0.5}, 3.0, "'happy'; use joy, sadness, .*squint"),
+        ({"joy": 1.5}, 3.0, "joy: strength 1.5 is not between 0 and 1"),
+        ({"joy": "much"}, 3.0, "joy: strength much"),
+        ({"joy": float("nan")}, 3.0, "joy: strength nan"),
+        ({"joy": True}, 3.0, "joy: strength True"),
+        ({"joy": 0.5}, -1.0, "hold_s is -1"),
+        ({"joy": 0.5}, None, "hold_s is None"),
+    ],
+)
+def test_rejects_invalid_expressions(
+    strengths: dict[str, object], hold_s: object, named: str
+) -> None:
+    with pytest.raises(UserError, match=named):
+        check_expressions(strengths, hold_s)
+
+
+DEFAULT = SynthesizerConfig().expressiveness
+
+
+def expressed(faps: NDArray[np.float32], amount: float) -> NDArray[np.float32]:
+    changed = faps.copy()
+    Expressiveness(amount).scale(changed)
+    return changed
+
+
+@pytest.mark.parametrize("amount", [0.5, DEFAULT, 2.0])
+def test_closed_lips_stay_closed(amount: float) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        faps = rng.normal(0.0, 150.0, NUM_FAPS).astype(np.float32)
+        closed = lip_gaps(faps) <= 20.0
+        changed = expressed(faps, amount)
+        np.testing.assert_array_equal(changed[UPPER][closed], faps[UPPER][closed])
+        np.testing.assert_array_equal(changed[LOWER][closed], faps[LOWER][closed])
+        assert (lip_gaps(changed)[~closed] > 20.0 - 1e-3).all()
+
+
+@pytest.mark.parametrize("viseme", ["a", "e", "i", "o", "u", "v"])
+def test_opens_further_up_to_a_limit(viseme: str) -> None:
+    opened = [expressed(viseme_faps(viseme), amount) for amount in (0.5, 0.8, 1.0, DEFAULT, 2.0)]
+    middle = [float(lip_gaps(faps)[0]) for faps in opened]
+    assert middle == sorted(middle)
+    assert middle[0] < 0.75 * middle[2]
+    assert middle[3] > 1.1 * middle[2]
+    assert middle[-1] < 900.0
+    assert opened[-1][JAW] < 500.0
+
+
+def test_exaggerates_spreading_and_rounding() -> None:
+    assert expressed(viseme_faps("i"), DEFAULT)[WIDTH] > 5.0
+    plain, more = viseme_faps("u"), expressed(viseme_faps("u"), DEFAULT)
+    assert more[WIDTH] < 1.3 * plain[WIDTH] < 0.0
+    assert 1.2 * plain[PUSH] < more[PUSH] <= 400.0
+
+
+def syllables(rate_hz: float, num: int = 12) -> list[Phone]:
+    """Return syllables "da" at a rate."""
+    length_s = 1.0 / rate_hz
+    return [
+        phone(2 * k + part, symbol, 0.2 + (k + start) * length_s, share * length_s)
+        for k in range(num)
+        for part, (symbol, start, share) in enumerate((("d", 0.0, 0.35), ("a", 0.35, 0.65)))
+    ]
+
+
+def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[float]:
+    """Return the gain of every frame, one level per frame."""
+    amplitude = Amplitude()
+    gains = []
+    for k, level_db in enumerate(levels_db):
+        level = (k * FRAME_S, level_db)
+        faps = np.zeros(68, dtype=np.float32)
+        faps[[JAW, UPPER[0], LOWER[0], WIDTH]] = 100.0, -100.0, 100.0, -100.0
+        amplitude.apply(faps, moment(k * FRAME_S, articulation, [level], FRAME_S))
+        assert faps[UPPER[0]] == -faps[JAW]
+        assert faps[LOWER[0]] == 100.0  # pressed lips stay pressed
+        assert faps[WIDTH] == -100.0
+        gains.append(float(faps[JAW]) / 100.0)
+    return gains
+
+
+def test_louder_speech_opens_further_at_any_microphone_gain() -> None:
+    vowel = [phone(0, "a", 0.0, 9.0)]
+    articulation = articulation_of(vowel)
+    for microphone_db in (-40.0, -20.0):
+        levels = [microphone_db] * 300 + [microphone_db + 8.0] * 25 + [microphone_db - 8.0] * 25
+        gain = gains(articulation, levels)
+        assert gain[299] == pytest.approx(1.0, abs=0.02)
+        assert gain[324] > 1.15
+        assert gain[349] < 0.85
+        assert np.abs(np.diff(gain[290:])).max() < 0.2
+
+
+def test_the_usual_level_of_a_viseme_changes_nothing() -> None:
+    articulation = articulation_of(syllables(4.0, num=30))
+    timeline = articulation.timeline
+    usual = {viseme: float(LIPS.parameters.level_db[VISEME_INDEX[viseme]]) for viseme in "da"}
+    assert usual["a"] > usual["d"] + 3.0
+    assert LIPS.parameters.level_db.shape == (len(VISEMES),)
+    levels = []
+    for k in range(350):
+        middle_s = (timeline.apex_start_s + timeline.apex_end_s) / 2.0
+        near = timeline.viseme[np.argmin(np.abs(middle_s - k * FRAME_S))]
+        levels.append(-30.0 + usual[VISEMES[near]])
+    gain = gains(articulation, levels)[150:]
+    assert max(gain) - min(gain) < 0.05
+    flat = gains(articulation, [-30.0] * 350)[150:]  # a vowel as quiet as its consonant
+    assert max(flat) - min(flat) > 0.1
+
+
+def test_fast_speech_opens_less() -> None:
+    slow, usual, fast = (
+        gains(articulation_of(syllables(rate_hz)), [math.nan] * 100)[60]
+        for rate_hz in (3.0, 5.0, 8.0)
+    )
+    assert slow == pytest.approx(1.06, abs=0.01)
+    assert usual == pytest.approx(1.0, abs=0.01)
+    assert fast == pytest.approx(0.91, abs=0.01)
