@@ -1,4 +1,4 @@
-"""Dominance, blending, full model, parameters: Li et al. 2011, eq. 5-11; Wang & Cai 2003, eq. 6-7."""
+"""Dominance, blending, full model, parameters: Li et al. 2011, eq. 5-11; Wang and Cai, eq. 6-7."""
 
 import dataclasses
 import json

@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from typing import Any, cast
 
 import pytest
-from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Phone, Refused, Result
+from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Refused, Result
 from kouxing_client.audio import ANSWER_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.messages import Joined
@@ -210,18 +210,6 @@ def test_a_blocked_socket_gets_the_rest_later() -> None:
     scene.audio().has_room = True
     scene.core.tick()
     assert sequences(scene.audio()) == [1, 2]
-
-
-def test_results_follow_a_move() -> None:
-    scene = Scene()
-    inbox, joined = scene.subscribe(Phone, FapFrame)
-    scene.confirm()
-    assert joined == [None]
-    scene.commands.answer("session-moved", **MOVED, next_sequence=None)
-    scene.confirm()
-    phone = Phone(epoch=2, index=0, symbol="a", duration=1, confidence=1.0, final=True)
-    scene.sockets.publish("phones 2", phone)
-    assert list(inbox.messages) == [phone]
 
 
 def test_an_unknown_session_ends_unless_it_moves() -> None:

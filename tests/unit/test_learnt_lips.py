@@ -199,18 +199,6 @@ def test_tongue_follows_the_dynamic_visemes() -> None:
     assert values(visemes, JAW).max() > 50.0
 
 
-def test_amplitude_does_not_apply() -> None:
-    jaws = []
-    for level_db in (-40.0, -10.0):
-        face = speaking_face()
-        frames = []
-        for number in range(1, 60):
-            face.process(lip_frame(number * 0.02 - 0.005 - LIPS_DELAY_S))
-            frames += face.process(Progress(time_s=number * 0.02, level_db=level_db))
-        jaws.append(values(frames, JAW))
-    np.testing.assert_array_equal(jaws[0], jaws[1])
-
-
 def test_flush_rests_within_150_ms_and_ignores_late_lip_frames() -> None:
     face = speaking_face()
     before = run(face, 0.0, 1.0, lip_frame)
@@ -223,16 +211,6 @@ def test_flush_rests_within_150_ms_and_ignores_late_lip_frames() -> None:
     face.process(SpeechChange(active=False, time_s=1.3))
     speak(face, 1.3)
     assert values(run(face, 1.3, 1.7, lip_frame), JAW)[-1] > 250.0
-
-
-def test_relaxes_and_returns_without_a_jump() -> None:
-    face = speaking_face()
-    frames = run(face, 0.0, 1.0, lip_frame)
-    frames += face.relax(10)
-    assert not frames[-1][1].round(3).any()
-    frames += run(face, 1.0, 1.4, lip_frame)
-    assert frames[-1][1][JAW] > 250.0
-    assert np.abs(np.diff(values(frames[20:], JAW))).max() < 120.0
 
 
 def test_ignores_invalid_lip_frames() -> None:
