@@ -195,7 +195,7 @@ def schemes(
     """
     from kouxing.evaluation.lips import sentences
     from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
-    from kouxing.evaluation.lips.scheme_report import print_outcome
+    from kouxing.evaluation.lips.report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos
     from kouxing.services.lip_models import lip_models
@@ -399,16 +399,3 @@ def plot_heads(
 
     for path in draw_sheets(folder) + (draw_choices(choices) if choices else []):
         print_message(f"wrote {path}")
-
-
-@plot_app.command(name="clip")
-def plot_clip(
-    name: Annotated[str, typer.Argument(help="Name of the clip.")],
-    output: Annotated[Path, typer.Argument(help="Video to write (.mp4, .mov, .webm, .webp).")],
-    clips: Clips,
-) -> None:
-    """Make a video of every lip model next to the tracked lips of a clip."""
-    from kouxing.evaluation.lips.clip_video import film_clip
-
-    film_clip(clips, name, output)
-    print_message(f"wrote {output}")

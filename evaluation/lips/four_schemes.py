@@ -8,21 +8,22 @@
 Schemes 1 and 2 use the product's offline chain (``services.recording_chain``). Schemes 3 and 4 use
 its live chain with the default delay of each lip model. Scheme 1 always uses the default acoustic
 model. In the paper, too, the alignment does not depend on the recognizer.
+
+The paper's output rule (section 2.2) emits a phone once N = 3 frames agree on it, and never
+corrects it (eq. 4, figure 3). A wrong phone stays, and its duration stays the mean. In scheme 4 a
+phone counts when the rule emits the next one; by then the search has measured its duration.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 from rich.progress import track
 
-from kouxing.evaluation.lips.paper_rule import (
-    delay_by_one_phone,
-    paper_config,
-    without_corrections,
-)
+from kouxing.corpora.scoring import is_emitted
 from kouxing.evaluation.lips.schemes import animate_live, drop_first_hypotheses, live_events
 from kouxing.evaluation.lips.sentences import Sentence
 from kouxing.services.lip_models import lip_model_info, lip_models
@@ -35,7 +36,7 @@ from kouxing.services.recording_chain import AnalyzedRecording, analyze_recordin
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.phones.events import SoundEvent
+from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 
 SCHEMES = (1, 2, 3, 4)
 ALIGNED, RECOGNIZED, LIVE, NEXT_PHONE = SCHEMES
@@ -99,7 +100,9 @@ def load_recognizers(
     recognizers = []
     for name in names:
         model = load_live_model(name)
-        config = paper_config(name) if has_paper_rule else RecognizerConfig(acoustic=name)
+        config = RecognizerConfig(acoustic=name)
+        if has_paper_rule:
+            config = RecognizerConfig(acoustic=name, num_stable_frames=3, min_confidence=0.0)
         title = Path(name).stem + ("-paper" if has_paper_rule else "")
         recognizers.append(
             TestedRecognizer(title, model, lip_predictor_for(model), config, has_paper_rule)
@@ -122,30 +125,21 @@ def recognize_all(
     model: AcousticModel, recognizers: Sequence[TestedRecognizer], sentences: Sequence[Sentence]
 ) -> list[RecognizedSentence]:
     """Run all recognizers on all sentences. ``model`` is the one of the aligned phones."""
-    return [
-        _recognize(model, recognizers, sentence)
-        for sentence in track(sentences, description="recognizing", transient=True)
-    ]
-
-
-def _recognize(
-    model: AcousticModel, recognizers: Sequence[TestedRecognizer], sentence: Sentence
-) -> RecognizedSentence:
-    samples, aligned = sentence.clip.samples, sentence.aligned
-    return RecognizedSentence(
-        sentence,
-        None
-        if aligned is None
-        else analyze_recording(model, samples, lip_predictor_for(model), aligned),
-        {
+    lips = lip_predictor_for(model)
+    recognized = []
+    for sentence in track(sentences, description="recognizing", transient=True):
+        samples, phones = sentence.clip.samples, sentence.aligned
+        aligned = None if phones is None else analyze_recording(model, samples, lips, phones)
+        outputs = {
             tested.name: RecognizerOutput(
                 analyze_recording(tested.model, samples, tested.lips),
                 live_events(tested.model, samples, tested.lips, _DELAYS_S, tested.config),
                 tested.has_paper_rule,
             )
             for tested in recognizers
-        },
-    )
+        }
+        recognized.append(RecognizedSentence(sentence, aligned, outputs))
+    return recognized
 
 
 def make_frames(
@@ -154,11 +148,8 @@ def make_frames(
     """Return the frames of a condition; None in scheme 1 if the text is not known."""
     lips = load_lip_model(name=condition.lips)
     if condition.scheme == ALIGNED:
-        return (
-            None
-            if recognized.aligned is None
-            else animate_recording(recognized.aligned, lips, config)
-        )
+        aligned = recognized.aligned
+        return None if aligned is None else animate_recording(aligned, lips, config)
     output = recognized.outputs[condition.recognizer]
     if condition.scheme == RECOGNIZED:
         return animate_recording(output.offline, lips, config)
@@ -179,3 +170,41 @@ def face_input(condition: Condition, output: RecognizerOutput) -> Sequence[Sound
     if output.has_paper_rule:
         return delay_by_one_phone(events) if is_delayed else without_corrections(events)
     return drop_first_hypotheses(events) if is_delayed else events
+
+
+def without_corrections(events: Sequence[SoundEvent]) -> list[SoundEvent]:
+    """Keep only the phones that the rule emits, renumbered, and all other events: scheme 3."""
+    kept: list[SoundEvent] = []
+    num_phones = 0
+    for event, after in zip_longest(events, events[1:]):
+        if not isinstance(event, Phone):
+            kept.append(event)
+        elif _is_emitted(event, after):
+            kept.append(replace(event, index=num_phones))
+            num_phones += 1
+    return kept
+
+
+def delay_by_one_phone(events: Sequence[SoundEvent]) -> list[SoundEvent]:
+    """Keep each phone once, when the next is emitted or speech ends: scheme 4."""
+    kept: list[SoundEvent] = []
+    latest: dict[int, Phone] = {}  # revision of each phone, by index
+    middle_s = 0.0  # of the last phone kept; a phone that starts earlier is not new
+    for event, after in zip_longest(events, events[1:]):
+        delayed = None
+        if isinstance(event, Phone):
+            latest[event.index] = event
+            if _is_emitted(event, after):
+                delayed = latest.get(event.index - 1)
+        elif isinstance(event, SpeechChange) and not event.active and latest:
+            delayed = latest[max(latest)]
+        if delayed is not None and delayed.onset_s >= middle_s and not delayed.is_withdrawn:
+            kept.append(delayed)
+            middle_s = delayed.onset_s + 0.5 * delayed.duration_s
+        if not isinstance(event, Phone):
+            kept.append(event)
+    return kept
+
+
+def _is_emitted(phone: Phone, after: SoundEvent | None) -> bool:
+    return is_emitted(phone, after if isinstance(after, Phone) else None)

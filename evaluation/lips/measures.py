@@ -1,8 +1,9 @@
 """Measures of how well two curves of a mouth agree: pure functions of arrays.
 
 *Made* lips come from a lip model, *real* lips were tracked. Both are sampled at the same times
-unless stated otherwise. Openings are in FAP units. All results are sums or counts that can be
-added, so that the figures of a group of clips are those of all their frames.
+unless stated otherwise: ``time_s`` in seconds, curves of shape (num_frames,), NaN where a real
+mouth was not measured. Openings are in FAP units. All results are sums or counts that can be added,
+so that the figures of a group of clips are those of all their frames.
 """
 
 from __future__ import annotations
@@ -72,20 +73,20 @@ class Moments(Sums):
 class Detections(Sums):
     """Counts of real events, of those reproduced, of made events, and of those that are true."""
 
-    num_real: int = 0
-    num_met: int = 0
-    num_made: int = 0
-    num_true: int = 0
+    real: int = 0
+    met: int = 0
+    made: int = 0
+    true: int = 0
 
     @property
     def recall(self) -> float | None:
         """Share of the real events that are reproduced."""
-        return self.num_met / self.num_real if self.num_real else None
+        return self.met / self.real if self.real else None
 
     @property
     def precision(self) -> float | None:
         """Share of the made events that are true."""
-        return self.num_true / self.num_made if self.num_made else None
+        return self.true / self.made if self.made else None
 
     @property
     def f1(self) -> float | None:
@@ -123,7 +124,7 @@ class Speed(Sums):
 
 
 def moments(made: Array, real: Array) -> Moments:
-    """Compare two curves of a clip, shape (num_frames,) each."""
+    """Compare two curves of a clip."""
     if not len(made):
         return Moments()
     made, real = made - made.mean(), real - real.mean()
@@ -131,7 +132,7 @@ def moments(made: Array, real: Array) -> Moments:
 
 
 def without_drift(values: Array, rate_hz: float) -> Array:
-    """Remove everything below 1 Hz from a curve, shape (n,), without delay."""
+    """Remove everything below 1 Hz from a curve, without delay."""
     sections = butter(2, DRIFT_HZ, "highpass", fs=rate_hz, output="sos")
     reach = min(len(values) - 1, round(rate_hz / DRIFT_HZ))
     filtered: Array = sosfiltfilt(sections, values, padlen=reach)
@@ -156,12 +157,7 @@ def rms_jerk(curves: Sequence[Array], rate_hz: float) -> float | None:
 def speed_in(pauses_s: Array, time_s: Array, values: Array) -> Speed:
     """Measure how fast a curve moves in pauses, without their first 0.3 s and last 0.2 s.
 
-    Parameters
-    ----------
-    pauses_s
-        Starts and ends, shape (num_pauses, 2).
-    time_s, values
-        Shape (num_frames,); NaN where not measured.
+    ``pauses_s`` has the starts and ends, shape (num_pauses, 2).
     """
     start_s, end_s = pauses_s[:, :1] + _CLOSING_S, pauses_s[:, 1:] - _PREPARING_S
     is_inside: Mask = np.any((time_s >= start_s) & (time_s <= end_s), axis=0)
@@ -190,10 +186,7 @@ def real_closed(time_s: Array, opening: Array) -> Array:
 
 
 def real_closures(time_s: Array, opening: Array) -> Array:
-    """Return when real lips close, seconds: minima of closed lips near an opening.
-
-    Frames without a face are NaN.
-    """
+    """Return when real lips close, seconds: minima of closed lips near an opening."""
     before, here, after = opening[:-2], opening[1:-1], opening[2:]
     is_minimum = (here <= before) & (here < after) & _is_closed(opening)[1:-1]
     return _near_opening(time_s[1:-1][is_minimum], time_s, opening)
@@ -213,8 +206,7 @@ def lip_to_teeth_poses(time_s: Array, upper: Array, lower: Array) -> Array:
 
     These are peaks of the lower lip (FAP 5) near rest, with the upper lip (FAP 4) raised, near an
     opening. A camera does not see whether lip and teeth touch: of a newsreader's 16 f, 12 look like
-    this, but only 12 of the 68 such moments are an f. Arrays have shape (num_frames,), NaN without
-    a face.
+    this, but only 12 of the 68 such moments are an f.
     """
     contact = _lip_to_teeth(upper, lower)
     before, here, after = contact[:-2], contact[1:-1], contact[2:]
@@ -247,14 +239,8 @@ def closures(real_s: Array, closed_s: Array, time_s: Array, opening: Array) -> D
 
     The made lips reproduce a real closure if they close within 40 ms. A made closure starts when
     open lips close. It is true if real lips are closed within 40 ms. Contacts more than 0.2 s from
-    open lips are rest, not closures.
-
-    Parameters
-    ----------
-    real_s, closed_s
-        Results of ``real_closures`` and ``real_closed``.
-    time_s, opening
-        Made lips, shape (num_frames,).
+    open lips are rest, not closures. ``real_s`` and ``closed_s`` are the results of
+    ``real_closures`` and ``real_closed``; the opening is that of made lips.
     """
     return _detections(real_s, closed_s, time_s, opening < _CLOSED, opening > _OPEN)
 
@@ -264,14 +250,8 @@ def lip_to_teeth(
 ) -> Detections:
     """Compare contacts of lower lip and upper teeth, like ``closures``.
 
-    Parameters
-    ----------
-    real_s
-        When real lips touch the teeth, seconds. These can be reproduced.
-    poses_s
-        When real lips look like it. A made contact near one of them is true.
-    time_s, upper, lower
-        FAP 4 and 5 of made lips, shape (num_frames,).
+    Real contacts at ``real_s`` can be reproduced. A made contact near one of ``poses_s``, when real
+    lips look like it, is true. ``upper`` and ``lower`` are FAP 4 and 5 of made lips.
     """
     touching = _lip_to_teeth(upper, lower) > 0.0
     return _detections(real_s, poses_s, time_s, touching, (-upper - lower > _OPEN) & ~touching)
@@ -292,12 +272,8 @@ def _detections(
     state = np.where(is_open, 1, -1)[is_open | touching]
     number = np.cumsum(np.diff(state, prepend=-1) > 0)[state < 0]
     is_true = is_near(time_s[touching], true_s, CLOSURE_WINDOW_S)
-    return Detections(
-        len(real_s),
-        int(is_met.sum()),
-        len(np.unique(number[number > 0])),
-        len(np.unique(number[(number > 0) & is_true])),
-    )
+    made, true = np.unique(number[number > 0]), np.unique(number[(number > 0) & is_true])
+    return Detections(len(real_s), int(is_met.sum()), len(made), len(true))
 
 
 def openings(time_s: Array, opening: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Print scores of lips: one table per kind of measure."""
+"""Print scores of lips: one table per kind of measure, or the four schemes of Li et al. 2011."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kouxing.evaluation.lips.clip_scores import MEASURES
+from kouxing.evaluation.lips.scheme_scores import ConditionScore, Order, Outcome
 from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S
-from kouxing.evaluation.lips.scores import CurveScore, HitScore, LipScore
+from kouxing.evaluation.lips.scores import MEASURES, CurveScore, HitScore, LipScore
 
 Cell = Callable[[LipScore], str]
 
@@ -31,9 +31,7 @@ def print_scores(scores: Sequence[LipScore], console: Console) -> None:
 
 
 def _table(title: str, columns: Mapping[str, Cell], scores: Sequence[LipScore]) -> Table:
-    table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0), title_justify="left")
-    for column in ("clips; scheme, delay in ms", *columns):
-        table.add_column(column, no_wrap=True)
+    table = _empty_table(title, ("clips; scheme, delay in ms", *columns), (0, 1, 0, 0))
     for group, members in groupby(scores, lambda score: score.group):
         rows = list(members)
         table.add_row(f"[bold]{group}: {max(score.num_clips for score in rows)}[/bold]")
@@ -44,27 +42,30 @@ def _table(title: str, columns: Mapping[str, Cell], scores: Sequence[LipScore]) 
     return table
 
 
-def curve_cell(
+def _empty_table(title: str, columns: Sequence[str], padding: tuple[int, ...]) -> Table:
+    table = Table(title=title, box=box.SIMPLE, padding=padding, title_justify="left")
+    for column in columns:
+        table.add_column(column, no_wrap=True)
+    return table
+
+
+def _curve_cell(
     figure: Callable[[CurveScore], float | None],
     form: str = ".2f",
     measures: Sequence[str] = tuple(MEASURES),
 ) -> Cell:
-    """Return a cell with a figure of opening, width and jaw, or of some of them."""
-
     def cell(score: LipScore) -> str:
         curves = [score.curves.get(measure) for measure in measures]
-        return " ".join(format_figure(figure(curve) if curve else None, form) for curve in curves)
+        return " ".join(_format(figure(curve) if curve else None, form) for curve in curves)
 
     return cell
 
 
-def opening_cell(figure: Callable[[CurveScore], float | None], form: str = ".2f") -> Cell:
-    """Return a cell with a figure of the opening."""
-    return curve_cell(figure, form, ("opening",))
+def _opening_cell(figure: Callable[[CurveScore], float | None], form: str = ".2f") -> Cell:
+    return _curve_cell(figure, form, ("opening",))
 
 
-def format_figure(value: float | None, form: str = ".2f") -> str:
-    """Format a figure for a cell."""
+def _format(value: float | None, form: str = ".2f") -> str:
     return "-" if value is None else format(value, form)
 
 
@@ -72,30 +73,30 @@ def _hit_cells(hits: Callable[[LipScore], HitScore]) -> dict[str, Cell]:
     return {
         "met": lambda score: f"{hits(score).met}/{hits(score).real}",
         "true": lambda score: f"{hits(score).true}/{hits(score).made}",
-        "recall": lambda score: format_figure(hits(score).recall),
-        "precision": lambda score: format_figure(hits(score).precision),
-        "F1": lambda score: format_figure(hits(score).f1),
+        "recall": lambda score: _format(hits(score).recall),
+        "precision": lambda score: _format(hits(score).precision),
+        "F1": lambda score: _format(hits(score).f1),
     }
 
 
 def _pause_cell(name: str) -> Cell:
     def cell(score: LipScore) -> str:
         made, real = (getattr(score.pauses, prefix + name) for prefix in ("", "real_"))
-        return f"{format_figure(made, '.0f')} ({format_figure(real, '.0f')})"
+        return f"{_format(made, '.0f')} ({_format(real, '.0f')})"
 
     return cell
 
 
 TABLES: dict[str, dict[str, Cell]] = {
     "Correlation of opening, width, jaw": {
-        "everything": curve_cell(lambda curve: curve.correlation),
-        "in speech": curve_cell(lambda curve: curve.correlation_in_speech),
-        "without drift": curve_cell(lambda curve: curve.correlation_without_drift),
+        "everything": _curve_cell(lambda curve: curve.correlation),
+        "in speech": _curve_cell(lambda curve: curve.correlation_in_speech),
+        "without drift": _curve_cell(lambda curve: curve.correlation_without_drift),
     },
     "Opening, width, jaw: error in FAP units, lag in ms (positive: late)": {
-        "error": curve_cell(lambda curve: curve.rmse, ".0f"),
-        "best lag": curve_cell(lambda curve: curve.best_lag_ms, "+.0f"),
-        "correlation there": curve_cell(lambda curve: curve.best_correlation),
+        "error": _curve_cell(lambda curve: curve.rmse, ".0f"),
+        "best lag": _curve_cell(lambda curve: curve.best_lag_ms, "+.0f"),
+        "correlation there": _curve_cell(lambda curve: curve.best_correlation),
     },
     "Closures: real ones reproduced (met), made ones that are true, within 40 ms": {
         **_hit_cells(lambda score: score.closures),
@@ -106,13 +107,13 @@ TABLES: dict[str, dict[str, Cell]] = {
         lambda score: score.lip_to_teeth
     ),
     "Turns of opening, width, jaw per second": {
-        "made": curve_cell(lambda curve: curve.turns_per_s, ".1f"),
-        "made, at 50 Hz": curve_cell(lambda curve: curve.turns_per_s_at_50_hz, ".1f"),
-        "real": curve_cell(lambda curve: curve.real_turns_per_s, ".1f"),
+        "made": _curve_cell(lambda curve: curve.turns_per_s, ".1f"),
+        "made, at 50 Hz": _curve_cell(lambda curve: curve.turns_per_s_at_50_hz, ".1f"),
+        "real": _curve_cell(lambda curve: curve.real_turns_per_s, ".1f"),
     },
     "Time from real openings to made ones, ms": {
-        "p50": lambda score: format_figure(score.opening_delay_p50_ms, "+.0f"),
-        "p95": lambda score: format_figure(score.opening_delay_p95_ms, "+.0f"),
+        "p50": lambda score: _format(score.opening_delay_p50_ms, "+.0f"),
+        "p95": lambda score: _format(score.opening_delay_p95_ms, "+.0f"),
         "met": lambda score: f"{score.openings_met}/{score.openings}",
     },
     "Pauses, made (real): FAP units/s of opening; ms from last sound to closed lips": {
@@ -124,11 +125,72 @@ TABLES: dict[str, dict[str, Cell]] = {
     },
 }
 SPEAKER_COLUMNS: dict[str, Cell] = {
-    "all": opening_cell(lambda curve: curve.correlation),
-    "speech": opening_cell(lambda curve: curve.correlation_in_speech),
-    "lag": opening_cell(lambda curve: curve.best_lag_ms, "+.0f"),
+    "all": _opening_cell(lambda curve: curve.correlation),
+    "speech": _opening_cell(lambda curve: curve.correlation_in_speech),
+    "lag": _opening_cell(lambda curve: curve.best_lag_ms, "+.0f"),
     "closures": lambda score: f"{score.closures.met}/{score.closures.real}",
-    "F1": lambda score: format_figure(score.closures.f1),
-    "turns": opening_cell(lambda curve: curve.turns_per_s, ".1f"),
-    "real": opening_cell(lambda curve: curve.real_turns_per_s, ".1f"),
+    "F1": lambda score: _format(score.closures.f1),
+    "turns": _opening_cell(lambda curve: curve.turns_per_s, ".1f"),
+    "real": _opening_cell(lambda curve: curve.real_turns_per_s, ".1f"),
 }
+
+
+# Table 2: mean opinion scores of sync and realism, and the minimum delay in theory, ms.
+PAPER = {1: (4.34, 4.01, 0), 2: (3.98, 3.81, 0), 3: (3.42, 3.50, 45), 4: (3.21, 3.16, 110)}
+
+AGREEMENT: dict[str, Cell] = {
+    "of": lambda score: str(score.num_clips),
+    "correlation": _curve_cell(lambda curve: curve.correlation),
+    "error": _opening_cell(lambda curve: curve.rmse, ".0f"),
+    "lag": _opening_cell(lambda curve: curve.best_lag_ms, "+.0f"),
+    "F1": lambda score: _format(score.closures.f1),
+}
+LEGEND = (
+    "correlation: opening, width, jaw; opening: error in FAP units, lag in ms and jerk in million "
+    "FAP units / s³; F1: of closures; phone: median phone delay, ms; face: delay of the face, ms; "
+    "paper: mean opinion scores of sync and realism, minimum delay in theory, ms"
+)
+
+
+def print_outcome(outcome: Outcome, console: Console) -> None:
+    """Print each lip model against scheme 1 and real lips, then whether the order holds."""
+    references: dict[str, Callable[[ConditionScore], LipScore | None]] = {
+        "scheme 1": lambda score: score.like_scheme_1,
+        "real lips": lambda score: score.like_real_lips,
+    }
+    for name, agreement in references.items():
+        for lips, scores in groupby(outcome.scores, lambda score: score.lips):
+            rows = [(score, like) for score in scores if (like := agreement(score))]
+            if rows:
+                console.print(_scheme_table(f"{lips} against {name}", rows))
+    console.print(LEGEND, highlight=False)
+    for order in outcome.orders:
+        console.print(describe(order), highlight=False, soft_wrap=True)
+
+
+def describe(order: Order) -> str:
+    """Say whether an order holds, and what schemes 3 and 4 lose."""
+    figures = " ".join(f"{figure:.2f}" for figure in order.correlations)
+    aligned, _, live, next_phone = order.correlations
+    return (
+        f"{order.lips}, {order.recognizer}, opening against {order.reference} ({figures}): "
+        f"1 > 2 > 3 > 4 {'holds' if order.holds else 'does not hold'}, in "
+        f"{order.num_holding} of {order.num_sentences} sentences; "
+        f"live costs {aligned - live:+.2f}, waiting for the next phone {live - next_phone:+.2f}"
+    )
+
+
+def _scheme_table(title: str, rows: Sequence[tuple[ConditionScore, LipScore]]) -> Table:
+    columns = ("scheme", *AGREEMENT, "jerk", "phone", "face", "paper")
+    table = _empty_table(title, columns, (0, 0, 0, 0))
+    for score, like in rows:
+        sync, realism, min_ms = PAPER[score.scheme]
+        table.add_row(
+            f"{score.scheme} {score.recognizer}",
+            *(cell(like) for cell in AGREEMENT.values()),
+            _format(score.jerk and score.jerk / 1e6, ".1f"),
+            _format(score.phone_delay_p50_ms, ".0f"),
+            _format(score.face_delay_ms, ".0f"),
+            f"{sync:.2f} {realism:.2f} {min_ms}",
+        )
+    return table

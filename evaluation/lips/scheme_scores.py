@@ -21,7 +21,6 @@ from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.scoring import matched_pairs
-from kouxing.evaluation.lips.clip_scores import MEASURES, ClipScore, score_clip
 from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
     RECOGNIZED,
@@ -35,7 +34,7 @@ from kouxing.evaluation.lips.four_schemes import (
 )
 from kouxing.evaluation.lips.measures import rms_jerk
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, RecognizedClip, Scheme
-from kouxing.evaluation.lips.scores import LipScore, pool
+from kouxing.evaluation.lips.scores import MEASURES, ClipScore, LipScore, pool, score_clip
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.alignment import spoken

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.evaluation.lips.clip_video import tracked_frames
 from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
     RECOGNIZED,
@@ -33,6 +32,7 @@ from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 _VIDEO_PX = (640, 640)
 _IMAGES_PER_S = 25.0
+_INNER_FAPS = dict(zip(range(51, 61), range(4, 14), strict=True))  # by the FAP of the outer contour
 MakeFrames = Callable[[RecognizedSentence], list[Frame]]
 
 
@@ -48,23 +48,9 @@ def write_videos(
     """Write ``CONDITION/SENTENCE.mp4`` for all conditions and sentences; keep existing videos.
 
     A condition that is not possible for every sentence is left out, because a listening test needs
-    all sentences in all conditions.
-
-    Parameters
-    ----------
-    recognized, recognizers, lips
-        Sentences, recognizers and lip models.
-    folder
-        Folder of the videos.
-    has_anchor
-        Add a condition ``anchor``, with a mouth at rest.
-    sound_at_once
-        Show live frames when they are made, later than their sound.
-
-    Raises
-    ------
-    UserError
-        If a file or folder cannot be written.
+    all sentences in all conditions. ``has_anchor`` adds a condition ``anchor``, with a mouth at
+    rest. ``sound_at_once`` shows live frames when they are made, later than their sound. Raises
+    UserError if a file cannot be written.
     """
     conditions = _conditions(
         recognized, recognizers, lips, has_anchor=has_anchor, sound_at_once=sound_at_once
@@ -144,6 +130,21 @@ def _frames_with_mouth(
     mouth = np.array(MOUTH_FAPS) - 1
     faps[:, mouth] = mouth_of(sentence.sentence.clip, times_s)[:, mouth]
     return [(time_s, row) for (time_s, _), row in zip(frames, faps, strict=True)]
+
+
+def tracked_frames(clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the tracked mouth at the given times, FAPs (n, 68).
+
+    If the outer contour was not measured, it follows the inner one.
+    """
+    faps = np.zeros((len(times_s), NUM_FAPS))
+    for fap, curve in zip(MOUTH_FAPS, clip.faps.T, strict=True):
+        is_known = np.isfinite(curve)
+        if is_known.any():
+            faps[:, fap - 1] = np.interp(times_s, clip.time_s[is_known], curve[is_known])
+        elif fap in _INNER_FAPS:
+            faps[:, fap - 1] = faps[:, _INNER_FAPS[fap] - 1]
+    return faps
 
 
 def _mouth_at_rest(_clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:

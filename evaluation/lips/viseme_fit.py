@@ -23,10 +23,9 @@ from rich.table import Table
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
-from kouxing.evaluation.lips.clip_scores import MEASURES, real_faps
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
-from kouxing.evaluation.lips.scores import clips_to_score
+from kouxing.evaluation.lips.scores import MEASURES, clips_to_score, real_faps
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes

@@ -15,12 +15,13 @@ from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.four_schemes import (
     Condition,
     RecognizerOutput,
+    delay_by_one_phone,
     face_input,
     load_recognizers,
+    without_corrections,
 )
 from kouxing.evaluation.lips.measures import rms_jerk
-from kouxing.evaluation.lips.paper_rule import delay_by_one_phone, without_corrections
-from kouxing.evaluation.lips.scheme_report import describe
+from kouxing.evaluation.lips.report import describe
 from kouxing.evaluation.lips.scheme_scores import Order, first_hypotheses, is_decreasing
 from kouxing.evaluation.lips.schemes import drop_first_hypotheses
 from kouxing.evaluation.lips.sentences import choose

@@ -98,7 +98,7 @@ def test_counts_missed_and_false_closures() -> None:
     real_s = np.array([0.5, 1.5, 2.5])
     made = mouth((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
     hits = closures(real_s, real_s, TIME_S, made)
-    assert hits == Detections(num_real=3, num_met=2, num_made=4, num_true=2)
+    assert hits == Detections(real=3, met=2, made=4, true=2)
     assert hits.recall == pytest.approx(2 / 3)
     assert hits.precision == 0.5
     assert hits.f1 == pytest.approx(4 / 7)
@@ -120,7 +120,7 @@ def test_a_resting_mouth_has_no_closures() -> None:
     never = closures(np.zeros(0), np.zeros(0), TIME_S, mouth())
     assert never.recall is never.precision is never.f1 is None
     # between 20 and 100 units lips neither meet nor open
-    assert closures_at(1.0, np.minimum(mouth((1.0, 1.0)), 99.0)).num_made == 0
+    assert closures_at(1.0, np.minimum(mouth((1.0, 1.0)), 99.0)).made == 0
 
 
 def test_real_lips_agree_with_themselves() -> None:

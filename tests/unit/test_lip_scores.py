@@ -13,7 +13,6 @@ from rich.console import Console
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from kouxing.evaluation.lips.clip_scores import score_clip
 from kouxing.evaluation.lips.report import print_scores
 from kouxing.evaluation.lips.schemes import (
     DEFAULT_DELAY_S,
@@ -27,7 +26,7 @@ from kouxing.evaluation.lips.schemes import (
     phones_with_viseme,
     quietest_moments,
 )
-from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool
+from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool, score_clip
 from kouxing.evaluation.lips.viseme_fit import fit_clip, fit_figure, viseme_errors
 from kouxing.services.live_chain import sound_events
 from kouxing.services.mouth_profiles.lip_tracks import level_track
