@@ -334,22 +334,22 @@ def chain(
 
     The page is measured if Chromium is installed.
     """
-    from kouxing.evaluation.system import chromium, latency, page, rendering, sessions
+    from kouxing.evaluation.system import chromium, costs, latency, page
 
     delays = latency.measure(audio, repeats, CONSOLE)
-    costs = sessions.measure(audio)
-    images = rendering.measure()
+    sessions = costs.measure_sessions(audio)
+    images = costs.measure_images()
     drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
     console = Console()
     latency.show(delays, console)
-    sessions.show(costs, console)
-    rendering.show(images, console)
+    costs.show_sessions(sessions, console)
+    costs.show_images(images, console)
     if drawings:
         page.show(drawings, console)
     page_figures = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
     write_json(
         json_file,
-        {**asdict(delays), "sessions": costs, "rendering": asdict(images), "page": page_figures},
+        {**asdict(delays), "sessions": sessions, "rendering": asdict(images), "page": page_figures},
     )
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
+from kouxing.evaluation.system.network import Network
 from kouxing.evaluation.system.systems import PORTS
 from kouxing.shared.keys import CLIENT
 
@@ -79,8 +80,8 @@ def _end(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-class Forwarders:
-    """Hosts that forwarders join instead of a router; as ``evaluation.system.network.Network``."""
+class Forwarders(Network):
+    """Hosts that forwarders join instead of a router."""
 
     def __init__(self, hosts: Sequence[str]) -> None:
         net = f"127.{secrets.randbelow(250) + 2}.{secrets.randbelow(250) + 2}"

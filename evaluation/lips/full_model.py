@@ -17,7 +17,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
     DynamicVisemes,
     VisemeArticulation,
 )
-from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -36,18 +36,8 @@ def synthesize(
 ) -> NDArray[np.float32]:
     """Return the FAP frames (num_frames, 68) of an utterance.
 
-    Parameters
-    ----------
-    lips
-        The lip model.
-    phones
-        Phones with their true times; gaps and silences are pauses.
-    num_frames
-        Frame ``k`` is at ``k / frame_rate_hz`` seconds.
-    frame_rate_hz
-        Frames per second.
-    levels
-        Times in seconds and levels in dB of full scale, if known.
+    The phones have their true times; gaps and silences are pauses. ``levels`` has times in seconds
+    and levels in dB of full scale, if known.
     """
     parameters = lips.parameters
     timeline = build_timeline(phones, lips.inventory)
@@ -56,7 +46,14 @@ def synthesize(
     block = max(int(_BLOCK_S * frame_rate_hz), 1)
     for first in range(0, num_frames, block):
         times = time_s[first : first + block]
-        near = _within(timeline, times[0] - _REACH_S, times[-1] + _REACH_S)
+        start_s, end_s = times[0] - _REACH_S, times[-1] + _REACH_S
+        near = timeline.select((timeline.apex_end_s >= start_s) & (timeline.apex_start_s <= end_s))
+        silent = (timeline.silence_end_s >= start_s) & (timeline.silence_start_s <= end_s)
+        near = replace(
+            near,
+            silence_start_s=timeline.silence_start_s[silent],
+            silence_end_s=timeline.silence_end_s[silent],
+        )
         faps[first : first + block, np.array(MOUTH_FAPS) - 1] = blend(parameters, near, times)
     amplitude = Amplitude()
     articulation = VisemeArticulation(timeline, parameters.level_db)
@@ -72,13 +69,3 @@ def synthesize(
         )
         amplitude.apply(faps_now, context)
     return faps
-
-
-def _within(timeline: Timeline, start_s: float, end_s: float) -> Timeline:
-    near = timeline.select((timeline.apex_end_s >= start_s) & (timeline.apex_start_s <= end_s))
-    silent = (timeline.silence_end_s >= start_s) & (timeline.silence_start_s <= end_s)
-    return replace(
-        near,
-        silence_start_s=timeline.silence_start_s[silent],
-        silence_end_s=timeline.silence_end_s[silent],
-    )

@@ -108,12 +108,10 @@ def score_schemes(
         for number, clip in enumerate(clips):
             made = mouths[condition, number]
             reference = mouths[Condition(ALIGNED, condition.lips, ""), number]
-            if made is None:
-                continue
-            if reference is not None:
+            if made is not None and reference is not None:
                 against = replace(clip, clip=_with_lips(clip.clip, reference))
                 like_aligned[condition][number] = _score(condition, against, made)
-            if len(clip.clip.time_s):
+            if made is not None and len(clip.clip.time_s):
                 like_real[condition][number] = _score(condition, clip, made)
     return Outcome(
         sentences=[sentence.sentence.clip.name for sentence in sentences],

@@ -132,47 +132,37 @@ def live_events(
 
 def all_schemes(visemes: DynamicVisemes, lip_models: Mapping[str, LipModel]) -> list[Scheme]:
     """Return all schemes and baselines."""
+
+    def full_frames(clip: RecognizedClip, phones: Sequence[Phone] | None) -> Array | None:
+        if phones is None:
+            return None
+        frames = synthesize(visemes, phones, clip.num_frames, FRAME_RATE_HZ, clip.levels)
+        return frames.astype(float)
+
+    def next_phone(clip: RecognizedClip) -> Array:
+        events = drop_first_hypotheses(clip.events[DEFAULT_DELAY_S])
+        return live_frames(visemes, events, DEFAULT_DELAY_S, FRAME_RATE_HZ)
+
+    def loudness(delay_s: float) -> Scheme:
+        return Scheme("loudness", delay_s, lambda clip: loudness_frames(clip.clip.samples, delay_s))
+
     return [
-        Scheme("aligned phones", None, lambda clip: full_frames(visemes, clip, clip.aligned)),
-        Scheme("recognized phones", None, lambda clip: full_frames(visemes, clip, clip.recognized)),
+        Scheme("aligned phones", None, lambda clip: full_frames(clip, clip.aligned)),
+        Scheme("recognized phones", None, lambda clip: full_frames(clip, clip.recognized)),
         *(live_scheme(name, lips, d) for name, lips in lip_models.items() for d in DELAYS_S),
-        next_phone_scheme(visemes),
-        *(loudness_scheme(delay_s) for delay_s in DELAYS_S),
+        Scheme("next phone", DEFAULT_DELAY_S, next_phone),
+        *(loudness(delay_s) for delay_s in DELAYS_S),
         Scheme("mean mouth", None, still_mouth),
     ]
 
 
 def live_scheme(name: str, lips: LipModel, delay_s: float) -> Scheme:
     """Return scheme 3 with a lip model and a delay."""
-
-    def frames(clip: RecognizedClip) -> Array:
-        return live_frames(lips, clip.events[delay_s], delay_s, FRAME_RATE_HZ)
-
-    return Scheme(name, delay_s, frames)
-
-
-def next_phone_scheme(visemes: DynamicVisemes) -> Scheme:
-    """Return scheme 4, at the default delay."""
-
-    def frames(clip: RecognizedClip) -> Array:
-        events = drop_first_hypotheses(clip.events[DEFAULT_DELAY_S])
-        return live_frames(visemes, events, DEFAULT_DELAY_S, FRAME_RATE_HZ)
-
-    return Scheme("next phone", DEFAULT_DELAY_S, frames)
-
-
-def loudness_scheme(delay_s: float) -> Scheme:
-    """Return the baseline that opens the mouth with the loudness."""
-    return Scheme("loudness", delay_s, lambda clip: loudness_frames(clip.clip.samples, delay_s))
-
-
-def full_frames(
-    visemes: DynamicVisemes, clip: RecognizedClip, phones: Sequence[Phone] | None
-) -> Array | None:
-    """Return frames (num_frames, 68) of the full viseme model, if the phones are known."""
-    if phones is None:
-        return None
-    return synthesize(visemes, phones, clip.num_frames, FRAME_RATE_HZ, clip.levels).astype(float)
+    return Scheme(
+        name,
+        delay_s,
+        lambda clip: live_frames(lips, clip.events[delay_s], delay_s, FRAME_RATE_HZ),
+    )
 
 
 def live_frames(

@@ -119,8 +119,7 @@ class ClipScore:
     """Results of one scheme on one clip."""
 
     clip: LipClip
-    scheme: str
-    delay_s: float | None
+    scheme: Scheme
     curves: dict[str, CurveSums]  # by measure, if the clip has it
     events: EventSums
     pauses: PauseSums
@@ -153,9 +152,10 @@ def score_clip(recognized: RecognizedClip, scheme: Scheme) -> ClipScore | None:
         for name, measure in MEASURES.items()
         if is_measured(clip, name)
     }
-    events = _score_events(recognized, real, made) if clip.is_in_sync else EventSums()
-    in_pauses = _score_pauses(recognized, real, made) if clip.is_in_sync else PauseSums()
-    return ClipScore(clip, scheme.name, scheme.delay_s, curves, events, in_pauses)
+    if not clip.is_in_sync:
+        return ClipScore(clip, scheme, curves, EventSums(), PauseSums())
+    events, in_pauses = _score_events(recognized, real, made), _score_pauses(recognized, real, made)
+    return ClipScore(clip, scheme, curves, events, in_pauses)
 
 
 def _score_curve(
@@ -328,24 +328,24 @@ def clips_to_score(
     return clips
 
 
-def groups_of(clip: LipClip) -> list[tuple[str, str]]:
-    """Return the kinds and names of the groups that a clip belongs to."""
+def pool(scores: Sequence[ClipScore]) -> list[LipScore]:
+    """Pool the scores of clips by group and scheme."""
+    members: dict[tuple[str, str], dict[tuple[str, float | None], list[ClipScore]]] = {}
+    for score in scores:
+        for group in _groups_of(score.clip).items():
+            key = score.scheme.name, score.scheme.delay_s
+            members.setdefault(group, {}).setdefault(key, []).append(score)
     return [
-        ("all", "all"),
-        ("language", clip.language),
-        ("source", clip.source),
-        ("speaker", clip.speaker or "unknown"),
+        _pool(*group, *key, pooled)
+        for group in sorted(members)
+        for key, pooled in members[group].items()
     ]
 
 
-def pool(scores: Sequence[ClipScore]) -> list[LipScore]:
-    """Pool the scores of clips by group and scheme."""
-    members: dict[tuple[str, str, str, float | None], list[ClipScore]] = {}
-    for kind, name in sorted({group for score in scores for group in groups_of(score.clip)}):
-        for score in scores:
-            if (kind, name) in groups_of(score.clip):
-                members.setdefault((kind, name, score.scheme, score.delay_s), []).append(score)
-    return [_pool(*key, group) for key, group in members.items()]
+def _groups_of(clip: LipClip) -> dict[str, str]:
+    """Return the groups that a clip belongs to, by kind."""
+    speaker = clip.speaker or "unknown"
+    return {"all": "all", "language": clip.language, "source": clip.source, "speaker": speaker}
 
 
 def _pool(

@@ -47,13 +47,7 @@ def sample_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
 def corpus_sentences(
     model: AcousticModel, corpus: Path, split: str, audio: Path | None = None
 ) -> list[Sentence]:
-    """Read twenty sentences of a split of a corpus.
-
-    Raises
-    ------
-    UserError
-        If the corpus does not exist, or the split has no usable recording.
-    """
+    """Read twenty sentences of a split of a corpus; raises UserError if it has none."""
     errors = RowErrors()
     utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
     if not utterances:

@@ -23,6 +23,7 @@ import contextlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.key_frames import key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -90,13 +91,7 @@ def accuracy_of(made: Array, real: Array) -> float:
 
 
 def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list[RateScore]:
-    """Score all methods on the Mandarin clips of a part ("choice" or "held") that are in sync.
-
-    Raises
-    ------
-    UserError
-        If there are no such clips.
-    """
+    """Score all methods on the Mandarin clips of a part ("choice" or "held") that are in sync."""
     clips = [clip for clip in read_clips(folder) if clip.part == part and clip.is_in_sync]
     if not clips:
         raise UserError(f"{folder} has no {part} clips in sync")
@@ -146,12 +141,7 @@ def _accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
 def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
     """Return the mean mouth of each phone that occurs at least 3 times, NaN where never measured.
 
-    Parameters
-    ----------
-    symbols
-        The phone of each mouth.
-    mouths
-        FAPs (num_mouths, num_mouth_faps), NaN where not measured.
+    ``symbols`` has the phone of each mouth; mouths are FAPs (num_mouths, num_mouth_faps).
     """
     means = []
     for symbol in sorted(set(symbols)):
@@ -198,22 +188,16 @@ def _methods(
     table = load_table(inventory)
     by_endpoints = time_text(progress_of(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
-        yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
+        motion = key_frames_of(timed, table, inventory.silence)
+        yield name, lambda times_s, motion=motion: faps_of(motion.openings_at(times_s))
     delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}
     events = live_events(model, samples, lip_predictor_for(model), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)
         frames = live_frames(lips, events[delay_s], delay_s, FRAME_RATE_HZ)
-        yield f"{name}, live", _curves_between(frames[:, np.array(MOUTH_FAPS) - 1])
-
-
-def _curves_of(motion: KeyFrames) -> Curves:
-    return lambda times_s: faps_of(motion.openings_at(times_s))
-
-
-def _curves_between(mouth: Array) -> Curves:
-    frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
-    return lambda times_s: _interpolate(times_s, frame_s, mouth)
+        mouth = frames[:, np.array(MOUTH_FAPS) - 1]
+        frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
+        yield f"{name}, live", partial(_interpolate, frame_s=frame_s, mouths=mouth)
 
 
 def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:

@@ -52,21 +52,9 @@ def ready(kind: str) -> bytes:
 
 
 def connected(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socket.socket:
-    """Connect and complete the handshake of a socket without keys.
+    """Connect from ``host`` to a port of this machine, with the handshake of a socket without keys.
 
-    Parameters
-    ----------
-    port
-        Port on this machine.
-    kind
-        ZeroMQ's name of the socket kind.
-    host
-        Source address.
-
-    Raises
-    ------
-    OSError
-        If the other end rejects the connection.
+    ``kind`` is ZeroMQ's name of the socket kind. Raises OSError if the other end refuses.
     """
     connection = socket.create_connection((LOCALHOST, port), 5.0, (host, 0))
     try:
@@ -191,6 +179,10 @@ def _random_message(number: int) -> list[bytes]:
     return [random.randbytes(random.choice((0, 1, 30, 3000))) for _ in range(random.randint(1, 4))]
 
 
+def _subscription(number: int) -> list[bytes]:
+    return [b"\x01" + b"%0120d" % number]
+
+
 def keyed_connections(endpoint: str, source: str, seconds: float) -> None:
     """Hold many ZeroMQ connections of one key."""
     end_s = time.monotonic() + seconds
@@ -239,28 +231,24 @@ def many_sessions(control: str, _source: str, seconds: float) -> None:
         time.sleep(max(0.0, end_s - time.monotonic()))
 
 
+_INPUTS = ("commands", "audio")
 ATTACKS: dict[str, Attack] = {
     BUSY_PROCESSOR: Attack(spin, ("",)),
     "random bytes": Attack(random_bytes, ("commands", "audio", "faps", "page")),
     "half-open connections": Attack(half_open_connections, ("commands", "audio", "faps", "page")),
     "endless handshake": Attack(endless_handshake, ("commands", "audio", "faps")),
-    "huge messages": Attack(
-        _send(lambda _: [bytes(64 * 2**20)]), ("commands", "audio"), has_key=True
-    ),
-    "messages of many parts": Attack(
-        _send(lambda _: [bytes(300)] * 300_000), ("commands", "audio"), has_key=True
-    ),
-    "flood of large messages": Attack(
-        _send(lambda _: [bytes(65_000)]), ("commands", "audio"), has_key=True
-    ),
-    "flood of small messages": Attack(
-        _send(lambda _: [bytes(10)]), ("commands", "audio"), has_key=True
-    ),
-    "malformed messages": Attack(_send(_random_message), ("commands", "audio"), has_key=True),
-    "many subscriptions": Attack(
-        _send(lambda number: [b"\x01" + b"%0120d" % number], zmq.XSUB), ("faps",), has_key=True
-    ),
-    "many connections": Attack(keyed_connections, ("commands", "audio"), has_key=True),
-    "silent subscribers": Attack(silent_subscribers, ("commands",), has_key=True),
-    "many sessions": Attack(many_sessions, ("commands",), has_key=True),
+    **{
+        name: Attack(run, targets, has_key=True)
+        for name, run, targets in (
+            ("huge messages", _send(lambda _: [bytes(64 * 2**20)]), _INPUTS),
+            ("messages of many parts", _send(lambda _: [bytes(300)] * 300_000), _INPUTS),
+            ("flood of large messages", _send(lambda _: [bytes(65_000)]), _INPUTS),
+            ("flood of small messages", _send(lambda _: [bytes(10)]), _INPUTS),
+            ("malformed messages", _send(_random_message), _INPUTS),
+            ("many subscriptions", _send(_subscription, zmq.XSUB), ("faps",)),
+            ("many connections", keyed_connections, _INPUTS),
+            ("silent subscribers", silent_subscribers, ("commands",)),
+            ("many sessions", many_sessions, ("commands",)),
+        )
+    },
 }

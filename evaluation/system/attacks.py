@@ -27,7 +27,6 @@ from rich.table import Table
 
 from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import percentiles, stream
-from kouxing.evaluation.system.memory import Memory
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -40,6 +39,38 @@ PHASE_S = 3.0
 SESSION_START_S = 0.5
 RELEASE_DEADLINE_S = 15.0
 RELEASED_MB = 4.0  # a service that has grown by no more has released the memory
+
+
+class Memory:
+    """Memory of a process, relative to when this object was made; MB of 2^20 bytes."""
+
+    def __init__(self, process_id: int) -> None:
+        self._folder = Path(f"/proc/{process_id}")
+        (self._folder / "clear_refs").write_text("5")  # resets the peak
+        self._start_mb = self._read_mb("VmRSS")
+
+    @property
+    def growth_mb(self) -> float:
+        """Peak growth since the start."""
+        return self._read_mb("VmHWM") - self._start_mb
+
+    @property
+    def kept_mb(self) -> float:
+        """Growth at present."""
+        return self._read_mb("VmRSS") - self._start_mb
+
+    def wait_until_kept(self, limit_mb: float, timeout_s: float = 10.0) -> bool:
+        """Wait until ``kept_mb`` is at most ``limit_mb``; return False after the timeout."""
+        end_s = time.monotonic() + timeout_s
+        while self.kept_mb > limit_mb:
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(0.05)
+        return True
+
+    def _read_mb(self, name: str) -> float:
+        lines = (self._folder / "status").read_text("ascii").splitlines()
+        return int(next(line.split()[1] for line in lines if line.startswith(f"{name}:"))) / 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +89,8 @@ class Damage:
 def measure(path: Path, names: Collection[str], console: Console) -> list[Damage]:
     """Start the services, attack them and return the figures.
 
-    Parameters
-    ----------
-    path
-        Audio file that the other client streams.
-    names
-        Keys of ``ATTACKS``. If empty, run all.
-    console
-        For progress messages.
-
-    Raises
-    ------
-    UserError
-        If an attack does not exist, the file is not audio, or the services cannot start.
+    The other client streams the file. ``names`` are keys of ``ATTACKS``; if empty, all run. Raises
+    UserError for an unknown attack, or if the file is not audio.
     """
     if unknown := [name for name in names if name not in ATTACKS]:
         raise UserError(f"no attack is named {unknown[0]!r}; choose from {', '.join(ATTACKS)}")
@@ -155,17 +175,14 @@ def _attacker(name: str, endpoint: str, source: str) -> Iterator[None]:
     start = context.Event()
     process = context.Process(target=_attack, args=(name, endpoint, source, start), daemon=True)
     process.start()
-    timers = [
-        threading.Timer(PHASE_S + SESSION_START_S, start.set),
-        threading.Timer(2 * PHASE_S + SESSION_START_S, process.terminate),
-    ]
-    for timer in timers:
-        timer.start()
+    begin = threading.Timer(PHASE_S + SESSION_START_S, start.set)
+    end = threading.Timer(2 * PHASE_S + SESSION_START_S, process.terminate)
+    begin.start()
+    end.start()
     try:
         yield
     finally:
-        for timer in timers:
-            timer.join()
+        end.join()
         process.join()
 
 

@@ -24,23 +24,10 @@ def is_installed() -> bool:
 
 
 class Chromium:
-    """A headless Chromium with one page, drawn without a GPU.
+    """A headless Chromium with one page, drawn without a GPU; raises UserError if not installed.
 
-    Parameters
-    ----------
-    folder
-        Folder for the profile.
-    size_px
-        Size of the page.
-    microphone
-        WAV file that the microphone repeats.
-    camera
-        MJPEG file that the camera repeats at 30 frames per second.
-
-    Raises
-    ------
-    UserError
-        If Chromium is not installed.
+    The microphone repeats a WAV file, the camera an MJPEG file at 30 frames per second. ``folder``
+    is for the profile.
     """
 
     def __init__(
@@ -55,10 +42,8 @@ class Chromium:
                 *("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle"),
                 *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
                 *("--no-first-run", "--disable-background-networking", "--disable-sync"),
-                *(
-                    "--disable-component-update",
-                    "--autoplay-policy=document-user-activation-required",
-                ),
+                "--disable-component-update",
+                "--autoplay-policy=document-user-activation-required",
                 *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
                 f"--use-file-for-fake-audio-capture={microphone}",
                 *([f"--use-file-for-fake-video-capture={camera}"] if camera else []),

@@ -40,30 +40,16 @@ class Continuity:
 def compare(
     seen: Seen, undisturbed: Seen, silence: str, delay_s: float, *, fault_s: float
 ) -> Continuity:
-    """Compare a session with one without a fault.
-
-    Parameters
-    ----------
-    seen, undisturbed
-        Results with and without the fault.
-    silence
-        Symbol of silence.
-    delay_s
-        Delay of the synthesizer.
-    fault_s
-        Time of the fault.
-    """
+    """Compare results with a fault at ``fault_s`` with those without; ``delay_s`` is the face's."""
     arrived_s = np.array([arrival_s for arrival_s, _ in seen.frames])
     times = np.array([frame.media_time for _, frame in seen.frames], np.int64)
     newest = np.maximum.accumulate(np.concatenate([[-1], times]))[:-1]  # before each frame
     is_new = times > newest
     is_rest = np.diff(times, prepend=-1) == 0
-    errors = count_errors(
-        *(
-            [phone.symbol for phone in record.final_phones(silence)]
-            for record in (undisturbed, seen)
-        )
+    said, heard = (
+        [phone.symbol for phone in record.final_phones(silence)] for record in (undisturbed, seen)
     )
+    errors = count_errors(said, heard)
     due_s = seen.start_s + delay_s + times / MEDIA_RATE_HZ
     is_live = is_new & (arrived_s < seen.live_until_s)
     late_s = (arrived_s - due_s)[is_live]
@@ -115,16 +101,10 @@ def largest_steps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
 def staleness(
     followed: Sequence[tuple[float, int]], seen: Seen, since_s: float
 ) -> NDArray[np.float64]:
-    """Return how late another subscriber received frames, in seconds.
+    """Return how late another subscriber received frames since a time, in seconds.
 
-    Parameters
-    ----------
-    followed
-        Arrival and media time of each frame at that subscriber.
-    seen
-        Results of a subscriber without delays.
-    since_s
-        Earlier arrivals do not count.
+    ``followed`` has arrival and media time of each of its frames, ``seen`` the results of a
+    subscriber without delays.
     """
     in_time_s = {frame.media_time: arrival_s for arrival_s, frame in reversed(seen.frames)}
     return np.array(

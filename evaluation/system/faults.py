@@ -68,13 +68,14 @@ class Timing:
 TIMING = Timing()
 
 Action = tuple[float, Callable[[], object]]  # seconds after the first sample, function
+Actions = Callable[[Any, str, Timing], list[Action]]
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
     """A fault in a live session."""
 
-    actions: Callable[[Any, str, Timing], list[Action]]  # by system and session name
+    actions: Actions  # by system and session name
     spare: str = ""  # kind of which a second worker runs; then services do not restart
     num_sessions: int = 1
     stops_subscriber: bool = False  # a second subscriber, not the measured one
@@ -97,28 +98,19 @@ class Outcome:
     load: float  # load average of the last minute
 
 
-def _kill(service: str) -> Callable[[System, str, Timing], list[Action]]:
-    """Return a fault that kills the process that serves the session."""
-    return lambda system, session, timing: [
-        _signal(system.process_of(session, service), signal.SIGKILL, timing.fault_at_s)
-    ]
+def _signal(service: str, number: int) -> Actions:
+    """Return a fault that signals the process that serves the session."""
+
+    def actions(system: System, session: str, timing: Timing) -> list[Action]:
+        process_id = system.process_of(session, service)
+        if number == signal.SIGSTOP:
+            return _stopped(process_id, timing.fault_at_s, timing.frozen_s)
+        return [_send_signal(process_id, number, timing.fault_at_s)]
+
+    return actions
 
 
-def _stop(service: str) -> Callable[[System, str, Timing], list[Action]]:
-    """Return a fault that stops the process that serves the session for some time."""
-    return lambda system, session, timing: _stopped(
-        system.process_of(session, service), timing.fault_at_s, timing.frozen_s
-    )
-
-
-def _hang(service: str) -> Callable[[System, str, Timing], list[Action]]:
-    """Return a fault that blocks the loop of the process that serves the session."""
-    return lambda system, session, timing: [
-        _signal(system.process_of(session, service), signal.SIGUSR1, timing.fault_at_s)
-    ]
-
-
-def _signal(process_id: int, number: int, at_s: float) -> Action:
+def _send_signal(process_id: int, number: int, at_s: float) -> Action:
     def send() -> None:
         with contextlib.suppress(ProcessLookupError):  # the supervisor has ended it
             os.kill(process_id, number)
@@ -128,8 +120,8 @@ def _signal(process_id: int, number: int, at_s: float) -> Action:
 
 def _stopped(process_id: int, at_s: float, for_s: float) -> list[Action]:
     return [
-        _signal(process_id, signal.SIGSTOP, at_s),
-        _signal(process_id, signal.SIGCONT, at_s + for_s),
+        _send_signal(process_id, signal.SIGSTOP, at_s),
+        _send_signal(process_id, signal.SIGCONT, at_s + for_s),
     ]
 
 
@@ -155,14 +147,14 @@ def _nothing(_system: System, _session: str, _timing: Timing) -> list[Action]:
     return []
 
 
-def _cut(which: str, *, is_mended: bool) -> Callable[[HostsSystem, str, Timing], list[Action]]:
+def _cut(which: str, *, is_mended: bool) -> Actions:
     """Return a fault that cuts off a host, for some time or permanently.
 
     ``which`` is the client's host, or the kind of the service that serves the session.
     """
 
     def actions(system: HostsSystem, session: str, timing: Timing) -> list[Action]:
-        host = which if which == CLIENT else system.host_of(session, which)
+        host = which if which == CLIENT else system.instance_of(session, which)
         cut: Action = timing.fault_at_s, functools.partial(system.network.cut, host)
         mend: Action = timing.fault_at_s + timing.cut_s, system.network.mend
         return [cut, mend] if is_mended else [cut]
@@ -171,15 +163,25 @@ def _cut(which: str, *, is_mended: bool) -> Callable[[HostsSystem, str, Timing],
 
 
 _WORKERS = ("recognizer", "synthesizer")
+_SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP, "hangs": signal.SIGUSR1}
+_SPARED = (
+    ("killed", False),
+    ("killed", True),
+    ("stopped", True),
+    ("hangs", True),
+    ("stopped", False),
+    ("hangs", False),
+)  # what happens to a worker, and whether there is one more
 FAULTS = {
     "none": Fault(_nothing, is_sudden=False),
-    **{f"{worker} killed": Fault(_kill(worker)) for worker in _WORKERS},
-    **{f"{worker} killed, one more": Fault(_kill(worker), worker) for worker in _WORKERS},
-    **{f"{worker} stopped, one more": Fault(_stop(worker), worker) for worker in _WORKERS},
-    **{f"{worker} hangs, one more": Fault(_hang(worker), worker) for worker in _WORKERS},
-    **{f"{worker} stopped": Fault(_stop(worker)) for worker in _WORKERS},
-    **{f"{worker} hangs": Fault(_hang(worker)) for worker in _WORKERS},
-    "control killed": Fault(_kill("control")),
+    **{
+        f"{worker} {event}" + (", one more" if is_spared else ""): Fault(
+            _signal(worker, _SIGNALS[event]), worker if is_spared else ""
+        )
+        for event, is_spared in _SPARED
+        for worker in _WORKERS
+    },
+    "control killed": Fault(_signal("control", signal.SIGKILL)),
     "busy machine": Fault(_busy, is_sudden=False),
     f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS, is_sudden=False),
     "a subscriber stopped": Fault(_nothing, stops_subscriber=True, is_sudden=False),
@@ -207,25 +209,10 @@ def measure(
     console: Console,
     timing: Timing,
 ) -> Iterator[Outcome]:
-    """Run faults one after another; yield the effects of each.
+    """Stream an audio file during faults, one after another; yield the effects of each.
 
-    Parameters
-    ----------
-    path
-        Audio file to stream.
-    names
-        Keys of ``FAULTS``. If empty, run all.
-    logs
-        Folder for the services' logs, with a subfolder for each fault and instant.
-    console
-        For progress messages.
-    timing
-        Durations.
-
-    Raises
-    ------
-    UserError
-        If a fault does not exist, or the file is not audio.
+    ``names`` are keys of ``FAULTS``; if empty, all run. ``logs`` gets a subfolder for each fault
+    and instant. Raises UserError for an unknown fault, or if the file is not audio.
     """
     unknown = sorted(set(names) - set(FAULTS))
     if unknown:
@@ -250,33 +237,24 @@ def measure(
 
 
 def _worst(outcomes: Sequence[Outcome]) -> Outcome:
-    """Return the worst value of outcome figure."""
+    """Return the worst value of each figure."""
     faces = [outcome.face for outcome in outcomes if outcome.face is not None]
     late_ms = [outcome.late_p95_ms for outcome in outcomes if outcome.late_p95_ms is not None]
+    numbers = ("old_frames", "num_refused", "stale_frames", "stalest_s", "load")
     return Outcome(
         fault=outcomes[0].fault,
         failure="; ".join(sorted({outcome.failure for outcome in outcomes} - {""})),
         face=worst(faces) if faces else None,
-        old_frames=max(outcome.old_frames for outcome in outcomes),
-        num_refused=max(outcome.num_refused for outcome in outcomes),
         late_p95_ms=max(late_ms, default=None),
-        stale_frames=max(outcome.stale_frames for outcome in outcomes),
-        stalest_s=max(outcome.stalest_s for outcome in outcomes),
-        load=max(outcome.load for outcome in outcomes),
+        **{name: max(getattr(outcome, name) for outcome in outcomes) for name in numbers},
     )
 
 
 def show(outcomes: Collection[Outcome], console: Console) -> None:
     """Print the figures as a table, and which sessions did not complete."""
     table = Table(
-        "fault",
-        "stopped s",
-        "late s",
-        "phones lost, doubled, changed",
-        "frames lost, doubled, old, at rest",
-        "largest step",
-        "p50, p95 ms",
-        "load",
+        *("fault", "stopped s", "late s", "phones lost, doubled, changed"),
+        *("frames lost, doubled, old, at rest", "largest step", "p50, p95 ms", "load"),
     )
     for outcome in outcomes:
         face = outcome.face
@@ -285,11 +263,11 @@ def show(outcomes: Collection[Outcome], console: Console) -> None:
             notes.append(f"{outcome.num_refused} refused")
         if outcome.stale_frames:
             notes.append(f"{outcome.stale_frames} stale frames, of up to {outcome.stalest_s:.1f} s")
-        figures = ["no frame"]
+        cells = ["no frame"]
         if face is not None:
             phones = face.phones_lost, face.phones_doubled, face.phones_changed
             frames = face.frames_lost, face.frames_doubled, outcome.old_frames, face.rest_frames
-            figures = [
+            cells = [
                 f"{face.stood_s:.2f}",
                 f"{face.late_s:.2f}",
                 f"{', '.join(map(str, phones))} of {face.phones}",
@@ -298,7 +276,7 @@ def show(outcomes: Collection[Outcome], console: Console) -> None:
                 f"{face.late_p50_ms:.0f}, {outcome.late_p95_ms:.0f}",
                 f"{outcome.load:.1f}",
             ]
-        table.add_row("; ".join([outcome.fault, *notes]), *figures)
+        table.add_row("; ".join([outcome.fault, *notes]), *cells)
     console.print(table)
 
 
@@ -366,14 +344,9 @@ def _outcome(
             with contextlib.suppress(KouxingError):  # already closed
                 session.close()
     failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
+    fault_s, expected = start_s + timing.fault_at_s, undisturbed[len(sound)]
     faces = [
-        compare(
-            seen,
-            undisturbed[len(sound)],
-            silence,
-            delay_s,
-            fault_s=start_s + timing.fault_at_s,
-        )
+        compare(seen, expected, silence, delay_s, fault_s=fault_s)
         for seen in all_seen
         if seen.frames
     ]
@@ -405,10 +378,26 @@ def _second_subscriber(
     if not stopped_s:
         yield frames
         return
-    subscriber = _SubscriberProcess(system.control, session)
-    actions += _stopped(subscriber.process_id, timing.fault_at_s, stopped_s)
+    environment = {**os.environ, variable(COMMON, "control"): system.control.partition(" ")[0]}
+    process = subprocess.Popen(  # noqa: S603 - our own module; prints a line for each frame
+        [sys.executable, "-m", "kouxing", "listen", session],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+
+    def read(lines: IO[str]) -> None:
+        with lines:
+            for line in lines:
+                frames.append((time.monotonic(), to_samples(float(line.split()[0]))))
+
+    reader = threading.Thread(target=read, args=(process.stdout,))
+    reader.start()
+    actions += _stopped(process.pid, timing.fault_at_s, stopped_s)
     yield frames
-    frames += subscriber.frames()
+    reader.join()
+    process.wait()
 
 
 def _open_all(client: Client, num: int) -> tuple[list[Session], int]:
@@ -421,37 +410,3 @@ def _open_all(client: Client, num: int) -> tuple[list[Session], int]:
         except Refused:
             num_refused += 1
     return sessions, num_refused
-
-
-class _SubscriberProcess:
-    """A process that prints each frame; records when its lines arrive."""
-
-    def __init__(self, control: str, session: str) -> None:
-        environment = {**os.environ, variable(COMMON, "control"): control.partition(" ")[0]}
-        self._process = subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", "kouxing", "listen", session],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        self._frames: list[tuple[float, int]] = []  # arrival in s, media time in samples
-        self._reader = threading.Thread(target=self._read, args=(self._process.stdout,))
-        self._reader.start()
-
-    @property
-    def process_id(self) -> int:
-        """Id of the process."""
-        return self._process.pid
-
-    def frames(self) -> list[tuple[float, int]]:
-        """Return arrival and media time of all frames, once the session has ended."""
-        self._reader.join()
-        self._process.wait()
-        return self._frames
-
-    def _read(self, lines: IO[str]) -> None:
-        with lines:
-            for line in lines:
-                media_time = to_samples(float(line.split()[0]))
-                self._frames.append((time.monotonic(), media_time))

@@ -47,13 +47,7 @@ class Latency:
 
 
 def measure(path: Path, num_repeats: int, console: Console) -> Latency:
-    """Start the services, stream the file and return the figures.
-
-    Raises
-    ------
-    UserError
-        If the file is not audio or the services cannot start.
-    """
+    """Start the services, stream the file and return the figures; UserError if that fails."""
     samples, rate_hz = read_audio(path)
     delay_s = SynthesizerConfig().delay_ms / 1e3
     with (

@@ -104,16 +104,8 @@ def speak(
 ) -> list[Seen]:
     """Stream the same audio into sessions and return what each of them received.
 
-    Parameters
-    ----------
-    sessions
-        Open sessions with 32-bit floats at 16 kHz.
-    sound
-        Samples, shape (n,).
-    paced
-        Send in real time; otherwise as fast as the session accepts.
-    on_step
-        Called every few milliseconds.
+    The sessions take 32-bit floats at 16 kHz, in real time if ``paced``, otherwise as fast as they
+    accept. ``on_step`` is called every few milliseconds.
     """
     speakers = [_Speaker(session, sound, paced=paced) for session in sessions]
     while any(speaker.is_speaking for speaker in speakers):
@@ -126,10 +118,7 @@ def speak(
 def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
     """Return what a session receives for audio without any fault; it is not paced.
 
-    Raises
-    ------
-    UserError
-        If results are missing every time, as on a machine that is too busy.
+    Raises UserError if results are missing every time, as on a machine that is too busy.
     """
     for _ in range(NUM_TRIES):
         session = client.open_session(encoding="f32le", paced=False)

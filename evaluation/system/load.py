@@ -11,22 +11,26 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kouxing_client import Client
+from kouxing_client import Client, FapFrame, Refused, Session
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.system.latency import percentiles
-from kouxing.evaluation.system.speakers import Crowd, read_text
+from kouxing.evaluation.system.live import CHUNK
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.kinds import read_settings
+from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 
@@ -37,6 +41,9 @@ SETTLE_S = 3.0  # start of a step, which is not measured
 DRAIN_S = 0.3  # from the last chunk to the end of the sessions
 PAUSE_S = 1.0  # between steps
 MAX_LOST_S = 60.0
+CHUNK_S = CHUNK / MEDIA_RATE_HZ
+VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, relative to the recording
+_OFFSET = 0.618  # from one speaker to the next, relative to the text: no two are close
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,23 +111,10 @@ def measure(
 ) -> Load:
     """Start control, a recognizer and a synthesizer, put them under load, return the figures.
 
-    Parameters
-    ----------
-    paths
-        Recordings to speak.
-    num_sessions
-        Number of sessions of the last step.
-    step_s
-        Measured time of each step.
-    console
-        For progress messages.
-
-    Raises
-    ------
-    UserError
-        If a file is not audio or the services cannot start.
+    The last step has ``num_sessions``; each is measured for ``step_s``. Raises UserError if a file
+    is not audio or the services cannot start.
     """
-    text = read_text(paths)
+    text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
     settings = {"KOUXING_CONTROL_MAX_SESSIONS": "2000"}  # so that only load causes refusals
     delay_s = read_settings().load(SynthesizerConfig).delay_ms / 1e3
@@ -141,7 +135,9 @@ def step_sizes(maximum: int) -> list[int]:
     return sorted({1, *(max(1, round(maximum * n / MAX_STEPS)) for n in range(1, MAX_STEPS + 1))})
 
 
-def _step(control: str, text: Any, number: int, step_s: float, delay_s: float) -> Step:
+def _step(
+    control: str, text: NDArray[np.float32], number: int, step_s: float, delay_s: float
+) -> Step:
     with connect(control) as client:
         crowd = Crowd(client, text, number)
         crowd.start()
@@ -187,13 +183,7 @@ class Usage:
 
 
 def usage_of(client: Client) -> dict[str, Usage]:
-    """Return the resources used by each service; wait for services that are lost.
-
-    Raises
-    ------
-    UserError
-        If a service stays lost.
-    """
+    """Return the resources used by each service; raises UserError if one stays lost."""
     end_s = time.monotonic() + MAX_LOST_S
     while True:
         states = client.status().services
@@ -260,9 +250,8 @@ def draw(load: Load) -> Any:
     for key in ("p50", "p95"):
         values = [step.delay_ms.get(key, float("nan")) for step in load.steps]
         delay.plot(requested, values, "o-", label=f"{key}, all sessions")
-    delay.plot(
-        requested, [step.worst_p95_ms for step in load.steps], "s--", label="p95, worst session"
-    )
+    worst = [step.worst_p95_ms for step in load.steps]
+    delay.plot(requested, worst, "s--", label="p95, worst session")
     delay.axhline(LIMIT_MS, color="grey", linestyle=":", label=f"limit, {LIMIT_MS:g} ms")
     delay.set_yscale("log")
     delay.set_ylabel("latency without the delay, ms")
@@ -273,12 +262,10 @@ def draw(load: Load) -> Any:
         right.set_ylim(bottom=0)
         right.set_ylabel("sessions admitted")
     for service in load.steps[0].cpu_cores:
-        cpu.plot(
-            requested, [step.cpu_cores.get(service) for step in load.steps], "o-", label=service
-        )
-        memory.plot(
-            requested, [step.memory_mb.get(service) for step in load.steps], "o-", label=service
-        )
+        cores = [step.cpu_cores.get(service) for step in load.steps]
+        memory_mb = [step.memory_mb.get(service) for step in load.steps]
+        cpu.plot(requested, cores, "o-", label=service)
+        memory.plot(requested, memory_mb, "o-", label=service)
     cpu.plot(requested, [step.client_cpu_cores for step in load.steps], "k:", label="this client")
     cpu.set_ylabel("cores busy")
     memory.set_ylabel("memory, MB")
@@ -286,6 +273,108 @@ def draw(load: Load) -> Any:
         axes.set_xlabel("requested sessions")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-    for axes in (cpu, memory):
-        axes.set_ylim(bottom=0)
+        if axes is not delay:
+            axes.set_ylim(bottom=0)
     return figure
+
+
+def voiced(text: NDArray[np.float32], number: int) -> NDArray[np.float32]:
+    """Return the audio of a speaker: the text from another position, in another voice."""
+    rotated = np.roll(text, -round(number * _OFFSET * len(text)) % len(text))
+    voice = VOICES[number % len(VOICES)]
+    return rotated if voice == 1.0 else to_16_khz(rotated[:, None], round(MEDIA_RATE_HZ * voice))
+
+
+@dataclass(slots=True)
+class Spoken:
+    """A speaker's session, and the arrival times of its frames."""
+
+    session: Session
+    sound: bytes  # 16-bit samples, repeated
+    start_s: float = 0.0  # when the first sample was due, by ``time.perf_counter``
+    num_sent: int = 0  # chunks
+    num_rest: int = 0  # frames of a silent client, though the speaker was not silent
+    arrived_s: dict[int, float] = field(default_factory=dict)  # first arrival, by media time
+
+    @property
+    def due_s(self) -> float:
+        """When the last sample of the next chunk is due."""
+        return self.start_s + (self.num_sent + 1) * CHUNK_S
+
+    def send(self) -> None:
+        """Send the next chunk; skip it if the queue is full."""
+        size = 2 * CHUNK
+        at = self.num_sent * size % (len(self.sound) // size * size)
+        self.num_sent += 1
+        if not self.session.try_push(self.sound[at : at + size]):
+            self.session.skip(CHUNK)
+
+    def record(self, frame: FapFrame) -> None:
+        """Record the arrival of a frame."""
+        if frame.media_time not in self.arrived_s:
+            self.arrived_s[frame.media_time] = time.perf_counter()
+        elif frame.media_time > 0:  # earlier, the speaker has not started
+            self.num_rest += 1
+
+    def delays_s(self, delay_s: float, from_s: float, until_s: float) -> Iterator[float]:
+        """Yield the latencies of all frames whose audio was due in an interval, seconds.
+
+        The synthesizer's delay is subtracted. Missing frames count as if they had arrived at the
+        end. A chunk counts from when it was due, so a late client makes figures worse.
+        """
+        rate_hz = self.session.info["facts"]["frame_rate_hz"]
+        for number in range(int((until_s - self.start_s) * rate_hz)):
+            media_time = round(number / rate_hz * MEDIA_RATE_HZ)
+            needed = -(-(media_time + round(delay_s * MEDIA_RATE_HZ)) // CHUNK)  # chunks
+            due_s = self.start_s + max(1, needed) * CHUNK_S
+            if from_s <= due_s < until_s:
+                yield min(self.arrived_s.get(media_time, until_s), until_s) - due_s
+
+
+class Crowd:
+    """Sessions of one client with audio in real time, whose chunks are spread evenly."""
+
+    def __init__(self, client: Client, text: NDArray[np.float32], num_speakers: int) -> None:
+        self.spoken: list[Spoken] = []  # admitted
+        self.refusals: dict[str, int] = {}  # number by code
+        self.lateness_s: list[float] = []  # how late each chunk was sent
+        self._turn = 0  # index of the next speaker
+        for number in range(num_speakers):
+            try:
+                session = client.open_session()
+            except Refused as refusal:
+                self.refusals[refusal.code] = self.refusals.get(refusal.code, 0) + 1
+                continue
+            sound = np.clip(voiced(text, number), -1.0, 1.0)
+            spoken = Spoken(session, np.round(sound * 32767).astype("<i2").tobytes())
+            session.results(FapFrame, on_result=spoken.record)
+            self.spoken.append(spoken)
+
+    def start(self) -> None:
+        """Start all speakers."""
+        now_s = time.perf_counter()
+        for number, spoken in enumerate(self.spoken):
+            spoken.start_s = now_s + CHUNK_S * number / len(self.spoken)
+
+    def speak_until(self, end_s: float) -> None:
+        """Speak until a time of ``time.perf_counter``."""
+        while (now_s := time.perf_counter()) < end_s:
+            if not self.spoken:
+                time.sleep(end_s - now_s)
+                return
+            speaker = self.spoken[self._turn]  # all chunks are equally long
+            left_s = min(speaker.due_s, end_s) - now_s
+            if left_s > 0.0:
+                time.sleep(left_s)
+            else:
+                self.lateness_s.append(now_s - speaker.due_s)
+                speaker.send()
+                self._turn = (self._turn + 1) % len(self.spoken)
+                if self._turn == 0:
+                    for spoken in self.spoken:
+                        spoken.session.take_errors()  # refused audio shows as missing frames
+
+    def close(self) -> None:
+        """End all sessions."""
+        for spoken in self.spoken:
+            spoken.session.close()

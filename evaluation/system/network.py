@@ -42,19 +42,9 @@ class Link:
 
 
 class Network:
-    """Hosts with one address each.
+    """Up to 250 hosts with one address each; their names have up to 15 letters.
 
-    Parameters
-    ----------
-    hosts
-        Up to 250 names of up to 15 letters.
-    link
-        Connection between any two hosts.
-
-    Raises
-    ------
-    UserError
-        If this process is not root, a tool is missing, or namespaces are forbidden.
+    Raises UserError if this process is not root, a tool is missing, or namespaces are forbidden.
     """
 
     def __init__(self, hosts: Sequence[str], link: Link) -> None:

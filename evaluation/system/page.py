@@ -45,10 +45,7 @@ class Drawing:
 def measure(path: Path, console: Console) -> dict[str, Drawing]:
     """Start the services and a browser; return the figures when idle and with the microphone.
 
-    Raises
-    ------
-    UserError
-        If the file is not audio, the services cannot start, or Chromium is not installed.
+    Raises UserError if the file is not audio, or the services or Chromium cannot start.
     """
     samples, rate_hz = read_audio(path)
     with tempfile.TemporaryDirectory() as name:

@@ -7,13 +7,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Self
 
 from kouxing_client import Status
 from rich.console import Console
 
+from kouxing.evaluation.system.network import Network
 from kouxing.services.cli.supervisor import Supervisor
 from kouxing.services.kinds import KINDS, free_addresses, more_workers, read_settings
 from kouxing.shared.config import variable
@@ -31,56 +32,47 @@ PORTS = {  # of services on virtual hosts
 }
 
 
-class System(Protocol):
-    """Running services and their addresses."""
+class System:
+    """Running services."""
 
     control: str  # address and key
     key: Key  # of a client
 
     def on_client(self) -> contextlib.AbstractContextManager[None]:
         """Open the sockets of this thread on the client's host."""
+        return contextlib.nullcontext()
 
     def process_of(self, session: str, service: str) -> int:
         """Return the id of the process that serves a session."""
+        raise NotImplementedError
+
+    def instance_of(self, session: str, service: str) -> str:
+        """Return the instance of a service that serves a session; empty if none does."""
+        report = self.status()
+        workers = {
+            worker
+            for state in report.sessions
+            if state.session == session
+            for worker in state.workers.values()
+        }
+        served = (
+            state.instance
+            for state in report.services
+            if state.service == service and state.instance in workers
+        )
+        return next(served, "")
+
+    def status(self) -> Status:
+        """Return the status report of control."""
+        with self.on_client(), connect(self.control, key=self.key, timeout_s=2.0) as client:
+            return client.status()
 
 
-class Hosts(Protocol):
-    """Hosts of a ``HostsSystem``, such as a ``Network``."""
+class LocalSystem(System):
+    """Services on free ports of this host, which log to ``folder``.
 
-    def bound(self, host: str) -> str:
-        """Return the address that services on a host bind."""
-
-    def address(self, host: str, seen_from: str) -> str:
-        """Return the address of a host as seen from another one."""
-
-    def command(self, host: str, *command: str) -> list[str]:
-        """Return a command line that runs a command on a host."""
-
-    def on(self, host: str) -> contextlib.AbstractContextManager[None]:
-        """Open the sockets of this thread on a host."""
-
-    def cut(self, host: str) -> None:
-        """Drop all packets from and to a host."""
-
-    def mend(self) -> None:
-        """Connect all hosts again."""
-
-
-class LocalSystem:
-    """Services on free ports of this host. A service that ends restarts, unless it has a spare.
-
-    Parameters
-    ----------
-    folder
-        Folder for the logs.
-    services
-        Kinds of services.
-    settings
-        Additional environment variables.
-    spare
-        Kind of which a second one runs, or nothing.
-    insecure
-        Run without keys.
+    ``settings`` are environment variables. A second worker of the kind ``spare`` runs, if it is not
+    empty. A service that ends restarts, unless there is a spare.
     """
 
     def __init__(
@@ -91,16 +83,15 @@ class LocalSystem:
         services: Collection[str] = tuple(KINDS),
         settings: Mapping[str, str] | None = None,
         spare: str = "",
-        insecure: bool = False,
     ) -> None:
         environment = {
             **free_addresses(services),
             "KOUXING_DRIVER_VIEW": "none",
-            "KOUXING_INSECURE": str(insecure),
+            "KOUXING_INSECURE": "false",
             "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
             **(settings or {}),
         }
-        self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=insecure)
+        self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
         self.key = user_key()
         self._spare_kind = spare
         self._spare_name = f"{spare}-2"
@@ -125,23 +116,19 @@ class LocalSystem:
     def __exit__(self, *_: object) -> None:
         self.supervisor.stop()
 
-    def on_client(self) -> contextlib.AbstractContextManager[None]:
-        """Do nothing: there is only one host."""
-        return contextlib.nullcontext()
-
     def process_of(self, session: str, service: str) -> int:
         """Return the id of the process that serves a session."""
-        is_spare = instance_of(self, session, service) == SPARE
+        is_spare = self.instance_of(session, service) == SPARE
         return self.supervisor.process_number(self._spare_name if is_spare else service)
 
 
-class HostsSystem:
+class HostsSystem(System):
     """Control, recognizer and synthesizer on one host each, and perhaps a spare worker.
 
     The keys are created on control's host and copied to the others, as in docs/hosts.md.
     """
 
-    def __init__(self, logs: Path, states: Path, network: Hosts, spare: str = "") -> None:
+    def __init__(self, logs: Path, states: Path, network: Network, spare: str = "") -> None:
         self.network = network
         self._logs = logs
         self._states = states  # folders of the hosts' keys
@@ -160,7 +147,7 @@ class HostsSystem:
         try:
             for host in self._services:
                 self._start(host)
-            wait_until_ready(self, self._services)
+            self._wait_until_ready()
         except BaseException:
             self.__exit__()
             raise
@@ -178,11 +165,7 @@ class HostsSystem:
 
     def process_of(self, session: str, service: str) -> int:
         """Return the id of the process that serves a session."""
-        return self._processes[self.host_of(session, service)].pid
-
-    def host_of(self, session: str, service: str) -> str:
-        """Return the host of the service that serves a session."""
-        return instance_of(self, session, service)
+        return self._processes[self.instance_of(session, service)].pid
 
     def _start(self, host: str) -> None:
         service, address = self._services[host], self.network.bound(host)
@@ -196,10 +179,26 @@ class HostsSystem:
             "KOUXING_ADVERTISE": self.network.address(host, CLIENT),
             "KOUXING_INSECURE": "false",
         }
-        command = self.network.command(host)
-        self._processes[host] = start(
-            service, host, self._logs, {**environment, **addresses}, command
-        )
+        command = self.network.command(host, sys.executable, "-m", f"kouxing.services.{service}")
+        environment |= {variable(service, "instance"): host}
+        with (self._logs / f"{host}.log").open("wb") as log:
+            self._processes[host] = subprocess.Popen(  # noqa: S603 - our own module
+                command,
+                env={**os.environ, **environment, **addresses},
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def _wait_until_ready(self) -> None:
+        """Wait until services have registered at control; raises UserError after READY_S."""
+        end_s = time.monotonic() + READY_S
+        while True:
+            with contextlib.suppress(UserError):  # control may not run yet
+                if {*self._services} <= {state.instance for state in self.status().services}:
+                    return
+            if time.monotonic() > end_s:
+                raise UserError(f"the services did not start within {READY_S:g} s")
+            time.sleep(0.1)
 
     def _control_for(self, host: str) -> str:
         return f"tcp://{self.network.address('control', host)}:{PORTS['control']['control']}"
@@ -219,57 +218,3 @@ class HostsSystem:
 
     def _state(self, host: str) -> Path:
         return self._states / host
-
-
-def start(
-    service: str,
-    instance: str,
-    folder: Path,
-    environment: Mapping[str, str],
-    command: Iterable[str] = (),
-) -> subprocess.Popen[bytes]:
-    """Start a service that logs to ``INSTANCE.log``; ``command`` runs it, on another host."""
-    with (folder / f"{instance}.log").open("wb") as log:
-        return subprocess.Popen(  # noqa: S603 - our own module
-            [*command, sys.executable, "-m", f"kouxing.services.{service}"],
-            env={**os.environ, **environment, variable(service, "instance"): instance},
-            stderr=log,
-            start_new_session=True,
-        )
-
-
-def wait_until_ready(system: System, instances: Iterable[str]) -> None:
-    """Wait until services have registered at control; raises UserError after READY_S."""
-    end_s = time.monotonic() + READY_S
-    while True:
-        with contextlib.suppress(UserError):  # control may not run yet
-            if {*instances} <= {state.instance for state in status(system).services}:
-                return
-        if time.monotonic() > end_s:
-            raise UserError(f"the services did not start within {READY_S:g} s")
-        time.sleep(0.1)
-
-
-def status(system: System) -> Status:
-    """Return the status report of control."""
-    with system.on_client(), connect(system.control, key=system.key, timeout_s=2.0) as client:
-        return client.status()
-
-
-def instance_of(system: System, session: str, service: str) -> str:
-    """Return the instance of a service that serves a session."""
-    report = status(system)
-    workers = {
-        worker
-        for state in report.sessions
-        if state.session == session
-        for worker in state.workers.values()
-    }
-    return next(
-        (
-            state.instance
-            for state in report.services
-            if state.service == service and state.instance in workers
-        ),
-        "",
-    )

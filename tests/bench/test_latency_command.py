@@ -17,8 +17,8 @@ pytestmark = pytest.mark.bench
 def test_prints_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("kouxing.evaluation.system.rendering.NUM_IMAGES", 10)
-    monkeypatch.setattr("kouxing.evaluation.system.sessions.NUM_SESSIONS", (1, 2))
+    monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_IMAGES", 10)
+    monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_SESSIONS", (1, 2))
     monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 2.0)
     figures = tmp_path / "latency.json"

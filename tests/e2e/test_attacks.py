@@ -7,7 +7,7 @@ from kouxing_client import Session
 
 from kouxing.evaluation.system import attackers
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
-from kouxing.evaluation.system.memory import Memory
+from kouxing.evaluation.system.attacks import Memory
 from tests.raw_bytes import pour
 from tests.system import System
 

@@ -17,7 +17,7 @@ from kouxing_client import Client
 
 from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link, Network
-from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, Hosts, HostsSystem
+from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
 from tests.e2e.following import samples_of_file
@@ -31,9 +31,8 @@ SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 
 
 @contextlib.contextmanager
-def hosts(*names: str, link: Link) -> Iterator[Hosts]:
+def hosts(*names: str, link: Link) -> Iterator[Network]:
     with contextlib.ExitStack() as stack:
-        network: Hosts
         try:
             network = stack.enter_context(Network(names, link))
         except UserError:  # not allowed here
@@ -59,7 +58,7 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
     session = client.open_session(encoding="f32le")
     begin_s = time.monotonic()
     if host and host != CLIENT:
-        host = system.host_of(session.name, host)
+        host = system.instance_of(session.name, host)
     steps: list[tuple[float, Callable[[], object]]] = [
         (CUT_AT_S, functools.partial(system.network.cut, host)),
         (CUT_AT_S + cut_s, system.network.mend),

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import bench_app
 from kouxing.evaluation.system import latency
-from kouxing.evaluation.system.load import Load, Step, step_sizes
-from kouxing.evaluation.system.speakers import Spoken, voiced
+from kouxing.evaluation.system.load import Load, Spoken, Step, step_sizes, voiced
 
 pytestmark = pytest.mark.unit
 

@@ -1,4 +1,8 @@
-"""Cost of an image: the stages of the renderer, the encoder, and the file of the head."""
+"""CPU cost of a recognizer with several sessions, and of an image.
+
+The recognizer runs without its messages. An image needs the stages of the renderer, the encoder,
+and the file of the head.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +16,70 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from kouxing.evaluation.system.live import CHUNK
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predictor_for
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level import VISEMES
 
+MODELS = ("neural", "blocks")
+NUM_SESSIONS = (1, 16)
 NUM_IMAGES = 60
 # name, detail, size, anti-aliasing samples per pixel, whether the images are encoded (H.264)
 CASES: tuple[tuple[str, Detail, tuple[int, int], int, bool], ...] = (
     ("live, coarse head, 640x480", "coarse", (640, 480), 0, False),
     ("video, fine head, 1280x720, 4x anti-aliased", "fine", (1280, 720), 4, True),
 )
+
+
+def measure_sessions(path: Path) -> dict[str, float]:
+    """Return CPU seconds per second of sound and session, by model and sessions."""
+    samples = to_16_khz(*read_audio(path))
+    costs = {}
+    for name in MODELS:
+        model = load_live_model(name)
+        recognizer = Recognizer(model, RecognizerConfig(acoustic=name).output_rule)
+        recognizer.warm_up()
+        for number in NUM_SESSIONS:
+            for lips, note in ((None, ""), (lip_predictor_for(model), " with lips")):
+                costs[f"{name}, {number}{note}"] = _cpu_s(recognizer, lips, samples, number)
+    return costs
+
+
+def show_sessions(costs: dict[str, float], console: Console) -> None:
+    """Print the costs as a table."""
+    table = Table("model, sessions of a recognizer", "CPU s per s of audio, each")
+    for name, value in costs.items():
+        table.add_row(name, f"{value:.3f}")
+    console.print(table)
+
+
+def _cpu_s(
+    recognizer: Recognizer,
+    lips: LipPredictor | None,
+    samples: NDArray[np.float32],
+    num_sessions: int,
+) -> float:
+    """Run every session once through the recording, each from another starting point."""
+    streams = [recognizer.create_stream(lips=lips) for _ in range(num_sessions)]
+    starts = np.arange(num_sessions) * len(samples) // num_sessions
+    sounds = [np.roll(samples, -start) for start in starts]
+    start_s = time.process_time()
+    for at in range(0, len(samples), CHUNK):
+        for stream, sound in zip(streams, sounds, strict=True):
+            stream.accept_waveform(sound[at : at + CHUNK])
+        recognizer.decode_streams(streams)
+        for stream in streams:
+            recognizer.get_result(stream)
+    cpu_s = time.process_time() - start_s
+    return cpu_s * MEDIA_RATE_HZ / len(samples) / num_sessions
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +93,8 @@ class Rendering:
     load_s: dict[str, float]  # by detail
 
 
-def measure() -> Rendering:
-    """Render the default head with visemes, blinks and nods.
-
-    Raises
-    ------
-    UserError
-        If OpenGL is not available.
-    """
+def measure_images() -> Rendering:
+    """Render the default head with visemes, blinks and nods; needs OpenGL, or raises UserError."""
     rates, stages = {}, {}
     load_s: dict[str, float] = {}
     opengl = ""
@@ -71,7 +122,7 @@ def measure() -> Rendering:
     return Rendering(opengl, rates, stages, size_bytes, load_s)
 
 
-def show(rendering: Rendering, console: Console) -> None:
+def show_images(rendering: Rendering, console: Console) -> None:
     """Print the figures as a table."""
     names = list(dict.fromkeys(stage for ms in rendering.stages_ms.values() for stage in ms))
     table = Table(f"rendering with {rendering.opengl}", "images per s", *(f"{n} ms" for n in names))
