@@ -97,32 +97,6 @@ def recognizer(
         draw_delay_curve(list(results.values()), curve)
 
 
-@app.command()
-def robustness(
-    manifest: Manifest,
-    audio: AudioFolder = None,
-    split: Split = "test",
-    acoustic: Acoustic = None,
-    look_ahead: LookAhead = None,
-    other_language: Annotated[
-        Path | None, typer.Option(help="Folder of recordings in another language.")
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Measure errors in disturbed speech, and phones recognized in sounds without speech."""
-    from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
-
-    check_output(json_file)
-    results = {
-        title: evaluate_robustness(
-            model, manifest, split, rule, audio=audio, other_language=other_language
-        )
-        for title, _, model, rule in _models(acoustic, look_ahead)
-    }
-    print_robustness(results, Console())
-    write_json(json_file, results)
-
-
 def _models(
     names: list[str] | None, look_aheads_ms: list[float] | None
 ) -> Iterator[tuple[str, str, AcousticModel, OutputRuleConfig]]:
