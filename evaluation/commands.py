@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
 from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
-
-if TYPE_CHECKING:
-    from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-    from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 
 
 class BenchGroup(TyperGroup):
@@ -51,10 +46,6 @@ Split = Annotated[str, typer.Option(help="Split of the corpus.")]
 Acoustic = Annotated[
     list[str] | None, typer.Option(help="neural, blocks, gmm or a model file; repeatable.")
 ]
-LookAhead = Annotated[
-    list[float] | None,
-    typer.Option("--look-ahead-ms", help="Look-ahead, for models that have one; repeatable."),
-]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
 Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
@@ -66,7 +57,10 @@ def recognizer(
     audio: AudioFolder = None,
     split: Split = "test",
     acoustic: Acoustic = None,
-    look_ahead: LookAhead = None,
+    look_ahead: Annotated[
+        list[float] | None,
+        typer.Option("--look-ahead-ms", help="Look-ahead, for models that have one; repeatable."),
+    ] = None,
     confusions: Annotated[
         Path | None, typer.Option(help="Plot the confusions of the last model (.png).")
     ] = None,
@@ -76,40 +70,30 @@ def recognizer(
     json_file: JsonFile = None,
 ) -> None:
     """Compare phone and viseme errors, delays and CPU cost of acoustic models."""
-    from kouxing.evaluation.recognizer.confusions import draw_confusions
-    from kouxing.evaluation.recognizer.delay_curve import draw_delay_curve
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
-    from kouxing.evaluation.recognizer.report import print_figures
+    from kouxing.evaluation.recognizer.report import (
+        draw_confusions,
+        draw_delay_curve,
+        print_figures,
+    )
+    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
+    from kouxing.services.recognizer.config import RecognizerConfig
 
     check_output(confusions, curve, json_file)
-    results = {
-        title: {
-            "acoustic": name,
-            **evaluate_recognizer(model, manifest, split, default_rule, audio=audio),
-        }
-        for title, name, model, default_rule in _models(acoustic, look_ahead)
-    }
+    results = {}
+    for name in acoustic or [DEFAULT_MODEL]:
+        defaults = RecognizerConfig(acoustic=name)
+        for look_ahead_ms in look_ahead or [defaults.look_ahead_ms]:
+            model = load_live_model(name, look_ahead_ms=look_ahead_ms)
+            title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_ahead else name
+            figures = evaluate_recognizer(model, manifest, split, defaults.output_rule, audio=audio)
+            results[title] = {"acoustic": name, **figures}
     print_figures(results, Console())
     write_json(json_file, results)
     if confusions is not None:
         draw_confusions(list(results.values())[-1], confusions)
     if curve is not None:
         draw_delay_curve(list(results.values()), curve)
-
-
-def _models(
-    names: list[str] | None, look_aheads_ms: list[float] | None
-) -> Iterator[tuple[str, str, AcousticModel, OutputRuleConfig]]:
-    """Yield title, name, model and default output rule of each model and look-ahead."""
-    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
-    from kouxing.services.recognizer.config import RecognizerConfig
-
-    for name in names or [DEFAULT_MODEL]:
-        defaults = RecognizerConfig(acoustic=name)
-        for look_ahead_ms in look_aheads_ms or [defaults.look_ahead_ms]:
-            model = load_live_model(name, look_ahead_ms=look_ahead_ms)
-            title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_aheads_ms else name
-            yield title, name, model, defaults.output_rule
 
 
 @app.command()
@@ -193,14 +177,8 @@ def schemes(
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))
     if videos:
-        written = write_videos(
-            recognized,
-            recognizers,
-            names,
-            videos,
-            has_anchor=anchor,
-            sound_at_once=sound_at_once,
-        )
+        options = {"has_anchor": anchor, "sound_at_once": sound_at_once}
+        written = write_videos(recognized, recognizers, names, videos, **options)
         print_message(f"wrote {len(written)} videos to {videos}")
         if any(sentence.aligned is None for sentence in recognized):
             print_message("no videos of scheme 1: some sentences have no text")

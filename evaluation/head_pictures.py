@@ -24,59 +24,41 @@ Float32 = NDArray[np.float32]
 _TURNS_DEG = (0.0, 40.0)
 _HEAD_PX, _VISEME_PX, _CHOICE_PX = (240, 200), (160, 160), (160, 160)
 _VISEMES_A_ROW = 9
+_REST = np.zeros(NUM_FAPS, np.float32)
 _SCALE = 2  # pictures are drawn larger and reduced, for smooth edges
 
 
-def head_names() -> list[str]:
+def _head_names() -> list[str]:
     """Return the names of the package's heads, the default one first."""
     names = (path.stem for path in ASSETS.glob("*.npz"))
     return sorted(names, key=lambda name: (name != DEFAULT_HEAD, name))
 
 
 def draw_choices(folder: Path) -> list[Path]:
-    """Write ``head-NAME.webp`` for every head into a folder; return their paths.
-
-    Raises
-    ------
-    UserError
-        If they cannot be written.
-    """
+    """Write ``head-NAME.webp`` for every head into a folder; return their paths."""
     return [
-        _save(
-            folder / f"head-{name}.webp", _picture(name, np.zeros(NUM_FAPS, np.float32), _CHOICE_PX)
-        )
-        for name in head_names()
+        _save(folder / f"head-{name}.webp", _picture(name, _REST, _CHOICE_PX))
+        for name in _head_names()
     ]
 
 
 def draw_sheets(folder: Path) -> list[Path]:
-    """Write ``heads.webp`` and ``faces.webp`` (every viseme) into a folder; return their paths.
-
-    Raises
-    ------
-    UserError
-        If they cannot be written.
-    """
-    rest = np.zeros(NUM_FAPS, np.float32)
-    names = head_names()
+    """Write ``heads.webp`` and ``faces.webp`` (every viseme) into a folder; return their paths."""
     heads = [
-        [_labelled(_picture(name, rest, _HEAD_PX, turn), name) for name in names]
+        [_labelled(_picture(name, _REST, _HEAD_PX, turn), name) for name in _head_names()]
         for turn in _TURNS_DEG
     ]
-    shapes = {name: _spoken(name) for name in VISEME_INDEX}
-    labels = list(shapes)
+    visemes = list(VISEME_INDEX)
     faces = [
         [
-            _labelled(_picture(DEFAULT_HEAD, shapes[label], _VISEME_PX, turn), label)
-            for label in labels[at : at + _VISEMES_A_ROW]
+            _labelled(_picture(DEFAULT_HEAD, _spoken(viseme), _VISEME_PX, turn), viseme)
+            for viseme in visemes[at : at + _VISEMES_A_ROW]
         ]
-        for at in range(0, len(labels), _VISEMES_A_ROW)
+        for at in range(0, len(visemes), _VISEMES_A_ROW)
         for turn in _TURNS_DEG
     ]
-    return [
-        _save(folder / "heads.webp", _sheet(heads)),
-        _save(folder / "faces.webp", _sheet(faces)),
-    ]
+    sheets = {"heads.webp": heads, "faces.webp": faces}
+    return [_save(folder / name, _sheet(rows)) for name, rows in sheets.items()]
 
 
 def _spoken(viseme: str) -> Float32:

@@ -42,7 +42,7 @@ def _table(title: str, columns: Mapping[str, Cell], scores: Sequence[LipScore]) 
     return table
 
 
-def _empty_table(title: str, columns: Sequence[str], padding: tuple[int, ...]) -> Table:
+def _empty_table(title: str, columns: Sequence[str], padding: tuple[int, int, int, int]) -> Table:
     table = Table(title=title, box=box.SIMPLE, padding=padding, title_justify="left")
     for column in columns:
         table.add_column(column, no_wrap=True)

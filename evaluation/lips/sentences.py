@@ -72,7 +72,7 @@ def choose(utterances: Sequence[Utterance], number: int = NUM_SENTENCES) -> list
 
 
 def clip_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
-    """Read all held-out clips of tracked lips in the model's language; UserError if none."""
+    """Read all held-out clips of tracked lips in the model's language."""
     clips = clips_to_score(folder, None, language=model.inventory.code)
     return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
 

@@ -44,7 +44,7 @@ from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.key_frames import key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -212,8 +212,7 @@ def _methods(
     table = load_table(inventory)
     by_endpoints = time_text(progress_of(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
-        motion = key_frames_of(timed, table, inventory.silence)
-        yield name, lambda times_s, motion=motion: faps_of(motion.openings_at(times_s))
+        yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
     delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}
     events = live_events(model, samples, lip_predictor_for(model), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():
@@ -222,6 +221,10 @@ def _methods(
         mouth = frames[:, np.array(MOUTH_FAPS) - 1]
         frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
         yield f"{name}, live", partial(_interpolate, frame_s=frame_s, mouths=mouth)
+
+
+def _curves_of(motion: KeyFrames) -> Curves:
+    return lambda times_s: faps_of(motion.openings_at(times_s))
 
 
 def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:

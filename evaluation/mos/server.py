@@ -17,9 +17,8 @@ from typing import Any
 
 from aiohttp import web
 
-from kouxing.evaluation.mos.order import places_of_judge
 from kouxing.evaluation.mos.store import Answer, Store
-from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study
+from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study, places_of_judge
 from kouxing.services.gateway import http
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.figures import new_figure, save_figure
 from kouxing.corpora.scoring import matched_pairs
 from kouxing.shared.phones.inventory import PhoneInventory
 
@@ -43,23 +40,16 @@ class Confusions:
         order = np.argsort(errors, axis=None)[::-1][:num]
         phones = self._inventory.phones
         return [
-            {
-                "reference": phones[row],
-                "recognized": phones[column],
-                "count": int(errors[row, column]),
-            }
-            for row, column in zip(*np.unravel_index(order, errors.shape), strict=True)
+            {"reference": phones[i], "recognized": phones[j], "count": int(errors[i, j])}
+            for i, j in zip(*np.unravel_index(order, errors.shape), strict=True)
         ]
 
     def labials(self) -> dict[str, float | None]:
         """Measure the consonants made with the lips, whose errors viewers can see.
 
-        Returns
-        -------
-        dict
-            ``recall``: share of the spoken ones recognized as any of them. ``precision``: share of
-            the recognized ones in whose place any of them is spoken. ``as_lingual`` and
-            ``for_lingual``: the same with consonants made with the tongue. None without phones.
+        ``recall`` is the share of the spoken ones recognized as any of them, ``precision`` the
+        share of the recognized ones in whose place any of them is spoken. ``as_lingual`` and
+        ``for_lingual`` are the same with consonants made with the tongue. None without phones.
         """
         labial, lingual = self._with_viseme(_LABIALS), self._with_viseme(_LINGUALS)
         spoken, recognized = self.counts[labial], self.counts[:, labial]
@@ -77,25 +67,3 @@ class Confusions:
     def _with_viseme(self, visemes: set[str]) -> NDArray[np.bool_]:
         inventory = self._inventory
         return np.array([inventory.visemes[phone][0][0] in visemes for phone in inventory.phones])
-
-
-def draw_confusions(figures: Mapping[str, Any], path: Path) -> None:
-    """Plot the confusion matrix in the result of ``evaluate_recognizer``, with normalized rows.
-
-    Silence, as ``-``, is the last row (insertions) and column (deletions). Raises UserError if the
-    picture cannot be written.
-    """
-    phones, silence = figures["phones"], figures["silence"]
-    order = sorted(range(len(phones)), key=lambda number: phones[number] == silence)
-    names = [phones[number] if phones[number] != silence else "-" for number in order]
-    counts = np.array(figures["confusions"])[np.ix_(order, order)]
-    rates = counts / np.maximum(1, counts.sum(axis=1, keepdims=True))
-    figure = new_figure(11.0, 10.0)
-    axes = figure.add_subplot()
-    picture = axes.imshow(rates, cmap="viridis", vmin=0, vmax=1)
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(names)), names, fontsize=7)
-    axes.set_xlabel("recognized (-: nothing)")
-    axes.set_ylabel("reference (-: nothing)")
-    figure.colorbar(picture, label="share of the reference phone", shrink=0.8)
-    save_figure(figure, path)

@@ -27,7 +27,6 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
     front_end, stream = model.create_front_end(), model.create_stream()
     decoder = Decoder(model.topology)
     detector, resampler = VoiceActivityDetector(), Resampler(48_000)
-    at_48_khz = np.repeat(samples, 3)
     frames = model.create_front_end().accept_waveform(samples)
     scores = model.create_stream().score(frames)  # compiles before the clock starts
     decoder.advance(scores[:1])
@@ -41,10 +40,9 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
             stage(piece)
         return (time.process_time() - start) * SAMPLE_RATE_HZ / len(samples)
 
+    at_48_khz = np.array_split(np.repeat(samples, 3), len(chunks))
     return {
-        "resampler_from_48_khz": run(
-            resampler.accept_waveform, np.array_split(at_48_khz, len(chunks))
-        ),
+        "resampler_from_48_khz": run(resampler.accept_waveform, at_48_khz),
         "voice_activity": run(detector.detect, blocks),
         "front_end": run(front_end.accept_waveform, chunks),
         "acoustic_model": run(stream.score, np.split(frames, len(frames))),

@@ -70,13 +70,8 @@ class Score:
     def summary(self, rng: np.random.Generator) -> dict[str, object]:
         """Return rates, intervals and delay percentiles for a JSON file."""
         out: dict[str, object] = {"output": self.name}
-        measures = {
-            "phone": self.phones,
-            "viseme": self.visemes,
-            "final_phone": self.final_phones,
-            "final_viseme": self.final_visemes,
-        }
-        for measure, by_speaker in measures.items():
+        for measure in ("phone", "viseme", "final_phone", "final_viseme"):
+            by_speaker: dict[str, ErrorCounts] = getattr(self, f"{measure}s")
             if not by_speaker:
                 continue
             total = sum(by_speaker.values(), ErrorCounts())
@@ -130,33 +125,12 @@ def evaluate_recognizer(
     audio: Path | None = None,
     rules: Sequence[OutputRuleConfig] = RULES,
 ) -> dict[str, object]:
-    """Measure a model on one split of a corpus.
+    """Measure a model on one split of a corpus in the model's language; return JSON figures.
 
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    corpus, audio
-        A corpus folder, or a manifest and the folder of its recordings, in the model's language
-        (:func:`kouxing.corpora.speech_corpus.read_corpus`).
-    split
-        Split of the corpus, such as ``dev`` or ``test``.
-    default_rule
-        The recognizer's default output rule with this model. Its score is the last one.
-    rules
-        Other output rules to try.
-
-    Returns
-    -------
-    dict
-        Figures for a JSON file. ``confusions`` counts reference phones (rows) against phones of
-        offline decoding (columns), in the order of ``phones``. ``labials`` has the consonants made
-        with the lips. ``bad_rows`` lists rows that could not be used.
-
-    Raises
-    ------
-    UserError
-        If the corpus does not exist, or the split has no usable recording.
+    The score of ``default_rule`` is the last one, after those of ``rules``. In the figures,
+    ``confusions`` counts reference phones (rows) against phones of offline decoding (columns), in
+    the order of ``phones``. ``labials`` has the consonants made with the lips. ``bad_rows`` lists
+    rows that could not be used. Raises UserError if the split has no usable recording.
     """
     inventory = model.inventory
     errors = RowErrors()
@@ -260,15 +234,17 @@ def _decode_live(
     return output
 
 
+@dataclass(frozen=True, slots=True)
 class _Reference:
     """The true phones of a recording."""
 
-    def __init__(self, truth: Sequence[Phone], speaker: str, inventory: PhoneInventory) -> None:
-        self._truth = truth
-        self._speaker = speaker
-        self._inventory = inventory
-        self.phones = [phone.symbol for phone in truth]
-        self._shapes = mouth_shapes(self.phones, inventory)
+    truth: Sequence[Phone]
+    speaker: str
+    inventory: PhoneInventory
+
+    @property
+    def phones(self) -> list[str]:
+        return [phone.symbol for phone in self.truth]
 
     def count(
         self,
@@ -277,19 +253,16 @@ class _Reference:
         visemes: dict[str, ErrorCounts],
     ) -> None:
         """Add the errors of recognized phones to the speaker's counts."""
-        symbols = [phone.symbol for phone in recognized]
-        shapes = mouth_shapes(symbols, self._inventory)
-        for counts, new in (
-            (phones, count_errors(self.phones, symbols)),
-            (visemes, count_errors(self._shapes, shapes)),
-        ):
-            counts[self._speaker] = counts.get(self._speaker, ErrorCounts()) + new
+        pair = self.phones, [phone.symbol for phone in recognized]
+        shapes = (mouth_shapes(symbols, self.inventory) for symbols in pair)
+        for counts, new in ((phones, count_errors(*pair)), (visemes, count_errors(*shapes))):
+            counts[self.speaker] = counts.get(self.speaker, ErrorCounts()) + new
 
     def delays_s(self, output: _LiveOutput) -> list[float]:
         """Return the emission delays of phones that are right in the first hypothesis."""
         symbols = [phone.symbol for phone in output.first]
         return [
-            output.emitted_s[j] - self._truth[i].onset_s
+            output.emitted_s[j] - self.truth[i].onset_s
             for i, j in matched_pairs(self.phones, symbols)
             if i is not None and j is not None and self.phones[i] == symbols[j]
         ]

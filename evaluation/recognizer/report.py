@@ -1,13 +1,18 @@
-"""Print the recognizer's figures as tables."""
+"""Print the recognizer's figures as tables, and plot them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+from kouxing.corpora.figures import new_figure, save_figure
 
 Figures = Mapping[str, Any]  # result of evaluate_recognizer
 
@@ -44,10 +49,10 @@ def _outputs(figures: Figures) -> Table:
     for score in figures["scores"]:
         table.add_row(
             score["output"],
-            percent(score["phone_error_rate"]),
+            _percent(score["phone_error_rate"]),
             _interval(score["phone_interval_95"]),
             _kinds(score["phone_errors"]),
-            percent(score["viseme_error_rate"]),
+            _percent(score["viseme_error_rate"]),
             _interval(score["viseme_interval_95"]),
         )
     return table
@@ -71,11 +76,11 @@ def _speakers(figures: Figures) -> Table:
         table.add_row(
             speaker,
             str(errors["reference"]),
-            percent(errors["rate"]),
+            _percent(errors["rate"]),
             _kinds(errors),
-            percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
-            percent(live["phone_errors_by_speaker"][speaker]["rate"]),
-            percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
+            _percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
+            _percent(live["phone_errors_by_speaker"][speaker]["rate"]),
+            _percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
         )
     return table
 
@@ -84,7 +89,7 @@ def _labials(figures: Figures) -> Table:
     columns = ("recall", "precision", "recognized as d t n g k h", "d t n g k h spoken")
     table = _table("p, b, m and f, %", ("output", *columns))
     for output, fractions in figures["labials"].items():
-        table.add_row(output, *map(percent, fractions.values()))
+        table.add_row(output, *map(_percent, fractions.values()))
     return table
 
 
@@ -105,8 +110,7 @@ def _table(title: str, columns: Iterable[str]) -> Table:
     return table
 
 
-def percent(rate: float | None) -> str:
-    """Format a rate for a table."""
+def _percent(rate: float | None) -> str:
     return "-" if rate is None else f"{100 * rate:.1f}"
 
 
@@ -114,18 +118,66 @@ def _rates(score: Figures, hypothesis: str = "") -> str:
     if f"{hypothesis}phone_error_rate" not in score:
         return ""
     kinds = ("phone", "viseme")
-    return " / ".join(percent(score[f"{hypothesis}{kind}_error_rate"]) for kind in kinds)
+    return " / ".join(_percent(score[f"{hypothesis}{kind}_error_rate"]) for kind in kinds)
 
 
 def _interval(bounds: tuple[float, float] | None) -> str:
-    return "-" if bounds is None else f"{percent(bounds[0])}-{percent(bounds[1])}"
+    return "-" if bounds is None else f"{_percent(bounds[0])}-{_percent(bounds[1])}"
 
 
 def _kinds(errors: Mapping[str, int]) -> str:
     kinds = ("insertions", "deletions", "substitutions")
-    return "/".join(percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
+    return "/".join(_percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
 
 
 def _delay(score: Figures) -> str:
     delay = score.get("delay_ms")
     return f"{delay['p50']:.0f} / {delay['p95']:.0f}" if delay else ""
+
+
+def draw_confusions(figures: Figures, path: Path) -> None:
+    """Plot the confusion matrix in the result of ``evaluate_recognizer``, with normalized rows.
+
+    Silence, as ``-``, is the last row (insertions) and column (deletions). Raises UserError if the
+    picture cannot be written.
+    """
+    phones, silence = figures["phones"], figures["silence"]
+    order = sorted(range(len(phones)), key=lambda number: phones[number] == silence)
+    names = [phones[number] if phones[number] != silence else "-" for number in order]
+    counts = np.array(figures["confusions"])[np.ix_(order, order)]
+    rates = counts / np.maximum(1, counts.sum(axis=1, keepdims=True))
+    figure = new_figure(11.0, 10.0)
+    axes = figure.add_subplot()
+    picture = axes.imshow(rates, cmap="viridis", vmin=0, vmax=1)
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    axes.set_xlabel("recognized (-: nothing)")
+    axes.set_ylabel("reference (-: nothing)")
+    figure.colorbar(picture, label="share of the reference phone", shrink=0.8)
+    save_figure(figure, path)
+
+
+def draw_delay_curve(results: Sequence[Figures], path: Path) -> None:
+    """Plot the errors of both hypotheses over the median delay of the first.
+
+    The results have the model's name as ``acoustic``. Those of one model, with several look-aheads,
+    are adjacent. Raises UserError if the picture cannot be written.
+    """
+    figure = new_figure(11.0, 4.5)
+    for axes, kind in zip(figure.subplots(1, 2), ("phone", "viseme"), strict=True):
+        by_model = groupby(results, key=lambda result: result["acoustic"])
+        for number, (name, group) in enumerate(by_model):
+            defaults = [result["scores"][-1] for result in group]
+            scores = [score for score in defaults if "delay_ms" in score]
+            scores.sort(key=lambda score: score["delay_ms"]["p50"])
+            delays_ms = [score["delay_ms"]["p50"] for score in scores]
+            for prefix, style, hypothesis in (("", "o-", "first"), ("final_", "s--", "final")):
+                rates = [100 * score[f"{prefix}{kind}_error_rate"] for score in scores]
+                label = f"{name}, {hypothesis} hypothesis"
+                axes.plot(delays_ms, rates, style, color=f"C{number}", label=label)
+        axes.set_xlabel("median delay of the first hypothesis, ms")
+        axes.set_ylabel(f"{kind} errors, %")
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    save_figure(figure, path)

@@ -17,9 +17,8 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.mos.commands import app
-from kouxing.evaluation.mos.order import places_of_judge
 from kouxing.evaluation.mos.store import read_answers
-from kouxing.evaluation.mos.study import load_study, new_study
+from kouxing.evaluation.mos.study import load_study, new_study, places_of_judge
 from kouxing.evaluation.system.chromium import Chromium
 from tests.system import ROOT, free_port
 
@@ -42,10 +41,7 @@ class Served:
         code = "from kouxing.evaluation.mos.commands import app; app()"
         command = [sys.executable, "-c", code, "serve", str(self.folder), "--port", str(self.port)]
         self._process = subprocess.Popen(
-            [*command, *self._options],
-            cwd=ROOT,
-            stderr=subprocess.PIPE,
-            text=True,
+            [*command, *self._options], cwd=ROOT, stderr=subprocess.PIPE, text=True
         )
         assert self._process.stderr is not None
         self.line = self._process.stderr.readline()
@@ -112,46 +108,30 @@ def test_answers_survive_a_crash_and_count_once(served: Served, video: Path) -> 
     assert served.state(f"/state?judge={token}")["place"] == 2
     again = {"place": 0, "sync": 1, "realism": 1, "language": "zh"}
     assert served.state(f"/answers?judge={token}", again)["place"] == 2
-    scores = {
-        (each.place, each.sentence, each.condition, each.scale): (each.score, each.language)
-        for each in read_answers(served.folder)
-    }
     places = places_of_judge(0, load_study(served.folder))
-    expected = {(place, *places[place], "sync"): (4, "en") for place in range(-2, 2)}
-    expected |= {(place, *places[place], "realism"): (3 + place, "en") for place in range(-2, 2)}
-    assert scores == expected
+    assert [
+        (answer.place, answer.sentence, answer.condition, answer.scale, answer.score)
+        for answer in read_answers(served.folder)
+    ] == [
+        (place, *places[place], scale, score)
+        for place in range(-2, 2)
+        for scale, score in (("sync", 4), ("realism", 3 + place))
+    ]
 
 
 def test_sends_only_the_next_video_and_rejects_invalid_answers(served: Served) -> None:
     good = {"place": -2, "sync": 3, "realism": 3, "language": "zh"}
     token = served.add_judge()
-    for path in (
-        f"/stimulus/-1?judge={token}",
-        f"/stimulus/0?judge={token}",
-        f"/stimulus/..%2fstudy.json?judge={token}",
-        "/stimulus/-2?judge=nobody",
-        "/study.json",
-        "/answers.jsonl",
-        "/..%2f..%2fserver.py",
-        "/server.py",
-        "/good/one.mp4",
-    ):
-        assert served.ask(path)[0] in (403, 404), path
+    files = ("study.json", "answers.jsonl", "..%2f..%2fserver.py", "server.py", "good/one.mp4")
+    videos = (f"stimulus/{name}?judge={token}" for name in ("-1", "0", "..%2fstudy.json"))
+    for path in (*files, *videos, "stimulus/-2?judge=nobody"):
+        assert served.ask(f"/{path}")[0] in (403, 404), path
     answers = f"/answers?judge={token}"
     assert served.ask(f"/stimulus/-2?judge={token}")[0] == 200
-    bodies: list[object] = [
-        {**good, "sync": 6},
-        {**good, "realism": 0},
-        {**good, "sync": True},
-        {**good, "sync": "3"},
-        {**good, "language": "fr"},
-        {**good, "language": ["zh"]},
-        {"place": -2, "sync": 3},
-        {"place": -2, "sync": 3, "realism": 3},
-        [],
-        3,
-    ]
-    for body in bodies:
+    changes: list[dict[str, object]] = [{"sync": value} for value in (6, True, "3")]
+    changes += [{"realism": 0}, {"language": "fr"}, {"language": ["zh"]}]
+    incomplete = {"place": -2, "sync": 3, "realism": 3}
+    for body in (*({**good, **change} for change in changes), incomplete, [], 3):
         assert served.ask(answers, body)[0] == 400, body
     for place in (-1, 0, 1, 10**30):
         assert served.ask(answers, {**good, "place": place})[0] == 409
@@ -192,12 +172,12 @@ def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served
     chinese.judge_everything({"good": 4, "bad": 2}, by_language_button=True)
     assert browser.complaints == []
     study = load_study(served.folder)
-    answers = [each for each in read_answers(served.folder) if each.place >= 0]
+    answers = [answer for answer in read_answers(served.folder) if answer.place >= 0]
     for number, language in enumerate(("en", "zh")):
-        given = [each for each in answers if each.judge == number]
-        assert {(each.sentence, each.condition) for each in given} == set(study.files)
+        given = [answer for answer in answers if answer.judge == number]
+        assert {(answer.sentence, answer.condition) for answer in given} == set(study.files)
         assert len(given) == 2 * len(study.files)
-        assert {each.language for each in given} == {language}
+        assert {answer.language for answer in given} == {language}
     figures = served.folder.parent / "figures.json"
     command = ["report", str(served.folder), "--json", str(figures)]
     result = CliRunner().invoke(app, command, catch_exceptions=False)
@@ -205,15 +185,11 @@ def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served
     report = json.loads(figures.read_text())
     assert (report["num_judges"], report["num_finished"]) == (2, 2)
     means = {
-        (each["scale"], each["condition"]): each["of_all"]["value"] for each in report["opinions"]
+        f"{opinion['scale']} {opinion['condition']}": opinion["of_all"]["value"]
+        for opinion in report["opinions"]
     }
     # Sync was scored 5 and 4, and 2 and 2; realism one less.
-    assert means == {
-        ("sync", "good"): 4.5,
-        ("sync", "bad"): 2.0,
-        ("realism", "good"): 3.5,
-        ("realism", "bad"): 1.0,
-    }
+    assert means == {"sync good": 4.5, "sync bad": 2, "realism good": 3.5, "realism bad": 1}
 
 
 def test_the_page_retries_until_the_server_answers(browser: Chromium, served: Served) -> None:

@@ -10,11 +10,9 @@ from kouxing.evaluation.lips.measures import (
     best_lag,
     closures,
     is_closed_at,
-    is_near,
     lip_to_teeth,
     lip_to_teeth_poses,
     moments,
-    offsets,
     openings,
     real_closed,
     real_closures,
@@ -160,14 +158,3 @@ def test_finds_openings_in_any_range() -> None:
     gap = curve.copy()
     gap[TIME_S < 1.5] = np.nan
     np.testing.assert_allclose(openings(TIME_S, gap), [2.206])
-
-
-def test_offsets_to_the_nearest_moment() -> None:
-    moments_s = np.array([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(
-        offsets(moments_s, np.array([0.9, 1.2, 3.1]), 0.3), [-0.1, np.nan, 0.1]
-    )
-    assert np.isnan(offsets(moments_s, np.zeros(0), 0.3)).all()
-    others_s = np.array([1.04, 2.5])
-    assert is_near(moments_s, others_s, 0.04).tolist() == [True, False, False]
-    assert not is_near(moments_s, np.zeros(0), 1.0).any()

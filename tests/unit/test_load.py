@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import bench_app
 from kouxing.evaluation.system import latency
-from kouxing.evaluation.system.load import Load, Spoken, Step, step_sizes, voiced
+from kouxing.evaluation.system.load import Load, Spoken, Step, voiced
 
 pytestmark = pytest.mark.unit
 
@@ -41,19 +41,13 @@ def test_missing_frames_count_as_late() -> None:
 
 def test_ignores_frames_at_rest() -> None:
     spoken = _spoken({})
-    frame = FapFrame(media_time=320, values=array("f", bytes(272)))
-    spoken.record(frame)
-    arrived_s = dict(spoken.arrived_s)
-    spoken.record(frame)
-    assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
-
-
-def test_ignores_rest_before_the_speaker_starts() -> None:
-    spoken = _spoken({})
-    frame = FapFrame(media_time=0, values=array("f", bytes(272)))
-    for _ in range(3):
+    first, second = (FapFrame(media_time=at, values=array("f", bytes(272))) for at in (0, 320))
+    for frame in (first, first, second):
         spoken.record(frame)
-    assert spoken.num_rest == 0
+    assert spoken.num_rest == 0  # the speaker has not started
+    arrived_s = dict(spoken.arrived_s)
+    spoken.record(second)
+    assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
 
 
 def test_speakers_differ_in_voice_and_position() -> None:
@@ -61,11 +55,6 @@ def test_speakers_differ_in_voice_and_position() -> None:
     sounds = [voiced(text, number) for number in range(12)]
     assert np.array_equal(sounds[0], text)
     assert len({sound.tobytes() for sound in sounds}) == len(sounds)
-
-
-def test_step_sizes() -> None:
-    assert step_sizes(24) == [1, 3, 6, 9, 12, 15, 18, 21, 24]
-    assert step_sizes(3) == [1, 2, 3]
 
 
 def _step(number: int, worst_p95_ms: float) -> Step:

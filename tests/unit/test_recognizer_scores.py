@@ -6,14 +6,13 @@ import pytest
 from rich.console import Console
 
 from kouxing.corpora.scoring import ErrorCounts, count_errors, first_hypothesis, matched_pairs
-from kouxing.evaluation.recognizer.confusions import Confusions, draw_confusions
-from kouxing.evaluation.recognizer.delay_curve import draw_delay_curve
+from kouxing.evaluation.recognizer.confusions import Confusions
 from kouxing.evaluation.recognizer.error_rates import (
     bootstrap_interval,
     evaluate_recognizer,
     mouth_shapes,
 )
-from kouxing.evaluation.recognizer.report import print_figures
+from kouxing.evaluation.recognizer.report import draw_confusions, draw_delay_curve, print_figures
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
@@ -58,13 +57,6 @@ def test_first_hypothesis_skips_corrections() -> None:
     first = [[phone.symbol for phone in first_hypothesis(chunk, known)] for chunk in chunks]
     assert first == [["n"], ["l"], ["i", "h"], ["ao"]]
     assert known == {0, 1, 2, 3}
-
-
-def test_rate_and_sum() -> None:
-    one = ErrorCounts(insertions=1, deletions=2, substitutions=3, reference=10)
-    assert one.rate == 0.6
-    assert (one + one).rate == 0.6
-    assert (one + ErrorCounts(reference=10)).rate == 0.3
 
 
 def test_aligns_random_strings_with_the_fewest_errors() -> None:
