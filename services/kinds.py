@@ -34,15 +34,7 @@ def read_settings(
 def free_addresses(
     names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """Return an environment in which services bind free ports.
-
-    Parameters
-    ----------
-    names
-        Services that bind.
-    hosts
-        Host to bind for each service; by default 127.0.0.1.
-    """
+    """Return an environment in which services bind free ports, on 127.0.0.1 or the given hosts."""
     environment = {}
     with contextlib.ExitStack() as probes:  # all stay open, so that all ports differ
         for name in names:

@@ -17,21 +17,9 @@ if TYPE_CHECKING:
 
 
 def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
-    """Run a service; return the exit status.
+    """Run one of ``services.kinds.KINDS`` with ``KEY=VALUE`` assignments; return the exit status.
 
-    Parameters
-    ----------
-    name
-        One of ``kouxing.services.kinds.KINDS``.
-    file
-        TOML file; None: no file.
-    assignments
-        Values from the command line, as ``KEY=VALUE``.
-
-    Raises
-    ------
-    UserError
-        If the configuration is invalid.
+    Raises ``UserError`` if the configuration is invalid.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during startup prints no traceback
     from kouxing.services.kinds import KINDS, read_settings

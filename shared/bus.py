@@ -37,23 +37,9 @@ HANDSHAKE_MS = 2000
 class Bus:
     """The sockets of one process.
 
-    Parameters
-    ----------
-    key
-        Key of this process; its sockets then accept only allowed keys. None disables encryption
-        and accepts every peer.
-    extra_connections
-        Number of connections that are allowed in addition to the usual limit.
-
-    Attributes
-    ----------
-    zap
-        The allowed keys; None without encryption.
-
-    Raises
-    ------
-    UserError
-        If the allowed keys cannot be read.
+    With a key, its sockets accept only the allowed keys, ``zap``. Without one, nothing is
+    encrypted, and every peer is accepted. ``extra_connections`` are allowed in addition to the
+    usual limit. Raises ``UserError`` if the allowed keys cannot be read.
     """
 
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:

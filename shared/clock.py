@@ -58,21 +58,10 @@ def now_ns() -> int:
 
 
 class StallDetector:
-    """Detects that this process did not run for a while: it was stopped, or had no processor.
+    """Detects that this process did not run for longer than a limit: it was stopped, or starved.
 
-    All times are in seconds on the same monotonic clock.
-
-    Parameters
-    ----------
-    now_s
-        The present.
-    limit_s
-        A pause longer than this is a stall.
-
-    Attributes
-    ----------
-    resumed_at_s
-        When the process resumed after its latest stall; minus infinity before the first.
+    All times are in seconds on the same monotonic clock. ``resumed_at_s`` is the end of the latest
+    stall; minus infinity before the first.
     """
 
     def __init__(self, now_s: float, limit_s: float = STALL_LIMIT_S) -> None:
@@ -87,12 +76,7 @@ class StallDetector:
     def check(self, now_s: float, *, expected_s: float = 0.0) -> float:
         """Return how much longer than expected the time since the last check was; 0 if no stall.
 
-        Parameters
-        ----------
-        now_s
-            The present.
-        expected_s
-            The longest time that the process meant to wait.
+        ``expected_s`` is the longest time that the process meant to wait.
         """
         pause_s = now_s - self._checked_s - expected_s
         self._checked_s = now_s

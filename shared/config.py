@@ -186,21 +186,10 @@ class Setting:
 class Settings:
     """The values of all keys of all services, from every source.
 
-    Parameters
-    ----------
-    types
-        Configuration class of each service, by the service's name.
-    file
-        A TOML file, if any.
-    environment
-        Environment variables; by default those of this process.
-    assignments
-        Values from the command line, by ``service.key``.
+    ``types`` has the configuration class of each service. ``assignments`` are the values from the
+    command line, by ``service.key``. ``environment`` is by default that of this process.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, or a table, key or variable is unknown.
+    Raises ``UserError`` if the file cannot be read, or a table, key or variable is unknown.
     """
 
     def __init__(
@@ -223,19 +212,10 @@ class Settings:
         )
 
     def load(self, config_type: type[Config], overrides: Mapping[str, str] | None = None) -> Config:
-        """Return the checked configuration of a service.
+        """Return the checked configuration of a service, or of a client (``ServiceConfig``).
 
-        Parameters
-        ----------
-        config_type
-            Configuration class of the service, or ``ServiceConfig`` for a client.
-        overrides
-            Values from the command line, by key.
-
-        Raises
-        ------
-        UserError
-            If a value is not allowed; the text names the key, the value and its origin.
+        ``overrides`` are values from the command line, by key. Raises ``UserError`` if a value is
+        not allowed; the text names the key, the value and its origin.
         """
         return self._resolve(config_type, overrides or {})[0]
 

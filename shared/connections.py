@@ -75,15 +75,7 @@ class Limits:
 
 
 class Budget:
-    """How much work a peer may still cause; it recovers with time.
-
-    Parameters
-    ----------
-    left
-        Budget at the start.
-    clock
-        Returns the time in s.
-    """
+    """How much work a peer may still cause; it recovers with time."""
 
     def __init__(self, left: float = BUDGET, clock: Callable[[], float] = time.monotonic) -> None:
         self._left, self._clock, self._since_s = left, clock, clock()
@@ -167,14 +159,9 @@ class Connection:
         return self.unread > 0 and now_s - self._stalled_since_s > STALLED_S
 
     def disconnect(self, reason: str, penalty_s: float = 0.0) -> None:
-        """End the connection. Any thread may call this.
+        """End the connection, and log the reason. Any thread may call this.
 
-        Parameters
-        ----------
-        reason
-            For the log.
-        penalty_s
-            Time in which the peer's key or address cannot connect again.
+        The peer's key or address cannot connect again for ``penalty_s``.
         """
         if self.is_cut:
             return
@@ -204,12 +191,7 @@ class LimitedSocket:
     def deliver(self, descriptor: int, key: str) -> Connection | None:
         """Count a delivered message; return its connection, None if that has ended.
 
-        Parameters
-        ----------
-        descriptor
-            Where the message arrived.
-        key
-            Public key of the sender, empty without keys.
+        ``key`` is the public key of the sender, empty without encryption.
         """
         connection = self.limiter.find(descriptor, self)
         if connection is None:
@@ -259,10 +241,7 @@ class LimitedSocket:
 class ConnectionLimiter:
     """Watches the connections to all bound sockets of a process.
 
-    Parameters
-    ----------
-    extra_connections
-        Number of connections that are allowed in addition to ``MAX_CONNECTIONS``.
+    It allows ``extra_connections`` in addition to ``MAX_CONNECTIONS``.
     """
 
     def __init__(self, extra_connections: int = 0) -> None:

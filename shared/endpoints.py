@@ -52,13 +52,10 @@ def with_host(endpoint: str, host: str) -> str:
 
 
 def own_address(towards: str = "192.0.2.1") -> str:
-    """Return the local address for connections to another host, without sending anything.
+    """Return the local address for connections to a host, without sending anything.
 
-    Parameters
-    ----------
-    towards
-        Name or address of the other host. If it cannot be reached, or by default, the address of
-        the default route is returned, or 127.0.0.1 without one.
+    Without a host, or if it cannot be reached, this is the address of the default route, or
+    127.0.0.1 without one.
     """
     for host in dict.fromkeys((towards, "192.0.2.1")):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

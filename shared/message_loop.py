@@ -22,19 +22,9 @@ Handler = Callable[[Any, Peer], None]
 
 
 class MessageLoop:
-    """Passes messages to handlers, by socket and type.
+    """Passes messages to handlers, by socket and type, and counts messages and problems.
 
-    Parameters
-    ----------
-    bus
-        Opens the sockets.
-
-    Attributes
-    ----------
-    metrics
-        Counts messages and problems.
-    current_session
-        Session whose message is being handled.
+    ``current_session`` is the session whose message is being handled.
     """
 
     def __init__(self, bus: Bus) -> None:

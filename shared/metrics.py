@@ -38,17 +38,7 @@ class Distribution:
 
 
 class Metrics:
-    """Metrics of a service by name.
-
-    Attributes
-    ----------
-    counts
-        Counters.
-    values
-        Gauges.
-    distributions
-        Latencies.
-    """
+    """Counters, gauges (``values``) and latencies (``distributions``) of a service by name."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -117,15 +107,7 @@ def give_back_memory() -> None:
 
 
 class BusyShare:
-    """Measures how much of the recent time a loop worked, rather than waited for messages.
-
-    Parameters
-    ----------
-    period_s
-        Minimum length of the measured time.
-    now_s
-        Present time. The loop does not work yet.
-    """
+    """Measures how much of at least the last ``period_s`` a loop worked, rather than waited."""
 
     def __init__(self, period_s: float, now_s: float) -> None:
         self._period_s = period_s

@@ -93,23 +93,9 @@ def _in_seconds(name: str) -> tuple[str, float]:
 class MetricsServer(ThreadingHTTPServer):
     """Serves a service's metrics and health in separate threads.
 
-    prometheus_client's own server has no health check and no limits.
-
-    Parameters
-    ----------
-    host, port
-        Address to bind.
-    metrics
-        The service's metrics.
-    service
-        Value of their label.
-    is_alive
-        Whether the service's loop runs. It is called in other threads.
-
-    Raises
-    ------
-    UserError
-        If the address cannot be bound.
+    prometheus_client's own server has no health check and no limits. ``is_alive`` returns whether
+    the service's loop runs; other threads call it. Raises ``UserError`` if the address cannot be
+    bound.
     """
 
     daemon_threads = True

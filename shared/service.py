@@ -62,16 +62,8 @@ class Service(MessageLoop):
     """Base class of all services.
 
     A subclass sets ``kind``, fills in ``endpoints`` and ``facts``, registers handlers for its own
-    sockets, and overrides the methods of the first section below.
-
-    Parameters
-    ----------
-    config
-        Configuration.
-    has_control
-        Whether to connect to control; False for control itself.
-    extra_connections
-        Connections to allow in addition to the usual number.
+    sockets, and overrides the methods of the first section below. Only control itself has no
+    connection to control (``has_control``).
     """
 
     kind: ClassVar[ServiceKind]

@@ -15,27 +15,11 @@ from kouxing.shared.logs import LOG
 
 
 class Zap:
-    """The keys that may connect to this process's sockets.
+    """The keys that may connect to this process's sockets, read again after every change.
 
-    Parameters
-    ----------
-    disconnect
-        Called with the keys that were revoked or have other roles now.
-
-    Attributes
-    ----------
-    grants
-        Name and roles of each allowed key. The file is read again after every change.
-    version
-        Version of that file.
-    required_roles
-        Role that a key needs, by the configuration key of the socket. Every allowed key may
-        connect to the other sockets.
-
-    Raises
-    ------
-    UserError
-        If the list of keys cannot be read (see ``read_grants``).
+    ``required_roles`` has the role that a key needs, by the configuration key of the socket. Every
+    allowed key may connect to the other sockets. ``disconnect`` is called with the keys that were
+    revoked or have other roles now. Raises the errors of ``read_grants``.
     """
 
     def __init__(self, disconnect: Callable[[Collection[str]], None]) -> None:
@@ -93,16 +77,8 @@ def answer_handshakes(
 ) -> None:
     """Start a thread that answers libzmq's requests until the context ends.
 
-    A rejection is temporary (status 300), so that the peer retries: its key may be allowed later.
-
-    Parameters
-    ----------
-    context
-        Context of the sockets.
-    zap
-        Allowed keys; None without encryption.
-    is_blocked
-        Returns whether a key or, without keys, an address cannot connect for now.
+    A rejection is temporary (status 300), so that the peer retries: its key may be allowed later. A
+    key or, without keys, an address cannot connect while ``is_blocked`` holds for it.
     """
     socket = context.socket(zmq.REP)
     socket.bind("inproc://zeromq.zap.01")

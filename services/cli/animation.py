@@ -69,30 +69,14 @@ def animate(
     mouth: Path | None,
     expressiveness: float | None,
 ) -> Motion:
-    """Animate a face from sound.
+    """Animate a face from a sound file.
 
-    Parameters
-    ----------
-    source
-        A sound file.
-    lips
-        Lip models. Each one moves a face; the frames hold all faces side by side.
-    progress
-        Shows the progress.
-    live
-        Whether to make the frames as the live services do, with their default settings. Otherwise
-        the whole recording is known.
-    text
-        The spoken text, or the name of a file with it. If None, phones are recognized.
-    mouth
-        The speaker's mouth profile, for learnt lips.
-    expressiveness
-        Size of the mouth's movements, 0.5 to 2. If None, the default.
+    Each lip model of ``lips`` moves a face; the frames hold all faces side by side. With ``live``,
+    the frames are those of the live services with their default settings. Otherwise the whole
+    recording is known, and its phones are aligned with ``text``, a text or the name of a file with
+    it, if given.
 
-    Raises
-    ------
-    UserError
-        If a file cannot be read, or the text has nothing to say.
+    Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """
     model = load_live_model()
     predictor = _load_lip_predictor(model, mouth)

@@ -33,17 +33,8 @@ Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68
 class CurveExporter(ABC):
     """Writes the curves of a face to a file.
 
-    Parameters
-    ----------
-    output
-        File to write.
-    options
-        Only ``form``, ``head`` and ``lips`` are used.
-
-    Raises
-    ------
-    UserError
-        If the options do not fit the format, or the folder does not exist.
+    Of the options, only ``form``, ``head`` and ``lips`` are used. Raises ``UserError`` if they do
+    not fit the format, or the folder does not exist.
     """
 
     unit: ClassVar[str] = "frame"
@@ -72,17 +63,8 @@ class CurveExporter(ABC):
     def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
         """Write frames as they arrive and return their number.
 
-        Parameters
-        ----------
-        rows
-            The frames.
-        frame_rate_hz
-            If None, it is estimated from the times of the frames.
-
-        Raises
-        ------
-        UserError
-            If the file cannot be written.
+        If ``frame_rate_hz`` is None, it is estimated from the times of the frames. Raises
+        ``UserError`` if the file cannot be written.
         """
 
 

@@ -35,21 +35,10 @@ T = TypeVar("T", FapFrame, Phone)
 
 
 def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, control: str) -> None:
-    """Follow a session until it ends.
+    """Follow a session until it ends; without a name, the newest one, or else the next one.
 
-    Parameters
-    ----------
-    session
-        Its name. If empty, the newest open session, or else the next one.
-    output
-        File for the frames. If None, print what ``shown`` selects.
-    form
-        Values of the frames.
-
-    Raises
-    ------
-    UserError
-        If control does not answer, or the file cannot be written.
+    The frames go to ``output``. Without it, what ``shown`` selects is printed. Raises ``UserError``
+    if control does not answer, or the file cannot be written.
     """
     if shown is not Shown.FAPS and (output is not None or form is not CurveForm.FAPS):
         raise UserError(f"--show {shown} only prints; --output and --as are for frames")

@@ -80,30 +80,14 @@ def draw_mouth(
     num_points: int = 21,
     speech_to_text: Path | None = None,
 ) -> None:
-    """Draw the mouth of a sound, in the format of the output's suffix.
+    """Draw the mouth of a sound file, in the format of the output's suffix.
 
-    Parameters
-    ----------
-    source
-        A sound file.
-    text
-        The spoken text. If None, phones are recognized.
-    output
-        ``.svg`` or ``.png`` for the mouths at the key frames, ``.mp4`` for a video with sound, or
-        ``.csv`` for the contour of every frame.
-    timing
-        How to time a text. If None, by endpoints.
-    smooth
-        Whether the velocity of the opening is continuous at key frames.
-    num_points
-        Number of points of each line, in a ``.csv``.
-    speech_to_text
-        Folder of a model that recognizes the text.
+    ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with sound, and
+    ``.csv`` has the contour of every frame with ``num_points`` for each line. Without a text, the
+    model in the folder ``speech_to_text`` recognizes it, or else phones are recognized. With
+    ``smooth``, the velocity of the opening is continuous at key frames.
 
-    Raises
-    ------
-    UserError
-        If a file cannot be read or written, or the options do not fit each other.
+    Raises ``UserError`` if a file cannot be read or written, or the options do not fit each other.
     """
     write = _WRITERS.get(output.suffix.lower())
     if write is None:

@@ -19,19 +19,9 @@ from kouxing.shared.errors import UserError
 
 
 class VideoExporter:
-    """Draws a video, or a numbered picture for each of its images.
+    """Draws a video, or a numbered picture for each of its images, such as ``face%05d.png``.
 
-    Parameters
-    ----------
-    output
-        A video, a folder, or a name with a number such as ``face%05d.png``.
-    options
-        How the face is shown.
-
-    Raises
-    ------
-    UserError
-        If the options do not fit the format or each other.
+    Raises ``UserError`` if the options do not fit the format or each other.
     """
 
     unit: ClassVar[str] = "image"

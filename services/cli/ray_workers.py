@@ -35,14 +35,7 @@ PLACEMENT_LIMIT_S = 5.0  # an actor that is not placed by then has no free core
 class Worker:
     """Runs one worker process. The actor ends with the process, so that Ray restarts both.
 
-    Parameters
-    ----------
-    kind
-        Name of the service kind.
-    environment
-        The worker's settings.
-    key
-        Content of its key file; empty if the system is insecure.
+    ``key`` is the content of the key file, empty if the system is insecure.
     """
 
     def __init__(self, kind: str, environment: Mapping[str, str], key: str) -> None:
@@ -85,15 +78,7 @@ class Worker:
 class RayWorkers:
     """The workers of a Ray cluster. They continue to run after this process has ended.
 
-    Parameters
-    ----------
-    address
-        Address of the cluster, as for ``ray.init``.
-
-    Raises
-    ------
-    UserError
-        If no cluster is found.
+    Raises ``UserError`` if no cluster is found at ``address``, which is as for ``ray.init``.
     """
 
     def __init__(self, address: str) -> None:

@@ -116,19 +116,10 @@ def run(
 
 
 def head_environment(name: str, out: Path) -> dict[str, str]:
-    """Return the environment in which the driver and the page show a head.
+    """Return the environment in which the driver and the page show a head of the package or a file.
 
-    Parameters
-    ----------
-    name
-        A head of the package, or a file.
-    out
-        Folder for the GLB that the page loads.
-
-    Raises
-    ------
-    UserError
-        If there is no such head, or the GLB cannot be written.
+    The GLB for the page is in the folder ``out``. Raises ``UserError`` if there is no such head, or
+    the GLB cannot be written.
     """
     environment = {variable("driver", "head"): name}
     if name == DriverConfig().head:

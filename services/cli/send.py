@@ -21,23 +21,10 @@ STEP_S = 0.05
 
 
 def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_seed: int) -> None:
-    """Send the frames of a session.
+    """Send the frames of a session; without a name, those of the newest session at any time.
 
-    Parameters
-    ----------
-    targets
-        Programs that receive the face.
-    session
-        Session name. If empty, the newest session at any time.
-    control
-        Where control takes commands.
-    idle_motion_seed
-        Seed of the face's idle motion, which is sent while there are no frames.
-
-    Raises
-    ------
-    UserError
-        If control does not answer, or there are too many targets.
+    While there are no frames, the face's idle motion is sent, which the seed determines. Raises
+    ``UserError`` if control does not answer, or there are too many targets.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
     with (
@@ -54,13 +41,7 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
 
 
 class _Search:
-    """Asks control for the session to follow, in a thread because answers may take long.
-
-    Attributes
-    ----------
-    newest
-        The session that control reported last; None at first.
-    """
+    """Asks control for the session to follow, in a thread because answers may take long."""
 
     def __init__(self, session: str, client: Client) -> None:
         self.newest: SessionState | None = None

@@ -43,18 +43,8 @@ class HangDetector:
 class ServiceProcess(subprocess.Popen[bytes]):
     """Runs ``python -m kouxing.services.<kind>``. It ends when this process ends.
 
-    Parameters
-    ----------
-    kind
-        Name of the service kind.
-    arguments
-        Command-line arguments of the service.
-    environment
-        The complete environment. This class adds two variables.
-    hang_limit_s
-        A loop that sends no heartbeat for longer hangs.
-    options
-        Options of ``subprocess.Popen``.
+    ``environment`` is complete but for two variables. A loop that sends no heartbeat for
+    ``hang_limit_s`` hangs. Other options are those of ``subprocess.Popen``.
     """
 
     def __init__(

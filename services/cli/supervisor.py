@@ -31,21 +31,11 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NU
 
 
 class Supervisor:
-    """Runs each service in a process.
+    """Runs each service in a process, with one log of JSON lines per service in ``log_folder``.
 
-    Parameters
-    ----------
-    arguments
-        Command-line arguments of every service, such as ``["--config", "my.toml"]``.
-    log_folder
-        Folder for one log of JSON lines per service. Warnings also go to the console.
-    environment
-        Added to this process's environment.
-    services
-        Kinds of service to run.
-    more
-        Additional workers: for each name, such as ``recognizer-2``, its additions to the
-        environment. ``services.kinds.more_workers`` returns this.
+    Warnings also go to the console. ``arguments`` are the command-line arguments of every service,
+    and ``environment`` is added to this process's. ``more`` names additional workers, such as
+    ``recognizer-2``, with their additions to the environment (see ``services.kinds.more_workers``).
     """
 
     def __init__(
