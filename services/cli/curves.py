@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -68,60 +69,25 @@ class CurveExporter(ABC):
         """
 
 
-class TableExporter(CurveExporter):
-    """Writes a line of text for each frame."""
+class CsvExporter(CurveExporter):
+    """Writes comma-separated values, with a column for each FAP or shape."""
 
     def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
         """Write each frame when it arrives."""
-        count = 0
-        try:
-            with self._output.open("w", encoding="utf-8", newline="") as file:
-                file.write(self.header(self._form))
-                for row in rows:
-                    file.write(self.line(row, self._form) + "\n")
-                    file.flush()
-                    count += 1
-        except OSError as error:
-            raise cannot_write(self._output, error) from None
-        return count
-
-    @staticmethod
-    def header(form: CurveForm) -> str:
-        """Return the text before the first frame."""
-        return ""
-
-    @staticmethod
-    @abstractmethod
-    def line(row: Row, form: CurveForm) -> str:
-        """Return the line of a frame."""
+        columns = ",".join(["time_s", *_value_names(self._form)])
+        lines = (
+            ",".join([f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, self._form))])
+            for time_s, _, faps in rows
+        )
+        return _write_lines(self._output, chain([columns], lines)) - 1
 
 
-class CsvExporter(TableExporter):
-    """Writes comma-separated values, with a column for each FAP or shape."""
+class JsonLinesExporter(CurveExporter):
+    """Writes a JSON object for each frame."""
 
-    @staticmethod
-    def header(form: CurveForm) -> str:
-        """Return the names of the columns."""
-        return ",".join(["time_s", *_value_names(form)]) + "\n"
-
-    @staticmethod
-    def line(row: Row, form: CurveForm) -> str:
-        """Return the values of a frame."""
-        time_s, _, faps = row
-        return ",".join([f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, form))])
-
-
-class JsonLinesExporter(TableExporter):
-    """Writes a JSON object for each frame: FAPs in the order of their numbers, or named shapes."""
-
-    @staticmethod
-    def line(row: Row, form: CurveForm) -> str:
-        """Return the JSON object of a frame."""
-        time_s, number, faps = row
-        is_faps = form is CurveForm.FAPS
-        rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, form)]
-        values = rounded if is_faps else dict(zip(_value_names(form), rounded, strict=True))
-        return json.dumps({"time_s": time_s, "sequence": number, form.value: values})
+    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+        """Write each frame when it arrives."""
+        return _write_lines(self._output, (json_line(row, self._form) for row in rows))
 
 
 class FapExporter(CurveExporter):
@@ -163,6 +129,28 @@ CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
     ".jsonl": JsonLinesExporter,
     ".glb": GlbExporter,
 }
+
+
+def json_line(row: Row, form: CurveForm) -> str:
+    """Return a JSON object for a frame: FAPs in the order of their numbers, or named shapes."""
+    time_s, number, faps = row
+    is_faps = form is CurveForm.FAPS
+    rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, form)]
+    values = rounded if is_faps else dict(zip(_value_names(form), rounded, strict=True))
+    return json.dumps({"time_s": time_s, "sequence": number, form.value: values})
+
+
+def _write_lines(output: Path, lines: Iterable[str]) -> int:
+    """Write each line when it arrives; return their number."""
+    count = 0
+    try:
+        with output.open("w", encoding="utf-8", newline="") as file:
+            for count, line in enumerate(lines, start=1):  # noqa: B007
+                file.write(line + "\n")
+                file.flush()
+    except OSError as error:
+        raise cannot_write(output, error) from None
+    return count
 
 
 def _value_names(form: CurveForm) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -9,9 +10,12 @@ from rich.progress import Progress
 
 from kouxing.services.cli.animation import Motion
 from kouxing.services.cli.curves import CURVE_EXPORTERS
-from kouxing.services.cli.options import ExportOptions
-from kouxing.services.cli.pictures import PictureExporter, VideoExporter
-from kouxing.services.driver.video.writer import VIDEO_SUFFIXES, is_sequence
+from kouxing.services.cli.options import CurveForm, ExportOptions
+from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.side_by_side import SideBySide
+from kouxing.services.driver.video import film
+from kouxing.services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_sequence
 from kouxing.shared.errors import UserError
 
 
@@ -25,6 +29,56 @@ class Exporter(Protocol):
 
     def export(self, motion: Motion, progress: Progress) -> int:
         """Write the motion and return the number of frames or images."""
+
+
+class VideoExporter:
+    """Draws a video, or a numbered picture for each of its images, such as ``face%05d.png``.
+
+    Raises ``UserError`` if the options do not fit the format or each other.
+    """
+
+    unit: ClassVar[str] = "image"
+
+    def __init__(self, output: Path, options: ExportOptions) -> None:
+        if options.at_s is not None:
+            raise UserError("--at selects one picture; give the name of a picture (.png)")
+        check_name(output)
+        self._output = output
+        self._rate_hz = options.rate_hz
+        self._renderer = _make_renderer(output, options)
+
+    def export(self, motion: Motion, progress: Progress) -> int:
+        """Draw a motion and return the number of images.
+
+        Raises ``UserError`` if a file cannot be written.
+        """
+        task = progress.add_task("drawing", total=1.0)
+        with contextlib.closing(self._renderer):
+            return film.render_video(
+                motion.frames,
+                self._output,
+                self._renderer,
+                frame_rate_hz=self._rate_hz or motion.image_rate_hz,
+                samples=motion.samples,
+                on_progress=lambda share: progress.update(task, completed=share),
+            )
+
+
+class PictureExporter:
+    """Draws one picture (PNG); parameters and errors as for ``VideoExporter``."""
+
+    unit: ClassVar[str] = "image"
+
+    def __init__(self, output: Path, options: ExportOptions) -> None:
+        self._output = output
+        self._at_s = options.at_s or 0.0
+        self._renderer = _make_renderer(output, options)
+
+    def export(self, motion: Motion, progress: Progress) -> int:
+        """Draw the picture and return 1."""
+        with contextlib.closing(self._renderer):
+            film.render_picture(motion.frames, self._output, self._renderer, self._at_s)
+        return 1
 
 
 EXPORTERS: dict[str, type[Exporter]] = {
@@ -48,3 +102,36 @@ def open_exporter(output: Path, options: ExportOptions) -> Exporter:
             " or a name with a number such as face%05d.png"
         )
     return exporter(output, options)
+
+
+def _make_renderer(output: Path, options: ExportOptions) -> Renderer | SideBySide:
+    """Return a renderer that draws a face for each lip model, side by side."""
+    if options.form is not CurveForm.FAPS:
+        raise UserError(f"--as {options.form} is for curves; write .csv, .jsonl or .glb")
+    num_faces = len(options.lips)
+    width_px, height_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
+    if width_px % num_faces:
+        raise UserError(f"--size {options.size}: choose a width that {num_faces} divides")
+    background = scene.background(options.background)
+    if background is None and output.suffix == ".mp4":
+        raise UserError("MP4 has no transparency; write .mov, .webm or pictures (.png)")
+    head = scene.load_head(options.head)
+    camera = scene.camera(head, options.camera, options.yaw_deg, options.pitch_deg)
+    renderer = Renderer(
+        head, width_px // num_faces, height_px, background=background, camera=camera
+    )
+    if num_faces == 1:
+        return renderer
+    return SideBySide(renderer, [f"lips: {name}" for name in options.lips])
+
+
+def _parse_size(text: str, *, even: bool) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise UserError(f"--size {text}: write WIDTHxHEIGHT, for example 1280x720")
+    width_px, height_px = int(width), int(height)
+    if not (16 <= width_px <= 7680 and 16 <= height_px <= 4320):
+        raise UserError(f"--size {text}: choose a size from 16x16 to 7680x4320")
+    if even and (width_px % 2 or height_px % 2):
+        raise UserError(f"--size {text}: both numbers must be even for a video")
+    return width_px, height_px

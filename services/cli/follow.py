@@ -14,8 +14,8 @@ from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 from kouxing.services.cli.curves import (
     CURVE_EXPORTERS,
     CurveExporter,
-    JsonLinesExporter,
     Row,
+    json_line,
 )
 from kouxing.services.cli.options import CurveForm, ExportOptions, Shown
 from kouxing.shared.clock import to_seconds
@@ -121,7 +121,7 @@ def _row(frame: FapFrame) -> Row:
 def _print_frames(rows: Iterable[Row], form: CurveForm) -> int:
     """Print frames, a line for each, and return their number."""
     if form is not CurveForm.FAPS:
-        return _print(JsonLinesExporter.line(row, form) for row in rows)
+        return _print(json_line(row, form) for row in rows)
     CONSOLE.print(LEGEND, markup=False, highlight=False)
     return _print(
         f"{time_s:9.3f} s  " + "  ".join(f"{values[n - 1]:6.0f}" for n in PRINTED_FAPS)

@@ -1,14 +1,26 @@
-"""The commands under ``kouxing head``."""
+"""The commands under ``kouxing head``, and the GLB files of the heads that the page shows.
+
+They are exported from the package's heads, because they are five times as large. A source tree and
+the container image have them in the page's folder. Otherwise ``kouxing run`` exports them once, to
+the user's cache folder.
+"""
 
 from __future__ import annotations
 
+import os
+from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from kouxing.services.cli.options import DEFAULT_HEAD, HeadName
+from kouxing.shared.errors import UserError
+from kouxing.shared.page_heads import page_heads_folder
 from kouxing.shared.terminal import print_message
+
+_DRIVER_HEADS = Path(str(resources.files("kouxing.services.driver"))) / "head"
+_PAGE = Path(str(resources.files("kouxing.services.gateway"))) / "page"
 
 app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")
 
@@ -28,7 +40,6 @@ def export_head(
     ] = False,
 ) -> None:
     """Write a head for an engine: a GLB with FAPs and ARKit shapes, or a VRM 1.0 avatar."""
-    from kouxing.services.cli.page_heads import export_page_heads
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head
 
@@ -58,3 +69,48 @@ def import_mesh(
     for remark in import_head(mesh, points, output):
         print_message(remark)
     print_message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+
+
+def export_page_heads(folder: Path) -> None:
+    """Export all heads of the package.
+
+    Raises ``UserError`` if a file cannot be written.
+    """
+    from kouxing.services.driver.head.glb_export import export_glb
+    from kouxing.services.driver.render.scene import load_head
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, file in _page_files().items():
+            part = folder / f".{os.getpid()}-{file}"  # another process may export, too
+            export_glb(load_head(name), part)
+            part.replace(folder / file)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def ensure_page_heads() -> None:
+    """Export the heads to the cache folder, unless they are up to date or in the page's folder."""
+    folder = page_heads_folder()
+    if _has_current_heads(_PAGE) or _has_current_heads(folder):
+        return
+    try:
+        export_page_heads(folder)
+    except UserError as error:
+        print_message(f"the page has no heads: {error}")
+
+
+def _page_files() -> dict[str, str]:
+    """Return the name of each head's file."""
+    names = sorted(path.stem for path in (_DRIVER_HEADS / "assets").glob("*.npz"))
+    return {name: "head.glb" if name == DEFAULT_HEAD else f"head-{name}.glb" for name in names}
+
+
+def _has_current_heads(folder: Path) -> bool:
+    """Return whether a folder has all heads, newer than what they are made from."""
+    files = [folder / file for file in _page_files().values()]
+    if not all(file.is_file() for file in files):
+        return False
+    sources = [*(_DRIVER_HEADS / "assets").iterdir(), _DRIVER_HEADS / "glb_export.py"]
+    newest_source_s = max(source.stat().st_mtime for source in sources)
+    return min(file.stat().st_mtime for file in files) > newest_source_s

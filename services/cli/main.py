@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
 from typing import Annotated, Any
@@ -14,9 +15,10 @@ from typer.core import TyperGroup
 from kouxing.services.cli import clients, cluster, configuration, offline, run
 from kouxing.services.cli.heads import app as head_app
 from kouxing.services.cli.keys import app as keys_app
-from kouxing.services.cli.services import service_command
+from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
+from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.terminal import CONSOLE
 
 SERVICES = "A single service (run starts all of them)"
@@ -75,6 +77,15 @@ def kouxing(
     """Live Mandarin speech in, a talking 3-D face out."""
 
 
+def _service_command(kind: ServiceKind) -> Callable[..., None]:
+    def command(config: ConfigFile = None, assignments: Assignments = None) -> None:
+        from kouxing.services.process import serve
+
+        sys.exit(serve(kind.name, config, assignments or []))
+
+    return command
+
+
 for command in (
     run.run, clients.speak, offline.render, offline.lips, clients.listen, clients.send,
     clients.express, offline.phones, offline.align, clients.devices, clients.status,
@@ -84,7 +95,7 @@ for command in (
 app.add_typer(head_app, name="head")
 app.add_typer(keys_app, name="keys")
 for kind in KINDS.values():
-    app.command(kind.name, help=kind.summary, rich_help_panel=SERVICES)(service_command(kind))
+    app.command(kind.name, help=kind.summary, rich_help_panel=SERVICES)(_service_command(kind))
 
 
 def main() -> None:

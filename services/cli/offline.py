@@ -158,7 +158,7 @@ def phones(
     audio: Audio, acoustic: Acoustic = "blocks", form: Form = None, output: Output = None
 ) -> None:
     """Recognize the phones of an audio file, with their times."""
-    from kouxing.services.cli.sound_file import read_mono_16k
+    from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.offline import recognize
     from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -184,8 +184,7 @@ def align(
     output: Output = None,
 ) -> None:
     """Find the times of the phones of a known text. The exit status is 1 if it does not fit."""
-    from kouxing.services.cli.sound_file import read_mono_16k
-    from kouxing.services.cli.spoken_text import does_not_fit, read_text
+    from kouxing.services.cli.inputs import does_not_fit, read_mono_16k, read_text
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.options import ConfigFile, HeadName, ServiceAssignments
-from kouxing.services.cli.page_heads import ensure_page_heads
 from kouxing.services.cli.running_system import announce, find_control
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig

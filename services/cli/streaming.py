@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from kouxing_client import (
     Client,
-    Event,
     KouxingError,
     Phone,
     Refused,
-    Results,
-    Session,
 )
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -58,177 +57,149 @@ def stream(
     refuses the session or stops answering.
     """
     with connect(control) as client:
-        drawn_before_s = _drawn_s(client) if record else 0.0
-        opened = client.open_session(
-            session,
+        return _Streaming(client, source, console).run(
+            record=record,
+            name=session,
+            paced=paced,
+            mouth_profile=mouth_profile or None,
+        )
+
+
+class _Streaming:
+    """One source that is streamed into a session."""
+
+    def __init__(self, client: Client, source: AudioSource, console: Console) -> None:
+        self._client = client
+        self._source = source
+        self._console = console
+        self._duration_s = self._clipped = self._peak = 0.0  # of what was sent
+
+    def run(self, *, record: bool, paced: bool, **options: Any) -> StreamSummary:
+        """Stream the source and wait for the last frame and the video."""
+        source = self._source
+        drawn_before_s = self._drawn_s() if record else 0.0
+        self._session = self._client.open_session(
             encoding="f32le",
             sample_rate_hz=source.sample_rate_hz,
             num_channels=source.num_channels,
             record=record,
             paced=paced,
-            mouth_profile=mouth_profile or None,
+            **options,
         )
-        events = opened.events()
-        silence = load_inventory(opened.info["facts"]["language"] or DEFAULT_LANGUAGE).silence
+        self._events = self._session.events()
+        self._frames = self._session.frames()
+        self._results = self._session.results(Phone, keep_all=True)
+        self._phones: set[int] = set()  # indices of those that are not silence
+        language = self._session.info["facts"]["language"] or DEFAULT_LANGUAGE
+        self._silence = load_inventory(language).silence
         try:
-            with _progress(console) as progress:
-                title = f"speaking {source.name}"
-                output = _Output(opened, progress, title, source.duration_s, silence)
-                duration_s, clipped, peak = _send_all(
-                    source, opened, output, events, console, paced=paced
-                )
-                opened.finish()
-                _wait_for_end(output, opened, events, console, client)
+            with self._progress() as progress:
+                task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
+                self._show_time = functools.partial(progress.update, task)
+                self._send_all(paced=paced)
+                self._session.finish()
+                self._wait_for_end()
         finally:
             with contextlib.suppress(KouxingError):  # closed already, or control is gone
-                opened.close()
-        video = ""
-        if record:
-            video = _wait_for_video(events, console, client, drawn_before_s, duration_s)
-    num_phones = len(output.phones)
-    if num_phones == 0:
-        reason = "it is silent" if peak < QUIET_PEAK else "is there a voice in it?"
-        _warn(console, f"{source.name}: no speech was found; {reason}")
-    for remark in (*source.remarks, *clipping_remarks(source.name, clipped)):
-        _warn(console, remark)
-    return StreamSummary(opened.name, duration_s, num_phones, video)
+                self._session.close()
+        video = self._wait_for_video(drawn_before_s) if record else ""
+        if not self._phones:
+            reason = "it is silent" if self._peak < QUIET_PEAK else "is there a voice in it?"
+            self._warn(f"{source.name}: no speech was found; {reason}")
+        for remark in (*source.remarks, *clipping_remarks(source.name, self._clipped)):
+            self._warn(remark)
+        return StreamSummary(self._session.name, self._duration_s, len(self._phones), video)
 
+    def _progress(self) -> Progress:
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        is_shown = self._console.is_interactive
+        return Progress(*columns, console=self._console, transient=True, disable=not is_shown)
 
-class _Output:
-    """The phones and FAP frames of the session, and a progress bar of the frames."""
-
-    def __init__(
-        self,
-        session: Session,
-        progress: Progress,
-        title: str,
-        duration_s: float | None,
-        silence: str,
-    ) -> None:
-        self.phones: set[int] = set()  # indices of those that are not silence
-        self._silence = silence
-        self._frames = session.frames()
-        self._phones = session.results(Phone, keep_all=True)
-        self._progress = progress
-        self._task = progress.add_task(title, total=duration_s)
-
-    @property
-    def has_ended(self) -> bool:
-        return self._frames.has_ended
-
-    def update(self, timeout_s: float) -> None:
+    def _update(self, timeout_s: float) -> None:
         """Process what has arrived, waiting up to the timeout for a frame."""
         for frame in self._frames.available(timeout_s):
-            self._progress.update(self._task, completed=frame.time_s)
-        for phone in self._phones.available():
+            self._show_time(completed=frame.time_s)
+        for phone in self._results.available():
             if phone.symbol != self._silence:
-                self.phones.add(phone.index)
+                self._phones.add(phone.index)
 
+    def _send_all(self, *, paced: bool) -> None:
+        source = self._source
+        num_sent = num_clipping = 0
+        is_pipe = source.duration_s is None
+        due_s = time.monotonic()  # when the next block is spoken
+        try:
+            for block in source.blocks:
+                self._check_errors()
+                with contextlib.suppress(Refused):  # `_check_errors` reports the next one
+                    self._session.push(block.astype("<f4").tobytes(), PUSH_TIMEOUT_S)
+                num_sent += len(block)
+                num_clipping += num_clipped(block)
+                self._peak = max(self._peak, float(np.abs(block).max()))
+                self._update(0.0)
+                if paced and not source.is_live:
+                    if is_pipe and time.monotonic() > due_s + PIPE_PAUSE_S:
+                        due_s = time.monotonic()  # it resumes after a pause
+                    due_s += len(block) / source.sample_rate_hz * (PIPE_CLOCK if is_pipe else 1.0)
+                    time.sleep(max(0.0, due_s - time.monotonic()))
+        except KeyboardInterrupt:
+            self._console.print("stopping")
+        self._duration_s = num_sent / source.sample_rate_hz
+        self._clipped = num_clipping / max(1, num_sent * source.num_channels)
 
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    is_shown = console.is_interactive
-    return Progress(*columns, console=console, transient=True, disable=not is_shown)
+    def _wait_for_end(self) -> None:
+        """Wait for the last frame; with much queued audio that may take a while."""
+        ask_s = time.monotonic() + STATUS_S
+        while not self._frames.has_ended:
+            self._update(0.2)
+            self._check_errors()
+            if time.monotonic() > ask_s:
+                self._client.status()  # fails if control is gone
+                ask_s = time.monotonic() + STATUS_S
 
+    def _check_errors(self) -> None:
+        """Print the errors that the services report."""
+        try:
+            errors = self._session.take_errors()
+        except Refused as refusal:
+            errors = [refusal]
+        for error in errors:
+            self._warn(str(error))
+            if error.code in ("unknown-session", "bad-token", "finished"):
+                raise UserError("the session was lost; speak again to open a new one")
+        for event in self._events.available():
+            if event.name == "error":
+                self._warn(event.detail)
 
-def _send_all(
-    source: AudioSource,
-    session: Session,
-    output: _Output,
-    events: Results[Event],
-    console: Console,
-    *,
-    paced: bool,
-) -> tuple[float, float, float]:
-    """Send everything; return seconds sent, the share of clipped samples and the peak."""
-    num_sent = clipped = 0
-    peak = 0.0
-    is_pipe = source.duration_s is None
-    due_s = time.monotonic()  # when the next block is spoken
-    try:
-        for block in source.blocks:
-            _check_errors(session, events, console)
-            with contextlib.suppress(Refused):  # `_check_errors` reports the next one
-                session.push(block.astype("<f4").tobytes(), PUSH_TIMEOUT_S)
-            num_sent += len(block)
-            clipped += num_clipped(block)
-            peak = max(peak, float(np.abs(block).max()))
-            output.update(0.0)
-            if paced and not source.is_live:
-                if is_pipe and time.monotonic() > due_s + PIPE_PAUSE_S:
-                    due_s = time.monotonic()  # it resumes after a pause
-                due_s += len(block) / source.sample_rate_hz * (PIPE_CLOCK if is_pipe else 1.0)
-                time.sleep(max(0.0, due_s - time.monotonic()))
-    except KeyboardInterrupt:
-        console.print("stopping")
-    duration_s = num_sent / source.sample_rate_hz
-    return duration_s, clipped / max(1, num_sent * source.num_channels), peak
+    def _wait_for_video(self, drawn_before_s: float) -> str:
+        """Wait for the driver's video; return its path, or an empty string."""
+        with self._progress() as progress:
+            task = progress.add_task("writing the video", total=self._duration_s)
+            newest_s = drawn_before_s
+            while True:
+                drawn_s = self._drawn_s(DRIVER_TIMEOUT_S)
+                if drawn_s < newest_s:
+                    raise UserError("the driver restarted, so there is no video; speak again")
+                newest_s = drawn_s
+                progress.update(task, completed=drawn_s - drawn_before_s)
+                for event in self._events.available(STATUS_S):
+                    if event.name == "recorded":
+                        return event.detail
+                    if event.detail.startswith("no-video"):
+                        self._warn(event.detail)
+                        return ""
 
-
-def _wait_for_end(
-    output: _Output, session: Session, events: Results[Event], console: Console, client: Client
-) -> None:
-    """Wait for the last frame; with much queued audio that may take a while."""
-    ask_s = time.monotonic() + STATUS_S
-    while not output.has_ended:
-        output.update(0.2)
-        _check_errors(session, events, console)
-        if time.monotonic() > ask_s:
-            client.status()
-            ask_s = time.monotonic() + STATUS_S
-
-
-def _check_errors(session: Session, events: Results[Event], console: Console) -> None:
-    """Print the errors that the services report."""
-    try:
-        errors = session.take_errors()
-    except Refused as refusal:
-        errors = [refusal]
-    for error in errors:
-        _warn(console, str(error))
-        if error.code in ("unknown-session", "bad-token", "finished"):
-            raise UserError("the session was lost; speak again to open a new one")
-    for event in events.available():
-        if event.name == "error":
-            _warn(console, event.detail)
-
-
-def _wait_for_video(
-    events: Results[Event],
-    console: Console,
-    client: Client,
-    drawn_before_s: float,
-    duration_s: float,
-) -> str:
-    """Wait for the driver's video of ``duration_s``; return its path, or an empty string."""
-    with _progress(console) as progress:
-        task = progress.add_task("writing the video", total=duration_s)
-        newest_s = drawn_before_s
+    def _drawn_s(self, timeout_s: float = 0.0) -> float:
+        """Return how many seconds of video the driver has drawn since it started."""
+        end_s = time.monotonic() + timeout_s
         while True:
-            drawn_s = _drawn_s(client, DRIVER_TIMEOUT_S)
-            if drawn_s < newest_s:
-                raise UserError("the driver restarted, so there is no video; speak again")
-            newest_s = drawn_s
-            progress.update(task, completed=drawn_s - drawn_before_s)
-            for event in events.available(STATUS_S):
-                if event.name == "recorded":
-                    return event.detail
-                if event.detail.startswith("no-video"):
-                    _warn(console, event.detail)
-                    return ""
+            services = self._client.status().services
+            drivers = [state for state in services if state.service == "driver"]
+            if drivers:
+                return max(state.metrics.get("video_ms", 0.0) for state in drivers) / 1000
+            if time.monotonic() >= end_s:
+                raise UserError("no driver runs, so there is no video; start one: kouxing driver")
+            time.sleep(STATUS_S)
 
-
-def _drawn_s(client: Client, timeout_s: float = 0.0) -> float:
-    """Return how many seconds of video the driver has drawn since it started."""
-    end_s = time.monotonic() + timeout_s
-    while True:
-        drivers = [state for state in client.status().services if state.service == "driver"]
-        if drivers:
-            return max(state.metrics.get("video_ms", 0.0) for state in drivers) / 1000
-        if time.monotonic() >= end_s:
-            raise UserError("no driver runs, so there is no video; start one: kouxing driver")
-        time.sleep(STATUS_S)
-
-
-def _warn(console: Console, text: str) -> None:
-    console.print(text, style="yellow", markup=False, highlight=False)
+    def _warn(self, text: str) -> None:
+        self._console.print(text, style="yellow", markup=False, highlight=False)

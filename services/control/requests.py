@@ -12,6 +12,7 @@ from kouxing.shared.keys import Grant, Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.control import AllowedKey, Heartbeat
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
@@ -38,6 +39,7 @@ class Requests:
 
     def __init__(self, bus: Bus, commands: Socket, metrics: Metrics) -> None:
         self.defers = False
+        self.key_versions: dict[str, tuple[int, int]] = {}  # that workers have, by instance
         self._bus = bus
         self._commands = commands
         self._metrics = metrics
@@ -104,6 +106,19 @@ class Requests:
         return grant is not None and any(
             role == "client" or role.startswith("service:") for role in grant.roles
         )
+
+    def changed_keys(self, heartbeat: Heartbeat) -> dict[str, AllowedKey] | None:
+        """Return the list of allowed keys for a worker, unless it has the list already."""
+        zap, instance = self._bus.zap, heartbeat.instance
+        if zap is None or heartbeat.role != "worker":
+            return None
+        if self.key_versions.get(instance) == zap.version:
+            return None
+        self.key_versions[instance] = zap.version
+        return {
+            public: AllowedKey(name=grant.name, roles=list(grant.roles))
+            for public, grant in zap.grants.items()
+        }
 
     def retry_deferred(self) -> None:
         """Handle the deferred requests again."""

@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.control.key_list import KeyList
 from kouxing.services.control.kind import KIND
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.refusal import Refusal
@@ -80,7 +79,6 @@ class ControlService(Service):
         self._num_events = 0
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._moves_to_repeat: list[tuple[float, str, SessionMoved]] = []  # heap by time
-        self._keys = KeyList(self.bus)
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         public = self.key.public if self.key else ""
@@ -117,7 +115,8 @@ class ControlService(Service):
     def on_tick(self, now_s: float) -> None:
         """Find lost services, sessions that wait too long, and keys that changed."""
         self._registry.exclude_pause(self._tick_stall.check(now_s))
-        self._keys.refresh()
+        if self.bus.zap is not None:
+            self.bus.zap.refresh()
         if self._takeover.is_active and now_s > self._takeover.end_s:
             self._takeover.is_active = self._requests.defers = False
             self._restore_sessions()
@@ -223,7 +222,7 @@ class ControlService(Service):
             received_ns=received_ns,
             replied_ns=now_ns(),
             control=self.instance,
-            keys=self._keys.update_for(heartbeat),
+            keys=self._requests.changed_keys(heartbeat),
         )
         self._commands.send(reply, to=sender)
         if heartbeat.state == "draining":
@@ -295,7 +294,7 @@ class ControlService(Service):
 
     def _on_service_lost(self, instance: str, reason: str) -> None:
         self._registry.remove(instance)
-        self._keys.forget(instance)
+        self._requests.key_versions.pop(instance, None)
         level = logging.INFO if reason == STOPPED else logging.WARNING
         LOG.log(level, "lost %s: %s", instance, reason)
         self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")

@@ -67,15 +67,6 @@ def test_the_sound_is_the_audio_that_was_sent(collected: Collected) -> None:
     np.testing.assert_allclose(sound / 32768, sent, atol=1e-4)
 
 
-@pytest.mark.parametrize("chunk", [97, 1600, 8000])
-def test_frames_do_not_depend_on_the_chunks(
-    system: System, collected: Collected, chunk: int
-) -> None:
-    again = stream(system.control, samples_of_file(DEMO / "hello-female.wav"), chunk=chunk)
-    assert again.symbols == collected.symbols
-    np.testing.assert_array_equal(again.faps, collected.faps)
-
-
 def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
     samples = samples_of_file(VOWELS_FILE)
     fast = stream(system.control, samples)
@@ -86,23 +77,6 @@ def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> No
             break  # a machine that stalls for 0.2 s gets frames of rest before, or in between
         assert time.monotonic() < end_s, "this machine stalls too often for real time"
     np.testing.assert_array_equal(live.faps, fast.faps)
-
-
-@pytest.mark.parametrize(("rate_hz", "chunk"), [(48000, 128), (44100, 97)])
-def test_odd_chunks_leave_no_gaps(system: System, rate_hz: int, chunk: int) -> None:
-    before = system.num_gaps()
-    stream(system.control, np.zeros(6 * rate_hz, np.float32), sample_rate_hz=rate_hz, chunk=chunk)
-    assert system.num_gaps() == before
-
-
-@pytest.mark.parametrize("rate_hz", [8000, 22050, 44100, 48000])
-def test_any_rate_is_recognised(system: System, rate_hz: int) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")
-    positions = np.arange(int(len(samples) * rate_hz / 16000)) * (16000 / rate_hz)
-    resampled = np.interp(positions, np.arange(len(samples)), samples).astype(np.float32)
-    result = stream(system.control, resampled, sample_rate_hz=rate_hz, chunk=rate_hz // 50)
-    assert len(result.symbols) > 15
-    assert abs(result.frames[-1].media_time - len(samples)) < 16000
 
 
 def test_int16_stereo_gives_the_phones_of_float_mono(system: System, collected: Collected) -> None:

@@ -19,9 +19,8 @@ import yaml
 from kouxing_client import Client, KouxingError
 
 from kouxing.evaluation.system.network import Link, Network
-from kouxing.shared.errors import UserError
 from kouxing.shared.keys import control_endpoint, read_key
-from tests.containers import READ, USER, Containers
+from tests.containers import READ, USER, Containers, network_or_skip
 from tests.system import ROOT, VOWELS_FILE
 
 pytestmark = pytest.mark.e2e
@@ -39,11 +38,7 @@ HOSTS = {  # containers by name, and their services: two recognizers, as by --sc
 
 @pytest.fixture(scope="module")
 def network() -> Iterator[Network]:
-    try:
-        made = Network([*HOSTS], Link())
-    except UserError as error:  # where nobody may have a network of his own
-        pytest.skip(str(error))
-    with made:
+    with network_or_skip([*HOSTS], Link()) as made:
         yield made
 
 

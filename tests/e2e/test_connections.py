@@ -12,8 +12,8 @@ import pytest
 from kouxing.evaluation.system.attackers import connected, frame
 from kouxing.shared import connections
 from kouxing.shared.bus import Bus
-from kouxing.shared.connections import BUDGET, MAX_TOPIC, MAX_TOPICS
-from kouxing.shared.sockets import ERROR_COST, MAX_DROPPED, Poller, Received, Socket
+from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS
+from kouxing.shared.sockets import MAX_DROPPED, Poller, Received, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.face import FapFrame
@@ -210,25 +210,6 @@ def test_reports_the_end_of_a_connection(bus: Bus) -> None:
         assert collect(bus, audio, lambda all_: len(all_) == 1)
 
 
-def test_silent_connections_make_room_for_new_ones(
-    bus: Bus, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 40)
-    audio = bus.bind_router(LOCAL, "audio")
-    talker = bus.connect_dealer(audio.endpoint)
-    talker.send(chunk(1, 10))
-    collect(bus, audio, lambda all_: len(all_) == 1)
-    silent = [connected(port_of(audio)) for _ in range(60)]
-    late = bus.connect_dealer(audio.endpoint)
-    late.send(chunk(2, 10))
-    collect(bus, audio, lambda all_: len(all_) == 1)
-    talker.send(chunk(3, 10))
-    collect(bus, audio, lambda all_: late.send(chunk(3, 10)) and bool(all_))
-    assert all(is_cut(each, audio) for each in silent[: 60 - 40])
-    for each in silent:
-        each.close()
-
-
 def test_a_disconnected_address_is_blocked_for_a_while(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,24 +249,3 @@ def test_drops_a_message_of_very_many_parts_step_by_step(
             list(bound.receive())
             turns += 1
     assert turns >= num_parts // MAX_DROPPED
-
-
-def test_a_new_connection_inherits_the_budget_of_the_previous_one(
-    bus: Bus, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(connections, "BUDGET_PER_S", 0.0)
-    audio = bus.bind_router(LOCAL, "audio")
-    bad = frame(b"nothing/s/", more=True) + frame(b"\x80")
-    num_refused = 0
-    for _ in range(4):
-        with contextlib.suppress(ConnectionError), connected(port_of(audio)) as hostile:
-            hostile.sendall(bad * 500)
-            num_left = 500
-            while num_left and not has_ended(hostile):
-                for received in audio.receive():
-                    audio.send(Error(code="bad-message", text="no"), to=received.sender)
-                    num_left -= 1
-                    num_refused += 1
-        while bus._limiter:
-            list(audio.receive())
-    assert num_refused < BUDGET / ERROR_COST + 10

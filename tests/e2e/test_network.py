@@ -1,6 +1,6 @@
 """Control, recognizer, synthesizer and client on a host each, with keys of their own.
 
-The hosts are network namespaces; where they are forbidden, forwarders take their place.
+The hosts are network namespaces; where they are forbidden, these tests are skipped.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import pytest
 from kouxing_client import Client
 
 from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
-from kouxing.evaluation.system.network import Link, Network
+from kouxing.evaluation.system.network import Link
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
-from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
+from tests.containers import network_or_skip
 from tests.e2e.following import samples_of_file
-from tests.forwarders import Forwarders
 from tests.system import DEMO
 
 pytestmark = pytest.mark.e2e
@@ -31,22 +30,12 @@ SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 
 
 @contextlib.contextmanager
-def hosts(*names: str, link: Link) -> Iterator[Network]:
-    with contextlib.ExitStack() as stack:
-        try:
-            network = stack.enter_context(Network(names, link))
-        except UserError:  # not allowed here
-            network = stack.enter_context(Forwarders(names))
-        yield network
-
-
-@contextlib.contextmanager
 def spread(folder: Path, *, link: Link | None = None, beside: str = "") -> Iterator[HostsSystem]:
     names = [*ON_HOSTS, CLIENT, *([SPARE] if beside else [])]
     states = folder / "states"
     states.mkdir()
     with (
-        hosts(*names, link=link or Link()) as network,
+        network_or_skip(names, link or Link()) as network,
         HostsSystem(folder, states, network, beside) as system,
         system.on_client(),
     ):
@@ -58,7 +47,7 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
     session = client.open_session(encoding="f32le")
     begin_s = time.monotonic()
     if host and host != CLIENT:
-        host = system.instance_of(session.name, host)
+        host = system.host_of(session.name, host)
     steps: list[tuple[float, Callable[[], object]]] = [
         (CUT_AT_S, functools.partial(system.network.cut, host)),
         (CUT_AT_S + cut_s, system.network.mend),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kouxing.services.cli import page_heads
+from kouxing.services.cli import heads as page_heads
 from kouxing.services.cli.heads import import_mesh
 from kouxing.services.cli.offline import render
 from kouxing.services.cli.options import CurveForm

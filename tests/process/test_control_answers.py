@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import socket
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,6 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
 from kouxing.shared.wire.session import OpenSession, SessionOpened
 from tests.control_stage import Stage
-from tests.forwarders import Link
 
 pytestmark = pytest.mark.process
 
@@ -38,14 +38,58 @@ def test_a_repeated_request_gets_the_same_answer(stage: Stage) -> None:
     assert stage.open(client, "mine") == first
 
 
+class Link:
+    """Forwards connections to control; a link that is not open holds what arrives."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.is_open = threading.Event()
+        self.is_open.set()
+        self.ends: list[socket.socket] = []
+        self._threads: list[threading.Thread] = []
+        self._start(self._accept)
+
+    def close(self) -> None:
+        self.is_open.set()
+        self.cut()
+        self.listener.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join()
+        for end in (self.listener, *self.ends):
+            end.close()
+
+    def cut(self) -> None:
+        for end in self.ends:
+            with contextlib.suppress(OSError):  # ended already
+                end.shutdown(socket.SHUT_RDWR)
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                incoming, _ = self.listener.accept()
+                outgoing = socket.create_connection(("127.0.0.1", self._port))
+                self.ends += [incoming, outgoing]
+                for ends in ((incoming, outgoing), (outgoing, incoming)):
+                    self._start(self._forward, *ends)
+
+    def _start(self, work: Callable[..., None], *ends: socket.socket) -> None:
+        self._threads.append(threading.Thread(target=work, args=ends, daemon=True))
+        self._threads[-1].start()
+
+    def _forward(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                self.is_open.wait()
+                sink.sendall(data)
+            sink.shutdown(socket.SHUT_RDWR)
+
+
 @pytest.fixture
 def link(stage: Stage) -> Iterator[Link]:
-    """Forward connections to control."""
     port = stage.control.endpoints["commands"].partition(" ")[0].rpartition(":")[2]
-    made = Link((), socket.create_server(("127.0.0.1", 0)), ("127.0.0.1", int(port)))
-    made.start()
-    yield made
-    made.close()
+    with contextlib.closing(Link(int(port))) as made:
+        yield made
 
 
 def disconnect_before_the_answer(stage: Stage, link: Link) -> tuple[zmq.Socket[bytes], str]:
@@ -57,9 +101,7 @@ def disconnect_before_the_answer(stage: Stage, link: Link) -> tuple[zmq.Socket[b
     link.is_open.clear()
     lost = stage.control._sessions.find("mine")
     stage.step_until(lambda: lost.announced)
-    for end in link.ends:
-        with contextlib.suppress(OSError):
-            end.shutdown(socket.SHUT_RDWR)
+    link.cut()
     link.is_open.set()
     stage.step_until(lambda: not stage.control._commands.is_open(lost.client.connection))
     return client, lost.token

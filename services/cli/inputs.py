@@ -1,16 +1,40 @@
-"""Reads the text of a recording for commands."""
+"""Reads the sound files and the spoken texts of commands."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from kouxing.services.recognizer.alignment import MIN_FIT, Alignment
+from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.terminal import print_message
 
 _MAX_BYTES = 1024 * 1024
+
+
+def read_mono_16k(path: Path) -> NDArray[np.float32]:
+    """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
+
+    Prints a message if the file is truncated or clipped. Raises ``UserError`` as
+    ``kouxing.shared.audio_file.open_audio``.
+    """
+    source = open_audio(path, block_s=1.0)
+    resampler = Resampler(source.sample_rate_hz, source.num_channels)
+    parts = []
+    num_samples = clipped = 0
+    for block in source.blocks:
+        parts.append(resampler.accept_waveform(block))
+        num_samples += block.size
+        clipped += num_clipped(block)
+    for remark in (*source.remarks, *clipping_remarks(str(path), clipped / max(1, num_samples))):
+        print_message(remark)
+    return np.concatenate([*parts, resampler.finish()])
 
 
 def read_text(text: str, inventory: PhoneInventory) -> Transcript:
