@@ -47,7 +47,7 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
     session = client.open_session(encoding="f32le")
     begin_s = time.monotonic()
     if host and host != CLIENT:
-        host = system.host_of(session.name, host)
+        host = system.instance_of(session.name, host)
     steps: list[tuple[float, Callable[[], object]]] = [
         (CUT_AT_S, functools.partial(system.network.cut, host)),
         (CUT_AT_S + cut_s, system.network.mend),
