@@ -21,10 +21,8 @@ _CODECS = {b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"RIFF": "webp"}
 def decode(encoded: bytes, name: str) -> UInt8:
     """Decode a PNG, JPEG or WebP into (H, W, 4); error texts contain the name.
 
-    Raises
-    ------
-    UserError
-        If the format is different, or the picture is damaged or has more than ``MAX_PIXELS``.
+    Raises ``UserError`` if the format is different, or the picture is damaged or has more than
+    ``MAX_PIXELS``.
     """
     codec = next((codec for magic, codec in _CODECS.items() if encoded.startswith(magic)), None)
     if codec is None:

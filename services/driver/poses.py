@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.resting_face import FADE_S, STALL_S, RestingFace
+from kouxing.shared.face.idle_motion import FADE_S, STALL_S, RestingFace
 
 NEWEST = "newest"
 
@@ -26,13 +26,6 @@ class Poses:
     """The newest FAPs of each session; shows the newest session, a named one, or the user's choice.
 
     The user's choice is valid until that session closes, or until the user returns to the default.
-
-    Parameters
-    ----------
-    session
-        Name of the session to show; ``newest`` for the one that was opened last.
-    idle_motion_seed
-        Seed of the resting face; 0 for no motion.
     """
 
     def __init__(self, session: str = NEWEST, idle_motion_seed: int = 0) -> None:

@@ -17,16 +17,8 @@ Float32 = NDArray[np.float32]
 class Recordings:
     """Passes each session's frames and sound to its video, and draws images when time permits.
 
-    Parameters
-    ----------
-    make
-        Opens the video of a session.
-    on_written
-        Called with the session and its finished video.
-    on_failed
-        Called with the session and the reason why it has no video.
-    on_image
-        Called after each image.
+    ``make`` opens the video of a session. ``on_failed`` receives the session and the reason why it
+    has no video.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ from kouxing.services.driver.recordings import Recordings
 from kouxing.services.driver.video.recording import Recording
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
-from kouxing.shared.face.resting_face import STALL_S
+from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
@@ -131,12 +131,9 @@ class DriverService(Service):
         if start.record:
             handlers[Sound] = self._on_sound
         follower = ServiceFollower(
-            self,
-            start.session,
-            handlers,
-            live=start.paced,
+            self, start.session, handlers, live=start.paced,
             on_complete=lambda: self.session_started(session.start),
-        )
+        )  # fmt: skip
         session = _Session(start, follower)
         return session
 

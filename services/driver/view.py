@@ -23,17 +23,10 @@ if TYPE_CHECKING:
 class View:
     """Opens the configured outputs and draws a face there.
 
-    Parameters
-    ----------
-    config
-        The driver's configuration.
-    on_switch
-        Called with 1 or -1 when the user switches to the next or previous session.
+    ``on_switch`` is called with 1 or -1 when the user switches to the next or previous session.
 
-    Raises
-    ------
-    UserError
-        If the head or background is unknown, or a required output is not available.
+    Raises ``UserError`` if the head or background is unknown, or a required output is not
+    available.
     """
 
     def __init__(self, config: DriverConfig, on_switch: Callable[[int], None]) -> None:

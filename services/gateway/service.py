@@ -34,7 +34,7 @@ from kouxing.services.gateway.web_server import WebServer, bind_port
 from kouxing.services.gateway.whip import WhipClients
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.resting_face import RESTING_RATE_HZ, RestingFace
+from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory

@@ -24,23 +24,14 @@ class Connection(ABC):
     """A connection to a target; it reconnects by itself.
 
     Each protocol is one subclass, listed in ``protocols.PROTOCOLS``.
-
-    Attributes
-    ----------
-    default_port
-        Port on which programs of this protocol listen.
-    options
-        Option names and their values, the default first; no values: any text.
-    problem
-        Why frames do not reach the target; empty if no problem is known.
     """
 
-    default_port: ClassVar[int]
-    options: ClassVar[Options] = COMMON_OPTIONS
+    default_port: ClassVar[int]  # on which programs of this protocol listen
+    options: ClassVar[Options] = COMMON_OPTIONS  # names and values, default first; (): any text
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self.problem = ""
+        self.problem = ""  # why frames do not reach the target, if known
 
     @abstractmethod
     async def run(self) -> None:

@@ -23,14 +23,9 @@ Angles = tuple[float, float, float]
 
 
 class FaceFrame:
-    """A frame for all targets; each conversion is computed once.
+    """A frame, FAPs (68,), for all targets; each conversion is computed once.
 
-    Parameters
-    ----------
-    faps
-        FAPs (68,).
-    time_s
-        Media time, seconds. At rest it continues from the last frame, or from 0.
+    ``time_s`` is media time. At rest it continues from the last frame, or from 0.
     """
 
     def __init__(self, faps: NDArray[np.float32], time_s: float) -> None:

@@ -53,18 +53,7 @@ class LiveLinkConnection(DatagramConnection):
         values = [*(weights.get(name, 0.0) for name in ORDER), *angles]
         sub_frame, number = math.modf(clock_s * FRAME_RATE_HZ)
         name = (self.target.options["name"] or "kouxing").encode()
-        return (
-            struct.pack(">Bi", VERSION, len(_DEVICE))
-            + _DEVICE
-            + struct.pack(">i", len(name))
-            + name
-            + struct.pack(
-                f">ifiiB{len(values)}f",
-                int(number),
-                sub_frame,
-                FRAME_RATE_HZ,
-                1,
-                len(values),
-                *values,
-            )
-        )
+        layout = f">Bi{len(_DEVICE)}si{len(name)}sifiiB{len(values)}f"
+        time_code = (int(number), sub_frame, FRAME_RATE_HZ, 1)
+        ids = (len(_DEVICE), _DEVICE, len(name), name)
+        return struct.pack(layout, VERSION, *ids, *time_code, len(values), *values)

@@ -34,23 +34,17 @@ class OscConnection(DatagramConnection):
 
     default_port = 9000
     options: ClassVar[Options] = {
-        **COMMON_OPTIONS,
-        "shapes": ("arkit", "vrm", "oculus"),
-        "prefix": (),
-    }
-
-    @property
-    def prefix(self) -> str:
-        """Start of every address."""
-        return self.target.options["prefix"] or "/kouxing/"
+        **COMMON_OPTIONS, "shapes": ("arkit", "vrm", "oculus"), "prefix": (),
+    }  # fmt: skip
 
     def encode(self, frame: FaceFrame) -> Iterator[bytes]:
         """Yield the datagrams of a frame."""
         weights = frame.weights(self.target.shapes, is_mouth_only=self.target.is_mouth_only)
-        messages = [message(f"{self.prefix}time", frame.time_s)]
+        prefix = self.target.options["prefix"] or "/kouxing/"
+        messages = [message(f"{prefix}time", frame.time_s)]
         if not self.target.is_mouth_only:
-            messages.append(message(f"{self.prefix}head", *map(math.degrees, frame.head)))
-        messages += [message(self.prefix + name, value) for name, value in weights.items()]
+            messages.append(message(f"{prefix}head", *map(math.degrees, frame.head)))
+        messages += [message(prefix + name, value) for name, value in weights.items()]
         return bundles(messages)
 
 

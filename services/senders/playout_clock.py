@@ -25,12 +25,7 @@ class PlayoutClock:
     def earliest_s(self, time_s: float, now_s: float) -> float:
         """Return the earliest time at which a frame that has just arrived could have arrived.
 
-        Parameters
-        ----------
-        time_s
-            Media time of the frame.
-        now_s
-            Time of a monotonic clock. The result is on the same clock and never later.
+        ``time_s`` is its media time. ``now_s`` and the result are times of a monotonic clock.
         """
         delay_s = now_s - time_s
         shortest_s = min(self._shortest_s, self._previous_shortest_s)

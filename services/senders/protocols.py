@@ -9,7 +9,7 @@ from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
 from kouxing.services.senders.target import Target, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
-from kouxing.services.senders.vtube_studio_connection import VTubeStudioConnection
+from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
 
 LOOPBACK = "127.0.0.1"
@@ -32,10 +32,7 @@ def connect(target: Target) -> Connection:
 def parse_target(url: str) -> Target:
     """Return the target of an address such as ``vmc://127.0.0.1:39540?delay=120``.
 
-    Raises
-    ------
-    UserError
-        If the address is not valid; the text says what is expected.
+    Raises ``UserError`` if the address is not valid; the text says what is expected.
     """
     try:
         parts = urlsplit(url)

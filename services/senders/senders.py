@@ -20,7 +20,7 @@ from kouxing.services.senders.protocols import connect
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.resting_face import FADE_S, RESTING_RATE_HZ, STALL_S, RestingFace
+from kouxing.shared.face.idle_motion import FADE_S, RESTING_RATE_HZ, STALL_S, RestingFace
 
 MAX_SENDERS = 16
 RATE_WINDOW_S = 2.0
@@ -55,14 +55,8 @@ class _Sender:
 class Senders:
     """Sends the frames of one session to targets. All methods are safe to call from any thread.
 
-    While no frames arrive, targets receive a face at rest.
-
-    Parameters
-    ----------
-    idle_motion_seed
-        Seed of the resting face; 0 for no motion.
-    report
-        Called with a target's address and problem when the problem changes; empty when it is over.
+    While no frames arrive, targets receive a face at rest. ``report`` is called with a target's
+    address and problem when the problem changes; the problem is empty when it is over.
     """
 
     def __init__(self, idle_motion_seed: int, report: Callable[[str, str], None]) -> None:
@@ -81,10 +75,7 @@ class Senders:
     def start(self, target: Target) -> None:
         """Start sending to a target, unless its address is already in use.
 
-        Raises
-        ------
-        UserError
-            If there are too many targets.
+        Raises ``UserError`` if there are too many targets.
         """
         self._call(lambda: self._start(target))
 

@@ -52,10 +52,7 @@ class Target:
 def parse_delay_s(delay_ms: str | float) -> float:
     """Return a delay in seconds.
 
-    Raises
-    ------
-    UserError
-        If the value is not a number or is out of range.
+    Raises ``UserError`` if the value is not a number or is out of range.
     """
     try:
         delay_s = float(delay_ms) / 1e3

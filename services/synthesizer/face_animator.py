@@ -57,24 +57,12 @@ _NO_TRANSITION = Transition(FapState(_ZERO, _ZERO), _TRANSITIONS_S)
 class FaceAnimator:
     """Turns the sound events of a session, in order, into FAP frames.
 
-    Parameters
-    ----------
-    lip_model
-        Moves the mouth.
-    frame_rate_hz
-        10 to 240; frame ``k`` is at media time ``k / frame_rate_hz``.
-    delay_s
-        0 to 1.5, how much later than its audio a frame is made. At 1.5 the visemes of a recording
-        are blended as if all were known.
-    idle_motion_seed
-        Seed of blinks, gaze, brows and head motion; with 0 only the mouth moves.
-    expressiveness
-        0.5 to 2, size of mouth movements; 1 leaves the lip model's movements unchanged.
+    Frame ``k`` is at media time ``k / frame_rate_hz``, with a rate of 10 to 240. It is made
+    ``delay_s`` (0 to 1.5) later than its audio; at 1.5 the visemes of a recording are blended as if
+    all were known. ``idle_motion_seed`` is for blinks, gaze, brows and head motion; with 0 only the
+    mouth moves. ``expressiveness`` scales the mouth movements, 0.5 to 2.
 
-    Raises
-    ------
-    UserError
-        If a value is out of range.
+    Raises ``UserError`` if a value is out of range.
     """
 
     def __init__(
@@ -120,11 +108,8 @@ class FaceAnimator:
         self._lip_stream = self._lip_model.stream(
             self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s
         )
-        self._modifiers: list[Modifier] = [  # in order of application
-            Amplitude(),
-            self._expressiveness,
-            self._expression,
-        ]
+        # in order of application
+        self._modifiers: list[Modifier] = [Amplitude(), self._expressiveness, self._expression]
         if self._idle_motion is not None:
             self._modifiers.append(self._idle_motion)
 
@@ -163,15 +148,8 @@ class FaceAnimator:
         """Replace the face of another process, before this face has made any frames.
 
         Events of the last seconds may be repeated; their last frames are made but not shown.
-
-        Parameters
-        ----------
-        time_s
-            Media time of the other face's newest frame.
-        num_frames
-            Number of frames that it has made.
-        shown
-            FAPs (68,) of its newest frame; None if unknown.
+        ``time_s`` is the media time of the other face's newest frame, ``num_frames`` how many it
+        has made, and ``shown`` the FAPs (68,) of the newest one, if known.
         """
         self._first_shown = self._frame_number(time_s) + 1
         num_rehearsed = min(

@@ -30,10 +30,7 @@ class ExpressionName(StrEnum):
 def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
     """Check requested expressions.
 
-    Raises
-    ------
-    UserError
-        If an expression is unknown, or a strength or the time is out of range.
+    Raises ``UserError`` if an expression is unknown, or a strength or the time is out of range.
     """
     for name, strength in strengths.items():
         if name not in [*ExpressionName]:
@@ -47,10 +44,7 @@ def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
 def check_expressiveness(amount: object) -> float:
     """Return the expressiveness if it is in range.
 
-    Raises
-    ------
-    UserError
-        If the value is out of range.
+    Raises ``UserError`` if the value is out of range.
     """
     if not _is_number(amount, MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS):
         raise UserError(

@@ -55,8 +55,6 @@ class FapAnimation:
 
 
 class _BadFileError(Exception):
-    """Reports the line and the reason."""
-
     def __init__(self, line_number: int, reason: str) -> None:
         super().__init__(f"line {line_number}: {reason}")
 
@@ -64,10 +62,8 @@ class _BadFileError(Exception):
 def read_fap(path: Path) -> FapAnimation:
     """Read a ``.fap`` file.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read or is not a valid ``.fap`` file; the text names the line.
+    Raises ``UserError`` if the file cannot be read or is not a valid ``.fap`` file; the text names
+    the line.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -84,10 +80,7 @@ def read_fap(path: Path) -> FapAnimation:
 def write_fap(path: Path, animation: FapAnimation) -> None:
     """Write a ``.fap`` file in Xface's style.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
+    Raises ``UserError`` if the file cannot be written.
     """
     visemes, expressions = animation.visemes, animation.expressions
     low = animation.faps[:, 2:]
@@ -146,13 +139,8 @@ def _parse(text: str) -> FapAnimation:
             faps[:, outer - 1] = faps[:, inner - 1]
         elif used[outer - 1] and not used[inner - 1]:
             faps[:, inner - 1] = faps[:, outer - 1]
-    return FapAnimation(
-        name,
-        frame_rate_hz,
-        faps,
-        visemes if used[0] else None,
-        expressions if used[1] else None,
-    )
+    used_visemes, used_expressions = visemes if used[0] else None, expressions if used[1] else None
+    return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
 
 
 def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:

@@ -56,10 +56,7 @@ def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
 
     ``blend`` goes from 0 (second viseme only) to 63 (first viseme only).
 
-    Raises
-    ------
-    UserError
-        If a number is out of range.
+    Raises ``UserError`` if a number is out of range.
     """
     _check("viseme_select", (select1, select2), len(VISEMES) - 1)
     _check("viseme_blend", (blend,), FULL)
@@ -76,10 +73,7 @@ def expression_faps(
     Expressions: 1 joy, 2 sadness, 3 anger, 4 fear, 5 disgust, 6 surprise; 0 for none. Intensities
     go from 0 to 63.
 
-    Raises
-    ------
-    UserError
-        If a number is out of range.
+    Raises ``UserError`` if a number is out of range.
     """
     _check("expression_select", (select1, select2), len(EXPRESSIONS) - 1)
     _check("expression_intensity", (intensity1, intensity2), FULL)

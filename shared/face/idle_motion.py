@@ -19,8 +19,12 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.smoothing import smooth_step, smoothing_share
+
+RESTING_RATE_HZ = 25.0
+STALL_S = 1.0  # a face without new frames for this time fades to rest
+FADE_S = 0.3
 
 _DEGREE = math.pi / 180.0 / RADIANS_PER_ANGLE_UNIT
 
@@ -161,3 +165,24 @@ class IdleMotion:
         is_on_listener = rng.random() < _ON_LISTENER[self._state]
         sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
         return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * _DEGREE
+
+
+class RestingFace:
+    """A face with idle motion only; with seed 0 it does not move."""
+
+    def __init__(self, seed: int) -> None:
+        self._motion = IdleMotion(seed) if seed else None
+        self._start_s: float | None = None
+
+    def faps(self, now_s: float) -> NDArray[np.float32]:
+        """Return the FAPs (68,) at a time of any clock; times must not decrease."""
+        self._start_s = now_s if self._start_s is None else self._start_s
+        faps = np.zeros(NUM_FAPS, np.float32)
+        if self._motion is not None:
+            self._motion.apply(faps, now_s - self._start_s)
+        return faps
+
+    def blend(self, face: NDArray[np.float32], share: float, now_s: float) -> NDArray[np.float32]:
+        """Return a mixture (68,) of another face, with the given share, and the resting face."""
+        rest = self.faps(now_s)
+        return rest + np.float32(share) * (face - rest)

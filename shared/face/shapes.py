@@ -72,20 +72,10 @@ _EFFECT_MM = _effect_mm()
 
 
 class ShapeSet:
-    """A named set of N blendshapes.
+    """A named set of N blendshapes; ``basis`` holds the FAPs (N, 68) of each shape at weight 1.
 
-    Parameters
-    ----------
-    names
-        Names of the shapes.
-    basis
-        FAPs (N, 68) of each shape at weight 1.
-    solved
-        Replaces the basis in equation (2); rows of zeros exclude a shape.
-    effect_mm
-        D of equation (2).
-    finish
-        Sets the weights (N,) of excluded shapes in place.
+    ``solved`` replaces the basis in equation (2); rows of zeros exclude a shape. ``finish`` sets
+    the weights (N,) of excluded shapes in place.
     """
 
     def __init__(
@@ -110,13 +100,7 @@ class ShapeSet:
         return faps
 
     def weights(self, faps: Float32) -> Float32:
-        """Return the weights (N,), 0 to 1, whose face is closest to FAPs (68,); equation (2).
-
-        Raises
-        ------
-        ValueError
-            If ``faps`` has another shape.
-        """
+        """Return the weights (N,), 0 to 1, whose face is closest to FAPs (68,); equation (2)."""
         if faps.shape != (NUM_FAPS,):
             raise ValueError(f"expected FAPs of shape ({NUM_FAPS},), got {faps.shape}")
         weights = self._solve(faps.astype(np.float64)).astype(np.float32)

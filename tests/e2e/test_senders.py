@@ -19,7 +19,7 @@ from pythonosc.osc_server import BlockingOSCUDPServer
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.senders import MAX_SENDERS, Senders
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.resting_face import STALL_S
+from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.vtube_studio import VTubeStudioStub
 

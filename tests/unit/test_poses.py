@@ -7,8 +7,7 @@ import pytest
 
 from kouxing.services.driver.poses import Poses
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.idle_motion import IdleMotion
-from kouxing.shared.face.resting_face import FADE_S
+from kouxing.shared.face.idle_motion import FADE_S, IdleMotion
 
 pytestmark = pytest.mark.unit
 

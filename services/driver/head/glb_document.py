@@ -70,10 +70,8 @@ class GlbDocument:
         if normalized:
             item["normalized"] = True
         if bounds:
-            lowest, highest = array.min(axis=0), array.max(axis=0)
             item["min"], item["max"] = (
-                np.atleast_1d(lowest).tolist(),
-                np.atleast_1d(highest).tolist(),
+                np.atleast_1d(limit).tolist() for limit in (array.min(axis=0), array.max(axis=0))
             )
         return self.add("accessors", item)
 
@@ -105,14 +103,9 @@ class GlbDocument:
     def save(self, path: Path, **rest: Any) -> None:
         """Write the file.
 
-        Raises
-        ------
-        UserError
-            If the file cannot be written.
+        Raises ``UserError`` if the file cannot be written.
         """
-        lists = {
-            kind: items for kind, items in self.json.items() if items
-        }  # empty lists are not allowed
+        lists = {kind: items for kind, items in self.json.items() if items}  # empty is not allowed
         document = {"asset": {"version": "2.0", "generator": "kouxing"}, **lists, **rest}
         document["buffers"] = [{"byteLength": len(self.binary)}]
         text = json.dumps(document, separators=(",", ":")).encode()

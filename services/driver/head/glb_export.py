@@ -73,23 +73,12 @@ _TURNS_EYES = np.isin(np.arange(1, NUM_FAPS + 1), (23, 24, 25, 26))
 def export_glb(
     head: Head, path: str | Path, motion: Sequence[Frame] = (), *, as_arkit: bool = False
 ) -> None:
-    """Write a head as GLB or VRM.
+    """Write a head as ``.glb`` or ``.vrm``.
 
-    Parameters
-    ----------
-    head
-        The head; a fine one has more triangles.
-    path
-        File to write, ``.glb`` or ``.vrm``.
-    motion
-        Frames of an animation; empty for a ``.vrm``.
-    as_arkit
-        Whether the animation uses ARKit's shapes instead of FAPs.
+    ``motion`` holds the frames of an animation, empty for a ``.vrm``; with ``as_arkit`` the
+    animation uses ARKit's shapes instead of FAPs.
 
-    Raises
-    ------
-    UserError
-        If the suffix is different, or the file cannot be written.
+    Raises ``UserError`` if the suffix is different, or the file cannot be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".glb", ".vrm"):

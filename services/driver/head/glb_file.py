@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from kouxing.shared.errors import UserError
 
@@ -42,12 +43,8 @@ def _reject_constant(word: str) -> float:
 class Glb:
     """The two chunks of a file.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read.
-    BadGlbError
-        If it is not a valid GLB, or requires an unsupported extension.
+    Raises ``UserError`` if the file cannot be read, and ``BadGlbError`` if it is not a valid GLB or
+    requires an unsupported extension.
     """
 
     def __init__(self, path: Path) -> None:
@@ -184,14 +181,7 @@ def _local_matrix(node: dict[str, Any]) -> Float64:
     """Return the matrix (4, 4) of a node relative to its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
     matrix[:3, 3] = node.get("translation", (0, 0, 0))

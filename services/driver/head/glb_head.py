@@ -52,10 +52,7 @@ Names = dict[str, Float64]  # shape name as in a file: FAPs (68,) at weight 1
 def read_glb(path: Path) -> Head:
     """Read a GLB whose morph targets are FAPs, ARKit shapes or Oculus visemes.
 
-    Raises
-    ------
-    UserError
-        If the file is not such a GLB; the text says what is missing.
+    Raises ``UserError`` if the file is not such a GLB; the text says what is missing.
     """
     try:
         glb = Glb(path)
@@ -73,10 +70,7 @@ def read_glb(path: Path) -> Head:
 def recognize(names: list[str]) -> Names:
     """Return the FAPs (68,) at weight 1 of each recognized target name, as ``plain`` returns it.
 
-    Raises
-    ------
-    BadGlbError
-        If too few names are recognized.
+    Raises ``BadGlbError`` if too few names are recognized.
     """
     faps: Names = {name: np.zeros(NUM_FAPS) for name in _FAP_NAMES}
     for name, fap in _FAP_NAMES.items():

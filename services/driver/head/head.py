@@ -86,20 +86,11 @@ class Head:
 
     @classmethod
     def load(cls, path: str | Path = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
-        """Read a head.
+        """Read a head by the name of a built-in one, or the path of an ``.npz``.
 
-        Parameters
-        ----------
-        path
-            Name of a built-in head, or path of an ``.npz``.
-        detail
-            "fine" for quality, "coarse" (a quarter of the skin's triangles) for speed; feature
-            points move equally in both.
+        A "coarse" head has a quarter of the skin's triangles; feature points move equally.
 
-        Raises
-        ------
-        UserError
-            If the head does not exist, or the file is not a head.
+        Raises ``UserError`` if the head does not exist, or the file is not a head.
         """
         file = Path(path)
         if file.suffix != ".npz":
@@ -169,10 +160,7 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
 def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine") -> Head:
     """Build a head from the arrays of its file.
 
-    Raises
-    ------
-    ValueError, KeyError, IndexError
-        If the arrays are not consistent.
+    Raises ``ValueError``, ``KeyError`` or ``IndexError`` if the arrays are not consistent.
     """
     if str(arrays["format"]) != FORMAT:
         raise ValueError(f"format {arrays['format']}, expected {FORMAT}")
@@ -303,10 +291,7 @@ def _basis(
 def neutral_faps(**values: float) -> Float32:
     """Return FAPs (68,) that are zero except for the named ones.
 
-    Raises
-    ------
-    UserError
-        If a name is not a FAP.
+    Raises ``UserError`` if a name is not a FAP.
 
     Examples
     --------

@@ -22,12 +22,8 @@ OUTER = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
 LOWER_LIP = ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8")
 UPPER_LIP = ("2.2", "2.6", "2.7", "8.1", "8.5", "8.6")
 AXES = {
-    "down": (1, -1.0),
-    "up": (1, 1.0),
-    "left": (0, 1.0),
-    "right": (0, -1.0),
-    "forward": (2, 1.0),
-}
+    "down": (1, -1.0), "up": (1, 1.0), "left": (0, 1.0), "right": (0, -1.0), "forward": (2, 1.0),
+}  # fmt: skip
 CORNER_SLOPE = 0.37  # slope of the lip curve near the corners, seen from above
 _LID_SLOPE = 0.15  # a closing lid moves forward around the eyeball
 _HINGE = 1.34  # distance from the chin back to the jaw's axis, eye distances
@@ -46,20 +42,10 @@ _FACE = (
 
 
 class FaceFields:
-    """The fields of a skin.
+    """The fields of a skin with vertices (V, 3), m, and triangles (F, 3).
 
-    Parameters
-    ----------
-    vertices
-        Vertices of the skin (V, 3), m; y is up, the face looks along z.
-    triangles
-        Vertex numbers (F, 3).
-    points
-        Vertex of each feature point; at least those in ``INNER`` and ``OUTER``, 2.1 and 2.10.
-    eyes
-        Centers of the left and right eye (2, 3), m.
-    fapu
-        FAPU lengths, m.
+    ``points`` are the vertices of feature points, at least those in ``INNER`` and ``OUTER``, 2.1
+    and 2.10; ``eyes`` are the centers of the left and right eye (2, 3), m.
     """
 
     def __init__(
@@ -89,16 +75,9 @@ class FaceFields:
         return {fap: self._along(fap, weight) for fap, weight in moved.items()}
 
     def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> Fields:
-        """Return the fields (R, 3) of a tongue, without the jaw's motion.
+        """Return the fields (R, 3) of a tongue, ``rows`` (R,) of a mesh, without the jaw's motion.
 
-        Parameters
-        ----------
-        vertices
-            Vertices of the whole mesh (V, 3), m.
-        rows
-            Vertices of the tongue (R,).
-        tip, body
-            Vertices of the points 6.1 and, if known, 6.2.
+        ``tip`` and ``body`` are the vertices of the points 6.1 and, if known, 6.2.
         """
         z = vertices[rows, 2]
         root = z.min()

@@ -45,23 +45,10 @@ Index = NDArray[np.int64]
 def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     """Write a head (``.npz``) made from a mesh and its feature points.
 
-    Parameters
-    ----------
-    mesh
-        A face at rest with a closed mouth, in a format of ``mesh_file.MESH_SUFFIXES``; y is up.
-    points
-        A file for ``points_file.read_points``.
-    output
-        Head to write.
+    The mesh is a face at rest with a closed mouth; y is up. Returns remarks for the user about
+    parts that will not move.
 
-    Returns
-    -------
-    Remarks for the user about parts that will not move.
-
-    Raises
-    ------
-    UserError
-        If a file cannot be read or written, or the mesh and points are not a face.
+    Raises ``UserError`` if a file cannot be read or written, or the mesh and points are not a face.
     """
     if output.suffix != ".npz":
         raise UserError(f"{output}: give a name that ends in .npz")
@@ -70,9 +57,8 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     if count > MAX_VERTICES:
         raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
     given = read_points(points)
-    arrays, remarks = _Import(
-        mesh, points, pieces, _places(mesh, points, pieces, given), given
-    ).run()
+    places = _places(mesh, points, pieces, given)
+    arrays, remarks = _Import(mesh, points, pieces, places, given).run()
     try:
         with output.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)

@@ -24,10 +24,7 @@ _SKIN_COLOR = (0.58, 0.40, 0.32)  # linear, for meshes without color
 def read_mesh(path: Path) -> list[Piece]:
     """Read the triangles of a mesh file; a GLB is read in its skeleton's rest pose.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, has no triangles, or is too large.
+    Raises ``UserError`` if the file cannot be read, has no triangles, or is too large.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -89,10 +86,7 @@ def _from_trimesh(mesh: Any) -> Piece:
 def numbered_vertices(mesh: Path, pieces: list[Piece]) -> tuple[Float64, dict[str, Float64]]:
     """Return the vertices (V, 3) in file order: all of them, and by mesh name.
 
-    Raises
-    ------
-    UserError
-        If a vertex line of an OBJ file is invalid.
+    Raises ``UserError`` if a vertex line of an OBJ file is invalid.
     """
     # the pieces of an OBJ file repeat a vertex for each texture coordinate
     if mesh.suffix.lower() != ".obj":

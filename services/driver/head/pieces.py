@@ -83,18 +83,9 @@ def pack(
     feature_points: dict[str, int],
     eye_centers: Float64,
 ) -> dict[str, NDArray[Any]]:
-    """Convert pieces to the arrays of a head file, see ``head.assemble``.
+    """Convert pieces (in the head's axes, m) to the arrays of a head file, see ``head.assemble``.
 
-    Parameters
-    ----------
-    pieces
-        In the head's axes, m.
-    fields
-        Displacement fields of each piece.
-    head_weight
-        Share (V,) of the head rotation, for all vertices.
-    fapu, feature_points, eye_centers
-        As in ``Head``.
+    ``fields`` are those of each piece; the others are as in ``Head``.
     """
     first = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
     bounds = np.cumsum([0] + [len(piece.triangles) for piece in pieces])
@@ -113,7 +104,8 @@ def pack(
         same = [name for name, data in textures.items() if data == piece.texture]
         names.append("plain" if not piece.texture else (same or [f"image {len(textures)}"])[0])
         textures.setdefault(names[-1], piece.texture)
-    surfaces = [piece.material.get("pbrMetallicRoughness", {}) for piece in pieces]
+    materials = [piece.material for piece in pieces]
+    surfaces = [material.get("pbrMetallicRoughness", {}) for material in materials]
     vertices = np.concatenate([piece.vertices for piece in pieces]).astype(np.float32)
     uv = np.concatenate([piece.uv for piece in pieces]).astype(np.float32)
     colors = np.clip(np.concatenate([piece.colors for piece in pieces]), 0, 1)
@@ -129,12 +121,8 @@ def pack(
         "part_names": np.array(part_names(pieces)),
         "part_textures": np.array(names),
         "part_roughness": np.clip([float(s.get("roughnessFactor", 0.6)) for s in surfaces], 0, 1),
-        "part_transparent": np.array(
-            [piece.material.get("alphaMode", "OPAQUE") != "OPAQUE" for piece in pieces]
-        ),
-        "part_double_sided": np.array(
-            [bool(piece.material.get("doubleSided", False)) for piece in pieces]
-        ),
+        "part_transparent": np.array([m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in materials]),
+        "part_double_sided": np.array([bool(m.get("doubleSided", False)) for m in materials]),
         "part_vertices": np.stack([first[:-1], first[1:], first[1:]], axis=1),
         "part_triangles": np.stack([bounds[:-1], bounds[1:], bounds[:-1], bounds[1:]], axis=1),
         "fapu_names": np.array(list(fapu)),

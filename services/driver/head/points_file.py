@@ -39,10 +39,8 @@ class Points:
 def read_points(path: Path) -> Points:
     """Read a file of feature points.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read or is invalid; the text names the line if possible.
+    Raises ``UserError`` if the file cannot be read or is invalid; the text names the line if
+    possible.
     """
     try:
         if path.stat().st_size > MAX_BYTES:

@@ -29,15 +29,10 @@ class Shading:
         basis: sparse.csr_array,
         welds: NDArray[np.int64] | None = None,
     ) -> Shading:
-        """Find the parts that deform.
+        """Find the parts of a ``Head`` that deform.
 
-        Parameters
-        ----------
-        vertices, triangles, basis
-            As in ``Head``.
-        welds
-            Index (V,) of the vertex that shares its normal with each vertex; several vertices have
-            one position at texture seams. By default no normals are shared.
+        ``welds`` (V,) is the vertex that shares its normal with each vertex, because several
+        vertices have one position at texture seams. By default no normals are shared.
         """
         same = np.arange(len(vertices)) if welds is None else welds
         welded = same[triangles.astype(np.int64)]

@@ -48,20 +48,11 @@ BONES: tuple[tuple[str, str, Place], ...] = (
 def extension(
     name: str, nodes: Mapping[str, int], bindings: Bindings, eyes: Place, *, is_free: bool
 ) -> dict[str, Any]:
-    """Return the contents of the extension.
+    """Return the contents of the extension for an avatar.
 
-    Parameters
-    ----------
-    name
-        Name of the avatar.
-    nodes
-        Node of each bone.
-    bindings
-        Location of the morph targets.
-    eyes
-        Offset from the head's pivot to the point between the eyes, m.
-    is_free
-        Whether the avatar is under CC0; otherwise only its author may use it.
+    ``nodes`` are those of the bones, ``bindings`` are the locations of the morph targets, and
+    ``eyes`` is the offset from the head's pivot to the point between the eyes, m. An avatar that
+    ``is_free`` is under CC0; otherwise only its author may use it.
     """
     bones = ["head", *(bone for bone, _, _ in BONES if bone != "body")]
     return {

@@ -30,10 +30,7 @@ DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
 def standalone_context() -> moderngl.Context:
     """Create an OpenGL 3.3 context without a display.
 
-    Raises
-    ------
-    UserError
-        If the GL libraries are missing or cannot create a context.
+    Raises ``UserError`` if the GL libraries are missing or cannot create a context.
     """
     try:
         # macOS has no EGL; its OpenGL needs no display
@@ -49,29 +46,13 @@ def standalone_context() -> moderngl.Context:
 
 
 class Renderer:
-    """Draws pictures of one head.
+    """Draws pictures of one head, offscreen by default.
 
-    Parameters
-    ----------
-    head
-        Head to draw.
-    width_px, height_px
-        Size of a picture.
-    background
-        sRGB colors of the center and the edge, each 0 to 1; None for transparent pictures.
-    samples
-        Anti-aliasing samples per pixel; 0 for none.
-    camera
-        Viewpoint.
-    context
-        OpenGL context of a window; by default a new offscreen context.
-    on_screen
-        Whether to draw into the window (``draw_on_screen``) instead of offscreen (``draw``).
+    Without a ``background`` pictures are transparent. ``samples`` per pixel are for anti-aliasing.
+    ``context`` is the OpenGL context of a window; with ``on_screen``, ``draw_on_screen`` draws into
+    that window.
 
-    Raises
-    ------
-    UserError
-        If OpenGL cannot start, the size is not positive, or a texture is damaged.
+    Raises ``UserError`` if OpenGL cannot start, the size is not positive, or a texture is damaged.
     """
 
     def __init__(
@@ -96,14 +77,13 @@ class Renderer:
         self._own_context = context is None
         self._on_screen = on_screen
         self._samples = min(samples, self._context.max_samples)
-        self._program = self._context.program(
-            vertex_shader=shaders.VERTEX, fragment_shader=shaders.FRAGMENT
-        )
-        self._eye_program = self._context.program(
-            vertex_shader=shaders.VERTEX, fragment_shader=shaders.EYE_FRAGMENT
-        )
-        self._backdrop_program = self._context.program(
-            vertex_shader=shaders.BACKDROP_VERTEX, fragment_shader=shaders.BACKDROP
+        self._program, self._eye_program, self._backdrop_program = (
+            self._context.program(vertex_shader=vertex, fragment_shader=fragment)
+            for vertex, fragment in (
+                (shaders.VERTEX, shaders.FRAGMENT),
+                (shaders.VERTEX, shaders.EYE_FRAGMENT),
+                (shaders.BACKDROP_VERTEX, shaders.BACKDROP),
+            )
         )
         corners = np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32)
         self._backdrop = self._context.vertex_array(
@@ -167,12 +147,7 @@ class Renderer:
         return target
 
     def draw(self, faps: Float32) -> UInt8:
-        """Draw FAPs (68,).
-
-        Returns
-        -------
-        Pixels (H, W, 3), top row first; (H, W, 4) with alpha if the background is transparent.
-        """
+        """Draw FAPs (68,); return pixels (H, W, 3), or (H, W, 4) with alpha if transparent."""
         self._upload(*self.head.pose(faps), faps)
         self._draw()
         return self._read()
@@ -247,12 +222,8 @@ class Renderer:
                 self._draw_part(part)
         context.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
         # the second pair keeps the alpha channel of transparent pictures correct
-        factors: Any = (
-            moderngl.SRC_ALPHA,
-            moderngl.ONE_MINUS_SRC_ALPHA,
-            moderngl.ONE,
-            moderngl.ONE_MINUS_SRC_ALPHA,
-        )
+        others = moderngl.ONE_MINUS_SRC_ALPHA
+        factors: Any = (moderngl.SRC_ALPHA, others, moderngl.ONE, others)
         context.blend_func = factors
         for part in self.head.parts:
             if part.transparent:

@@ -19,23 +19,17 @@ COLORS = {
     "blue": "#0047bb",
 }  # fmt: skip
 
-# height of the picture's center above the eyes and distance of the camera, in eye distances (FAPU
-# ES)
+# height of the picture's center above the eyes, and distance of the camera, in FAPU ES
 _FRAMINGS = {
-    Framing.FACE: (-0.267, 20.0),
-    Framing.HEAD: (-0.25, 26.0),
-    Framing.MOUTH: (-1.20, 6.0),
-}
+    Framing.FACE: (-0.267, 20.0), Framing.HEAD: (-0.25, 26.0), Framing.MOUTH: (-1.20, 6.0),
+}  # fmt: skip
 _RISE = 0.0114  # height of the camera above the center, as a share of its distance
 
 
 def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
     """Read a built-in head, an ``.npz``, or a GLB with morph targets.
 
-    Raises
-    ------
-    UserError
-        If the head does not exist, or the file is not a head.
+    Raises ``UserError`` if the head does not exist, or the file is not a head.
     """
     path = Path(name)
     if path.suffix.lower() == ".glb":
@@ -48,19 +42,7 @@ def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
 def camera(
     head: Head, framing: Framing = Framing.FACE, yaw_deg: float = 0.0, pitch_deg: float = 0.0
 ) -> Camera:
-    """Place the camera in front of a head.
-
-    Parameters
-    ----------
-    head
-        Head to show.
-    framing
-        The part of the head that fills the picture.
-    yaw_deg
-        Camera angle to the subject's left.
-    pitch_deg
-        Camera angle upwards.
-    """
+    """Place the camera in front of a head, at angles to the subject's left and upwards."""
     eyes = head.eye_centers.mean(axis=0)
     unit_m = float(head.eye_centers[0, 0] - head.eye_centers[1, 0])
     height, distance = _FRAMINGS[framing]
@@ -76,14 +58,7 @@ def camera(
 def background(text: str) -> Background:
     """Parse a background: studio, transparent, the name of a color, or ``#rrggbb``.
 
-    Returns
-    -------
-    sRGB colors of the center and the edge, 0 to 1; None for transparent.
-
-    Raises
-    ------
-    UserError
-        If the text is not a background.
+    Raises ``UserError`` if the text is not a background.
     """
     word = text.strip().lower()
     if word == "studio":

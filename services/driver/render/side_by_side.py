@@ -13,15 +13,7 @@ _CAPTION_SHARE = 1 / 20  # height of the letters, as a share of the picture
 
 
 class SideBySide:
-    """Draws one face per caption, from left to right.
-
-    Parameters
-    ----------
-    renderer
-        Renderer of a single face.
-    captions
-        Texts below the faces.
-    """
+    """Draws one face per caption, from left to right."""
 
     def __init__(self, renderer: Renderer, captions: Sequence[str]) -> None:
         width_px, height_px = renderer.size

@@ -21,21 +21,9 @@ TITLE = "kouxing"
 class Window:
     """A resizable window with a head; edges are anti-aliased if there is a graphics card.
 
-    Parameters
-    ----------
-    head
-        Head to show.
-    width_px, height_px
-        Initial size.
-    background, camera
-        As for ``Renderer``.
-    on_switch
-        Called with 1 (Tab, right arrow, click) or -1 (Shift+Tab, left arrow).
+    ``on_switch`` is called with 1 (Tab, right arrow, click) or -1 (Shift+Tab, left arrow).
 
-    Raises
-    ------
-    UserError
-        If there is no display, or the display has no OpenGL 3.3.
+    Raises ``UserError`` if there is no display, or the display has no OpenGL 3.3.
     """
 
     def __init__(
@@ -59,22 +47,19 @@ class Window:
             self._open(width_px, height_px, num_samples=4)
         size = glfw.get_framebuffer_size(self._window)
         self._renderer = Renderer(
-            head,
-            *size,
-            background=background,
-            camera=camera,
-            context=self._context,
-            on_screen=True,
-        )
+            head, *size,
+            background=background, camera=camera, context=self._context, on_screen=True,
+        )  # fmt: skip
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_mouse_button_callback(self._window, self._on_mouse_button)
 
     def _open(self, width_px: int, height_px: int, num_samples: int) -> None:
-        glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
-        glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
-        glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
-        glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
-        glfw.window_hint(glfw.SAMPLES, num_samples)
+        for hint, value in (
+            (glfw.CONTEXT_VERSION_MAJOR, 3), (glfw.CONTEXT_VERSION_MINOR, 3),
+            (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE), (glfw.OPENGL_FORWARD_COMPAT, True),
+            (glfw.SAMPLES, num_samples),
+        ):  # fmt: skip
+            glfw.window_hint(hint, value)
         self._window = glfw.create_window(width_px, height_px, TITLE, None, None)
         if not self._window:
             glfw.terminate()

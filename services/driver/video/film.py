@@ -59,25 +59,10 @@ def render_video(
 ) -> int:
     """Write a video or one picture per image; return the number of images.
 
-    Parameters
-    ----------
-    frames
-        At least one; the last one is held until the sound ends.
-    path
-        As for ``open_writer``.
-    renderer
-        Draws the images.
-    frame_rate_hz
-        Images per second.
-    samples
-        Sound (n,), 16 kHz mono.
-    on_progress
-        Called with the finished share, 0 to 1.
+    The last of the ``frames``, at least one, is held until the sound (n,), 16 kHz mono, ends.
+    ``on_progress`` is called with the finished share, 0 to 1.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
+    Raises ``UserError`` if the file cannot be written.
     """
     recording = Recording(path, renderer, frame_rate_hz, sound=samples is not None)
     try:
@@ -101,10 +86,7 @@ def render_picture(
 ) -> None:
     """Write the picture (PNG) at a time.
 
-    Raises
-    ------
-    UserError
-        If the time is outside the animation, or the file cannot be written.
+    Raises ``UserError`` if the time is outside the animation, or the file cannot be written.
     """
     last_s = frames[-1][0]
     if not 0 <= at_s <= last_s:

@@ -25,23 +25,10 @@ Faps = NDArray[np.float32]
 class Recording:
     """Writes images and sound to a video; the file appears when it is closed.
 
-    Parameters
-    ----------
-    path
-        As for ``open_writer``.
-    renderer
-        Draws the images; a transparent background makes a transparent video.
-    frame_rate_hz
-        Images per second.
-    sound
-        Whether the video has sound.
-    overwrite
-        Whether to replace an existing file; otherwise ``close`` adds a number to ``path``.
+    A renderer with a transparent background makes a transparent video. Unless ``overwrite`` is set,
+    ``close`` adds a number to the name of an existing file.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
+    Raises ``UserError`` if the file cannot be written.
     """
 
     def __init__(
@@ -55,19 +42,14 @@ class Recording:
     ) -> None:
         self.path = path
         self.num_images = 0
-        self.ended = False
         self._renderer = renderer
         self._frame_rate_hz = frame_rate_hz
         self._frames: deque[tuple[float, Faps]] = deque()
         self._num_samples = 0
         self._writer = open_writer(
-            path,
-            renderer.size,
-            frame_rate_hz,
-            MEDIA_RATE_HZ if sound else None,
-            transparent=renderer.transparent,
-            overwrite=overwrite,
-        )
+            path, renderer.size, frame_rate_hz, MEDIA_RATE_HZ if sound else None,
+            transparent=renderer.transparent, overwrite=overwrite,
+        )  # fmt: skip
 
     @property
     def duration_s(self) -> float:
@@ -82,10 +64,7 @@ class Recording:
     def add_sound(self, media_time: int, samples: NDArray[np.float32]) -> None:
         """Add sound (n,); a gap before it is filled with silence.
 
-        Raises
-        ------
-        UserError
-            If the gap is too long, or the file cannot be written.
+        Raises ``UserError`` if the gap is too long, or the file cannot be written.
         """
         missing = media_time - self._num_samples
         if missing > MAX_SILENCE_S * MEDIA_RATE_HZ:

@@ -14,10 +14,7 @@ from kouxing.shared.errors import UserError, install_command
 class VirtualCamera:
     """Sends pictures to the system's virtual camera, through pyvirtualcam.
 
-    Raises
-    ------
-    UserError
-        If pyvirtualcam is not installed or the system has no virtual camera.
+    Raises ``UserError`` if pyvirtualcam is not installed or the system has no virtual camera.
     """
 
     def __init__(self, renderer: Renderer, frame_rate_hz: float) -> None:

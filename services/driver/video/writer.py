@@ -24,8 +24,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import av
 import numpy as np
@@ -82,22 +81,6 @@ _FORMATS = {
 }
 
 
-class Writer(Protocol):
-    """A destination for pictures and sound."""
-
-    def write_image(self, image: UInt8) -> None:
-        """Append a picture (H, W, 3), or (H, W, 4) with alpha, sRGB."""
-
-    def write_sound(self, samples: Float32) -> None:
-        """Append mono sound (N,), -1 to 1."""
-
-    def close(self) -> Path:
-        """Finish the output; return its path."""
-
-    def discard(self) -> None:
-        """Delete the unfinished output."""
-
-
 def open_writer(
     path: Path,
     size: tuple[int, int],
@@ -106,43 +89,26 @@ def open_writer(
     *,
     transparent: bool = False,
     overwrite: bool = True,
-) -> Writer:
+) -> VideoWriter | PictureSequence:
     """Open a writer for a path: a video, or pictures in a folder or named like ``name%05d.png``.
 
     The parameters are those of ``VideoWriter``; pictures are always overwritten.
 
-    Raises
-    ------
-    UserError
-        If the path is not a valid output, or cannot be written.
+    Raises ``UserError`` if the path is not a valid output, or cannot be written.
     """
     check_name(path)
     if path.suffix in _FORMATS:
         return VideoWriter(
-            path,
-            *size,
-            frame_rate_hz,
-            sample_rate_hz,
-            transparent=transparent,
-            overwrite=overwrite,
-        )
+            path, *size, frame_rate_hz, sample_rate_hz,
+            transparent=transparent, overwrite=overwrite,
+        )  # fmt: skip
     return PictureSequence(path)
 
 
 def check_name(path: Path, others: Iterable[str] = ()) -> None:
     """Check that a path is a valid output in an existing folder.
 
-    Parameters
-    ----------
-    path
-        Output path.
-    others
-        Further suffixes to suggest in the error text.
-
-    Raises
-    ------
-    UserError
-        If the path is not valid.
+    Raises ``UserError`` if it is not; the text also suggests the suffixes ``others``.
     """
     if path.suffix not in _FORMATS and not is_sequence(path):
         raise UserError(
@@ -163,26 +129,12 @@ def is_sequence(path: Path) -> bool:
 class VideoWriter:
     """A video that appears under its name when it is complete.
 
-    Parameters
-    ----------
-    path
-        Output with one of ``VIDEO_SUFFIXES``.
-    width_px, height_px
-        Even numbers.
-    frame_rate_hz
-        Pictures per second, 1 to 1000.
-    sample_rate_hz
-        One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``. None for no sound; ``.webp``
-        never has sound.
-    transparent
-        Whether pictures have an alpha channel.
-    overwrite
-        Whether ``close`` replaces an existing file; otherwise it adds a number to the name.
+    Width and height are even, the frame rate is 1 to 1000 Hz. ``sample_rate_hz`` is one that the
+    codec supports, or None for no sound; ``.webp`` never has sound. Pictures are ``transparent`` if
+    they have an alpha channel. Unless ``overwrite`` is set, ``close`` adds a number to the name of
+    an existing file.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be written or a value is not possible.
+    Raises ``UserError`` if the file cannot be written or a value is not possible.
     """
 
     def __init__(
@@ -252,13 +204,8 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             self.close()
         else:
             self.discard()
@@ -321,16 +268,9 @@ class VideoWriter:
 class PictureSequence:
     """One PNG file per picture; existing files are replaced.
 
-    Parameters
-    ----------
-    path
-        A folder for ``00000.png`` and so on, or a name such as ``face%05d.png`` in an existing
-        folder.
+    ``path`` is a folder for ``00000.png`` and so on, or a name such as ``face%05d.png``.
 
-    Raises
-    ------
-    UserError
-        If the folder cannot be created.
+    Raises ``UserError`` if the folder cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -363,10 +303,7 @@ class PictureSequence:
 def write_picture(path: Path, image: UInt8) -> None:
     """Write a picture (H, W, 3), or (H, W, 4) with alpha, as PNG.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
+    Raises ``UserError`` if the file cannot be written.
     """
     try:
         path.write_bytes(picture.encode(image))

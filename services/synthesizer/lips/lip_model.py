@@ -52,25 +52,12 @@ class LipStream(Protocol):
 
 
 class LipModel(Protocol):
-    """A lip model, shared by any number of sessions.
+    """A lip model, shared by any number of sessions."""
 
-    Attributes
-    ----------
-    amplitude_applies
-        Whether the amplitude modifier may scale the openings with the level of the voice.
-    """
-
-    amplitude_applies: ClassVar[bool]
+    amplitude_applies: ClassVar[bool]  # whether openings may be scaled with the level of the voice
 
     def stream(self, start_s: float, *, frame_rate_hz: float, delay_s: float) -> LipStream:
-        """Start a session at rest.
+        """Start a session at rest, with the first frame at media time ``start_s``.
 
-        Parameters
-        ----------
-        start_s
-            Media time of the first frame.
-        frame_rate_hz
-            Frames per second of media time.
-        delay_s
-            How much audio after a frame is known when the frame is made.
+        ``delay_s`` is how much audio after a frame is known when the frame is made.
         """

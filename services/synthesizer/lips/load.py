@@ -14,10 +14,8 @@ from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 def load_lip_model(language: str = DEFAULT_LANGUAGE, name: str = DEFAULT_LIP_MODEL) -> LipModel:
     """Load a lip model for the phones of a language.
 
-    Raises
-    ------
-    UserError
-        If the lip model or the language is not installed, or the lip model does not support it.
+    Raises ``UserError`` if the lip model or the language is not installed, or the lip model does
+    not support it.
     """
     lip_model: LipModel = lip_model_info(name).load(load_inventory(language))
     return lip_model

@@ -33,10 +33,7 @@ def still(value: Array) -> FapState:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """Leads the difference between two trajectories to zero along cubics, one duration per FAP.
-
-    The sum of new trajectory and transition is continuous in position and velocity.
-    """
+    """Leads the difference between two trajectories to zero along cubics, one duration per FAP."""
 
     difference: FapState
     duration_s: Array

@@ -72,17 +72,15 @@ class Expressiveness:
         faps[JAW] += is_open * self._growth(np.maximum(faps[JAW], 0.0))
         width = faps[_WIDTH] - _USUAL_WIDTH
         # at rest the mouth is wider than in speech, but not spread
-        change = _SIDEWAYS * self._more * np.where(width > 0.0, is_open * width, width)
+        more = _SIDEWAYS * (self.amount - 1.0)
+        change = more * np.where(width > 0.0, is_open * width, width)
         faps[_WIDTH] = np.maximum(faps[_WIDTH] + change, np.minimum(faps[_WIDTH], _MIN_WIDTH))
-        pushed = _SIDEWAYS * self._more * np.maximum(faps[_PUSH] - _USUAL_PUSH, 0.0)
+        pushed = more * np.maximum(faps[_PUSH] - _USUAL_PUSH, 0.0)
         faps[_PUSH] = np.minimum(faps[_PUSH] + pushed, np.maximum(faps[_PUSH], _MAX_PUSH))
 
-    @property
-    def _more(self) -> float:
-        return self.amount - 1.0
-
     def _growth(self, opening: NDArray[np.float32]) -> NDArray[np.float32]:
-        if self._more < 0.0:
-            return self._more * opening
+        more = self.amount - 1.0
+        if more < 0.0:
+            return more * opening
         within = np.minimum(opening, _WIDEST / 2)
-        return np.asarray(self._more * within * (1.0 - within / _WIDEST), np.float32)
+        return np.asarray(more * within * (1.0 - within / _WIDEST), np.float32)

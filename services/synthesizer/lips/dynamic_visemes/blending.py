@@ -10,6 +10,8 @@ overflow.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +24,9 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+from kouxing.services.synthesizer.lips.trajectory import FapState
+
+_STEP_S = 1e-3  # of the numerical derivative
 
 
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -82,11 +87,7 @@ def _close_lips(
             closed = weights.copy()
         selected = np.ix_(near, faps)
         others = np.delete(weights, row, axis=0)[:, near[:, None], faps]
-        log_others = (
-            np.logaddexp.reduce(others, axis=0)
-            if len(others)
-            else np.full((near.size, faps.size), -np.inf)
-        )
+        log_others = np.logaddexp.reduce(others, axis=0, initial=-np.inf)
         closed[row][selected] = log_closure(
             weights[row][selected],
             np.maximum(log_others, weights[row][selected] - 50.0),
@@ -125,3 +126,17 @@ def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray
     following = int(np.searchsorted(timeline.apex_start_s, time_s, side="right"))
     active[max(following - 1, 0) : following + 1] = True
     return active
+
+
+@dataclass(frozen=True, slots=True)
+class TargetTrajectory:
+    """The trajectory of the mouth FAPs for a timeline."""
+
+    parameters: VisemeParameters
+    timeline: Timeline
+
+    def at(self, time_s: float) -> FapState:
+        """Return position and velocity at a media time."""
+        times = np.array([time_s - _STEP_S, time_s, time_s + _STEP_S])
+        before, here, after = blend(self.parameters, self.timeline, times)
+        return FapState(here, (after - before) / (2.0 * _STEP_S))

@@ -34,16 +34,8 @@ class ClosureTracker:
     def postpone(self, timeline: Timeline, last_s: float, time_s: float) -> tuple[Timeline, bool]:
         """Move closures whose apex passed before they were recognized.
 
-        Parameters
-        ----------
-        timeline
-            The visemes.
-        last_s, time_s
-            Times of the last and the next frame, seconds.
-
-        Returns
-        -------
-        The timeline with late closures moved, and whether a closure was moved for the first time.
+        ``last_s`` and ``time_s`` are the times of the last and the next frame. Returns the timeline
+        with late closures moved, and whether a closure was moved for the first time.
         """
         start_s, end_s = timeline.apex_start_s.copy(), timeline.apex_end_s.copy()
         is_new = False

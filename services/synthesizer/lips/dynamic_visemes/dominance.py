@@ -70,18 +70,8 @@ def log_closure(
     ``closure_ratio`` times the sum of all others at the apex. Its corners would be visible as
     jerks. This function uses a smooth step between the same ends in the log domain.
 
-    Parameters
-    ----------
-    log_viseme
-        Log dominance by eq. 5.
-    log_others
-        Log of the sum of all other dominances.
-    tau_s
-        Apex minus time, seconds.
-    reach_s
-        T of eq. 7, seconds.
-    closure_ratio
-        C of eq. 7, above 20.
+    ``log_viseme`` is the dominance by eq. 5, ``log_others`` the sum of all others, ``reach_s`` is T
+    and ``closure_ratio`` is C of eq. 7.
     """
     nearness = np.clip(1.0 - np.abs(tau_s) / reach_s, 0.0, 1.0)
     step = nearness * nearness * (3.0 - 2.0 * nearness)

@@ -25,10 +25,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.blending import active_visemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
+    TargetTrajectory,
+    active_visemes,
+)
 from kouxing.services.synthesizer.lips.dynamic_visemes.closures import ClosureTracker
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
-from kouxing.services.synthesizer.lips.dynamic_visemes.target_trajectory import TargetTrajectory
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import check_visemes
 from kouxing.services.synthesizer.lips.known_phones import KnownPhones
@@ -54,10 +56,7 @@ _MEMORY_S = 1.5  # phones that ended earlier have no weight
 class DynamicVisemes:
     """The lip model of Li et al. 2011, for the phones of a language.
 
-    Raises
-    ------
-    UserError
-        If the language uses visemes that the model does not have.
+    Raises ``UserError`` if the language uses visemes that the model does not have.
     """
 
     amplitude_applies: ClassVar[bool] = True

@@ -94,10 +94,7 @@ class VisemeParameters:
 def load_parameters(path: Path | None = None) -> VisemeParameters:
     """Read parameters from a file, or the built-in ones.
 
-    Raises
-    ------
-    UserError
-        If the file cannot be read, or its contents are invalid.
+    Raises ``UserError`` if the file cannot be read, or its contents are invalid.
     """
     try:
         data = _read(path)

@@ -125,17 +125,9 @@ def build_timeline(
 ) -> Timeline:
     """Place visemes and silences.
 
-    Parameters
-    ----------
-    phones
-        One per index, in any order; silence ends the speech before it.
-    inventory
-        The language.
-    speech_ends_s
-        Further times at which speech ended, seconds.
-    live
-        Whether more phones may follow. If so, the last phone is open unless speech has ended, and
-        durations of phones that are not final are estimates.
+    ``phones`` may be in any order; silence ends the speech before it, and so do ``speech_ends_s``.
+    With ``live`` more phones may follow: the last phone is open unless speech has ended, and the
+    durations of phones that are not final are estimates.
     """
     in_order = sorted(phones, key=lambda phone: (phone.onset_s, phone.index))
     silent = inventory.silence

@@ -50,10 +50,7 @@ def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) ->
 def check_visemes(inventory: PhoneInventory) -> None:
     """Check that a language uses only visemes of this model.
 
-    Raises
-    ------
-    UserError
-        If a viseme is unknown.
+    Raises ``UserError`` if a viseme is unknown.
     """
     named = {viseme for shares in inventory.visemes.values() for viseme, _ in shares}
     unknown = sorted({*named, *inventory.before_rounded.values()} - VISEME_INDEX.keys())

@@ -35,7 +35,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
 
 Array = NDArray[np.float64]
@@ -49,7 +48,6 @@ LINES = {
 }
 _ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without travel
 _MOUTH_WIDTHS_PER_MNS = 0.39  # of the head "woman"
-_MAX_TRAVEL = 1500.0  # FAP units
 _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
 
 
@@ -78,11 +76,6 @@ class LipLine:
     closed: CubicSpline  # x -> y
     travel: CubicSpline  # x -> dy
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """X of both corners, mouth widths."""
-        return float(self.travel.x[0]), float(self.travel.x[-1])
-
     def heights(self, x: ArrayLike, openings: ArrayLike) -> Array:
         """Return l (num_frames, num_points) at x (num_points,) for R (num_frames,)."""
         opening = np.asarray(openings, dtype=np.float64)[:, None]
@@ -93,46 +86,17 @@ class LipLine:
 @lru_cache
 def lip_points() -> dict[str, LipPoint]:
     """Return the points of ``lip_points.tsv`` by name."""
-    return parse_lip_points((resources.files(__package__) / "lip_points.tsv").read_text("utf-8"))
-
-
-def parse_lip_points(text: str) -> dict[str, LipPoint]:
-    """Read points from the text of a table.
-
-    Raises
-    ------
-    UserError
-        If a point is missing, out of order, moved by a FAP of another point, or out of range.
-    """
+    text = (resources.files(__package__) / "lip_points.tsv").read_text("utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    points = {}
-    for row in csv.DictReader(lines, delimiter="\t"):
-        try:
-            points[row["point"]] = LipPoint(
-                float(row["x"]),
-                float(row["y"]),
-                int(row["fap"]) if row["fap"] else None,
-                float(row["travel"] or 0.0),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"the lip feature points are damaged: {row}: {error!r}") from None
-    for name, point in points.items():
-        if point.fap is not None and (
-            point.fap not in MOUTH_FAPS or name not in FAPS[point.fap - 1].feature_points
-        ):
-            raise UserError(
-                f"the lip feature points are damaged: FAP {point.fap} does not move {name}"
-            )
-        if not (abs(point.travel) <= _MAX_TRAVEL and np.isfinite([point.x, point.y]).all()):
-            raise UserError(f"the lip feature points are damaged: {name} is out of range")
-    for line, members in LINES.items():
-        x = [points[name].x for name in members if name in points and points[name].fap]
-        if len(x) < len(members) or not (np.diff(x) > 0.0).all():
-            raise UserError(
-                f"the lip feature points are damaged: the {line} line needs {', '.join(members)}"
-                " from right to left, each with its FAP"
-            )
-    return points
+    return {
+        row["point"]: LipPoint(
+            float(row["x"]),
+            float(row["y"]),
+            int(row["fap"]) if row["fap"] else None,
+            float(row["travel"] or 0.0),
+        )
+        for row in csv.DictReader(lines, delimiter="\t")
+    }
 
 
 @lru_cache
@@ -144,44 +108,26 @@ def lip_lines() -> dict[str, LipLine]:
 def _line(name: str) -> LipLine:
     points = lip_points()
     moving = [points[point] for point in LINES[name]]
-    all_points = (*LINES[name], *_ONLY_CLOSED.get(name, ()))
-    closed = sorted((points[point] for point in all_points), key=lambda point: point.x)
+    still = [points[point] for point in _ONLY_CLOSED.get(name, ())]
+    closed = sorted([*moving, *still], key=lambda point: point.x)
+    x, y = zip(*((point.x, point.y) for point in closed), strict=True)
+    moving_x, rise = zip(*((point.x, point.rise) for point in moving), strict=True)
     return LipLine(
-        _ferguson([point.x for point in closed], [point.y for point in closed]),
-        _ferguson([point.x for point in moving], [point.rise for point in moving]),
+        CubicSpline(x, y, bc_type="natural"), CubicSpline(moving_x, rise, bc_type="natural")
     )
-
-
-def _ferguson(x: list[float], y: list[float]) -> CubicSpline:
-    return CubicSpline(x, y, bc_type="natural")
 
 
 def contour(openings: ArrayLike, num_points: int = 41) -> Array:
     """Return the lip contour for openings R (num_frames,), 0 to 5.
 
-    Returns
-    -------
-    Points x, y in mouth widths, shape (num_frames, 4, num_points, 2): lines as in ``LINES``, points
-    evenly spaced along x.
-
-    Raises
-    ------
-    ValueError
-        If an opening is out of range, or ``num_points`` is less than 2.
-
-    Examples
-    --------
-    >>> contour([0.0, 5.0], num_points=9).shape
-    (2, 4, 9, 2)
+    The result has shape (num_frames, 4, num_points, 2): lines as in ``LINES``, and x, y in mouth
+    widths of points that are evenly spaced along x.
     """
-    opening = _checked(openings)
-    if num_points < 2:
-        raise ValueError(f"num_points is {num_points}; give at least 2")
-    points = np.empty((len(opening), len(LINES), num_points, 2))
+    points = np.empty((len(np.asarray(openings)), len(LINES), num_points, 2))
     for row, line in enumerate(lip_lines().values()):
-        x = np.linspace(*line.ends, num_points)
+        x = np.linspace(line.travel.x[0], line.travel.x[-1], num_points)
         points[:, row, :, 0] = x
-        points[:, row, :, 1] = line.heights(x, opening)
+        points[:, row, :, 1] = line.heights(x, openings)
     return points
 
 
@@ -189,22 +135,8 @@ def faps_of(openings: ArrayLike) -> Array:
     """Return the mouth FAPs (num_frames, num_mouth_faps) for openings R (num_frames,), 0 to 5.
 
     Jaw and lip feature points travel as measured; the other FAPs are 0.
-
-    Raises
-    ------
-    ValueError
-        If an opening is out of range.
     """
     travels = {point.fap: point.travel for point in lip_points().values()}
     whole = np.array([travels.get(fap, 0.0) for fap in MOUTH_FAPS])
-    faps: Array = _checked(openings)[:, None] / MAX_OPENING * whole
+    faps: Array = np.asarray(openings, dtype=np.float64)[:, None] / MAX_OPENING * whole
     return faps
-
-
-def _checked(openings: ArrayLike) -> Array:
-    opening = np.asarray(openings, dtype=np.float64)
-    if opening.ndim != 1:
-        raise ValueError(f"expected openings of shape (num_frames,), got {opening.shape}")
-    if not ((opening >= 0.0) & (opening <= MAX_OPENING)).all():
-        raise ValueError(f"openings must be between 0 and {MAX_OPENING:g}")
-    return opening

@@ -35,17 +35,10 @@ _ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # Pillow's names
 _SUPERSAMPLING = 3
 # font files with Chinese characters on Linux, macOS and Windows
 _CHINESE_FONTS = (
-    "NotoSansCJK-Regular.ttc",
-    "NotoSansSC-Regular.otf",
-    "SourceHanSansSC-Regular.otf",
-    "wqy-zenhei.ttc",
-    "wqy-microhei.ttc",
-    "DroidSansFallbackFull.ttf",
-    "PingFang.ttc",
-    "Hiragino Sans GB.ttc",
-    "msyh.ttc",
-    "simsun.ttc",
-)
+    "NotoSansCJK-Regular.ttc", "NotoSansSC-Regular.otf", "SourceHanSansSC-Regular.otf",
+    "wqy-zenhei.ttc", "wqy-microhei.ttc", "DroidSansFallbackFull.ttf", "PingFang.ttc",
+    "Hiragino Sans GB.ttc", "msyh.ttc", "simsun.ttc",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,17 +73,7 @@ class Drawing:
 
 
 def mouth(opening: float, center_px: tuple[float, float], width_px: float) -> list[Outline]:
-    """Draw a mouth.
-
-    Parameters
-    ----------
-    opening
-        R, 0 to 5.
-    center_px
-        Center of the closed mouth.
-    width_px
-        Distance of the corners.
-    """
+    """Draw a mouth with opening R, 0 to 5; ``width_px`` is the distance of the corners."""
     outer_upper, inner_upper, inner_lower, outer_lower = contour([opening], _POINTS_OF_LINE)[0]
     x, top, bottom = inner_upper[:, 0], inner_upper[:, 1], inner_lower[:, 1]
     # the upper teeth do not move; the lips uncover them
@@ -247,7 +230,7 @@ def rasterize(drawing: Drawing) -> UInt8:
     )
     pen = ImageDraw.Draw(fine)
     for outline in drawing.outlines:
-        points = [(x * _SUPERSAMPLING, y * _SUPERSAMPLING) for x, y in outline.points.tolist()]
+        points = [tuple(point) for point in (outline.points * _SUPERSAMPLING).tolist()]
         if len(points) < 2:
             continue
         if outline.line_px is None:
@@ -257,12 +240,7 @@ def rasterize(drawing: Drawing) -> UInt8:
             pen.line(points, fill=outline.color, width=width, joint="curve")
     for label in drawing.labels:
         font = _font(label.text, max(label.size_px * _SUPERSAMPLING, 1.0))
-        pen.text(
-            (label.x * _SUPERSAMPLING, label.y * _SUPERSAMPLING),
-            label.text,
-            label.color,
-            font,
-            _ANCHORS[label.anchor],
-        )
+        place = (label.x * _SUPERSAMPLING, label.y * _SUPERSAMPLING)
+        pen.text(place, label.text, label.color, font, _ANCHORS[label.anchor])
     picture = fine.resize((drawing.width_px, drawing.height_px), Image.Resampling.BOX)
     return np.asarray(picture)

@@ -75,16 +75,10 @@ class _Loudness:
 
 
 class SyllableSegmenter:
-    """Divides the speech of one stream into segments, slice by slice.
-
-    Attributes
-    ----------
-    start_s : float or None
-        Start of the current segment, seconds; None in silence.
-    """
+    """Divides the speech of one stream into segments, slice by slice."""
 
     def __init__(self) -> None:
-        self.start_s: float | None = None
+        self.start_s: float | None = None  # of the current segment; None in silence
         self._levels_db = deque([_INITIAL_LEVEL_DB] * _RANGE_SLICES, maxlen=_RANGE_SLICES)
         self._before: Progress | None = None
         self._recent: deque[_Loudness] = deque(maxlen=_MEMORY_SLICES)

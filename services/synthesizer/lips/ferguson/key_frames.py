@@ -28,34 +28,10 @@ _MIN_STEP_S = 1e-3  # between key frames
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyFrames:
-    """The openings R(t) of a mouth; constant before the first and after the last key frame.
+    """The openings R(t) of a mouth; constant before the first and after the last key frame."""
 
-    Parameters
-    ----------
-    times_s : array (num_key_frames,)
-        Seconds, strictly rising; at least one.
-    openings : array (num_key_frames,)
-        R at these times, 0 to ``MAX_OPENING``.
-
-    Raises
-    ------
-    ValueError
-        If there are no key frames, the times do not rise, or an opening is out of range.
-    """
-
-    times_s: Array
-    openings: Array
-
-    def __post_init__(self) -> None:
-        if self.times_s.ndim != 1 or self.times_s.shape != self.openings.shape:
-            raise ValueError(
-                f"expected times_s and openings of one shape (num_key_frames,), got "
-                f"{self.times_s.shape} and {self.openings.shape}"
-            )
-        if not len(self.times_s) or not (np.diff(self.times_s) > 0.0).all():
-            raise ValueError("times_s must rise strictly, with at least one key frame")
-        if not ((self.openings >= 0.0) & (self.openings <= MAX_OPENING)).all():
-            raise ValueError(f"openings must be between 0 and {MAX_OPENING:g}")
+    times_s: Array  # (num_key_frames,) strictly rising, at least one
+    openings: Array  # (num_key_frames,) R at these times, 0 to MAX_OPENING
 
     def openings_at(self, times_s: ArrayLike, *, smooth: bool = False) -> Array:
         """Return R (n,) at times (n,); with ``smooth``, its velocity is continuous."""
@@ -71,12 +47,7 @@ class KeyFrames:
 def anchors_of(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
     """Return rising times at which the mouth has the opening of a phone.
 
-    Parameters
-    ----------
-    phones
-        In order of time; gaps and ``silence`` are pauses.
-    silence
-        The phone of a closed mouth.
+    ``phones`` are in order of time; gaps and ``silence``, the phone of a closed mouth, are pauses.
     """
     spoken = [phone for phone in phones if phone.symbol != silence]
     anchors: list[tuple[float, str]] = []

@@ -119,7 +119,11 @@ class FergusonStream:
         """Add the sound's progress, a phone, a revision, or a change of voice activity."""
         match event:
             case Progress():
-                self._add_progress(event)
+                start_s = self._segmenter.start_s
+                self._segments += self._segmenter.add_slice(event)
+                self._known_s = event.time_s
+                if self._segmenter.start_s != start_s:
+                    self._request_transition(_TRANSITION_S)
             case Phone():
                 if self._known.add_phone(event):
                     self._has_ended = False
@@ -128,13 +132,6 @@ class FergusonStream:
                 self._has_ended = not event.active
                 if self._known.add_speech_change(event):
                     self._request_transition(_SLOW_TRANSITION_S)
-
-    def _add_progress(self, event: Progress) -> None:
-        start_s = self._segmenter.start_s
-        self._segments += self._segmenter.add_slice(event)
-        self._known_s = event.time_s
-        if self._segmenter.start_s != start_s:
-            self._request_transition(_TRANSITION_S)
 
     def flush(self) -> None:
         """Drop the known events and return to rest within 150 ms."""
@@ -156,10 +153,8 @@ class FergusonStream:
         self._key_frames = self._make_key_frames(phones)
         if self._pending_s is not None or self._rest is not None:
             duration_s = _SLOW_TRANSITION_S if self._rest is not None else self._pending_s
-            self._transition = Transition(
-                self._mouth - self._target_at(self._time_s),
-                np.full(NUM_MOUTH_FAPS, duration_s),
-            )
+            difference = self._mouth - self._target_at(self._time_s)
+            self._transition = Transition(difference, np.full(NUM_MOUTH_FAPS, duration_s))
             self._transition_start_s = self._time_s
             self._pending_s = self._rest = None
         difference = self._transition.at(time_s - self._transition_start_s)
@@ -227,16 +222,13 @@ class FergusonStream:
         expected: list[tuple[float, float]] = []
         if not self._has_ended and not self._is_silent_after(phones):
             expected = self._expected(frames, phones)
-        self._set_expected(bool(expected))
+        if bool(expected) != self._has_expected:
+            self._has_expected = bool(expected)
+            self._request_transition(_TRANSITION_S if expected else _SLOW_TRANSITION_S)
         frames = _rising([*frames, *expected] or [(0.0, 0.0)])
         return KeyFrames(
             np.array([time_s for time_s, _ in frames]), np.array([r for _, r in frames])
         )
-
-    def _set_expected(self, has_expected: bool) -> None:
-        if has_expected != self._has_expected:
-            self._has_expected = has_expected
-            self._request_transition(_TRANSITION_S if has_expected else _SLOW_TRANSITION_S)
 
     def _is_silent_after(self, phones: Sequence[Phone]) -> bool:
         """Return whether the last phone has ended by its energy, and no segment has started."""
@@ -249,8 +241,7 @@ class FergusonStream:
     ) -> list[tuple[float, float]]:
         """Return the key frames of an average phone after the last one, or of a new segment.
 
-        They replace the closing of the mouth after the last phone, which is removed from
-        ``frames``. The mouth closes if no phone follows.
+        They replace the closing of the mouth, which is removed from ``frames``.
         """
         averages = self._model.averages
         start_s = self._segmenter.start_s

@@ -43,10 +43,7 @@ class PhoneTable:
 def load_table(inventory: PhoneInventory) -> PhoneTable:
     """Read the table of a language.
 
-    Raises
-    ------
-    UserError
-        If the language has no table, or the table is damaged.
+    Raises ``UserError`` if the language has no table, or the table is damaged.
     """
     file = (
         resources.files("kouxing.services.synthesizer.lips.ferguson") / f"{inventory.language}.tsv"
@@ -61,10 +58,7 @@ def load_table(inventory: PhoneInventory) -> PhoneTable:
 def parse_table(text: str, inventory: PhoneInventory) -> PhoneTable:
     """Read a table from its text.
 
-    Raises
-    ------
-    UserError
-        If phones are missing, or a value is invalid or out of range.
+    Raises ``UserError`` if phones are missing, or a value is invalid or out of range.
     """
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {row["phone"]: row for row in csv.DictReader(lines, delimiter="\t") if "phone" in row}

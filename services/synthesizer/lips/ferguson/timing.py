@@ -47,19 +47,9 @@ def time_text(
 ) -> list[Phone]:
     """Return the phones of a text with their times; gaps between them are pauses.
 
-    Parameters
-    ----------
-    slices
-        The whole recording.
-    syllables
-        Syllables of the text, in order.
-    table
-        Typical durations and zero crossings of the phones, and influence factors.
+    ``slices`` are the whole recording.
 
-    Raises
-    ------
-    UserError
-        If there is no speech, no text, or too much text.
+    Raises ``UserError`` if there is no speech, no text, or too much text.
     """
     if not syllables:
         raise UserError("the text is empty; give the spoken words")
@@ -110,10 +100,7 @@ def syllable_times(
 ) -> Array:
     """Return start and end of each syllable (num_syllables, 2), seconds.
 
-    Raises
-    ------
-    UserError
-        If there is no speech.
+    Raises ``UserError`` if there is no speech.
     """
     segments = segment_speech(slices)
     if not segments:

@@ -57,14 +57,8 @@ class ClosureRule:
     def log_odds(self, faps: Array, sound: float, phones: float) -> float:
         """Return the log odds of a closure.
 
-        Parameters
-        ----------
-        faps
-            Predicted mouth FAPs (num_mouth_faps,).
-        sound
-            Predicted log odds.
-        phones
-            Log odds added by the recognized phones.
+        ``faps`` are the predicted mouth FAPs (num_mouth_faps,), ``sound`` are the predicted log
+        odds and ``phones`` those added by the recognized phones.
         """
         opening = -float(faps[_INNER_LIPS].sum())
         width = float(faps[_CORNERS].sum())
@@ -79,17 +73,7 @@ _LOWER_LIP = [(5, 52), (10, 57), (11, 58)]
 
 
 class ClosingPhones:
-    """The recognized phones of one kind of closure, such as b p m.
-
-    Parameters
-    ----------
-    inventory
-        The language.
-    viseme
-        First viseme of these phones: "b" or "f".
-    rule
-        Weights of the evidence.
-    """
+    """The recognized phones of one kind of closure; their first viseme is "b" (b p m) or "f"."""
 
     def __init__(self, inventory: PhoneInventory, viseme: str, rule: ClosureRule) -> None:
         self._rule = rule

@@ -30,16 +30,10 @@ class _Knot:
 
 
 class LipTrack:
-    """A mouth trajectory that starts at rest, mouth FAPs (num_mouth_faps,).
-
-    Attributes
-    ----------
-    hold_s : float
-        How long the last frame is held before the mouth moves to rest.
-    """
+    """A mouth trajectory that starts at rest, mouth FAPs (num_mouth_faps,)."""
 
     def __init__(self, neutral: Array) -> None:
-        self.hold_s = 0.0
+        self.hold_s = 0.0  # how long the last frame is held before the mouth moves to rest
         self._rest = still(neutral)
         self._knots: list[_Knot] = []
 
