@@ -181,7 +181,7 @@ def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None
         if not node.get("ignored") and "name" in node and "role" in node
     }
     assert named["meter"] == "level"
-    assert named["slider"].startswith("Movement of the mouth")
+    assert named["slider"].startswith("Mouth movement")
     roles = ("button", "combobox", "slider", "meter", "image")
     for node in nodes:
         if not node.get("ignored") and node["role"]["value"] in roles:

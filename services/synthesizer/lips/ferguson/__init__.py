@@ -20,6 +20,6 @@ def _load(inventory: PhoneInventory) -> LipModel:
 
 LIP_MODEL = LipModelInfo(
     delay_ms=160.0,
-    titles={"en": "from one opening (Ferguson)", "zh": "由单一开口（Ferguson）"},
+    titles={"en": "from the phones, opening only (Ferguson)", "zh": "由单一开口（Ferguson）"},
     load=_load,
 )
