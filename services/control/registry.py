@@ -6,8 +6,9 @@ A worker provides endpoints and needs others. An observer takes part in every se
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from itertools import takewhile
 from operator import itemgetter
 
 from kouxing.services.control.load import WorkerLoad
@@ -238,14 +239,10 @@ class Registry:
 
     def silent(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
-        return list(self._silent(now_s))
-
-    def _silent(self, now_s: float) -> Iterator[str]:
-        for instance, record in self._services.items():
-            if self.age_s(instance, now_s) <= self._lost_after_s:
-                return
-            if record.peer != NO_PEER:
-                yield instance
+        oldest = takewhile(
+            lambda item: self.age_s(item[0], now_s) > self._lost_after_s, self._services.items()
+        )
+        return [instance for instance, record in oldest if record.peer != NO_PEER]
 
 
 def _with_keys(heartbeat: Heartbeat, peer: Peer) -> dict[str, str]:

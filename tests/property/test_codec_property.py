@@ -18,6 +18,8 @@ from kouxing.shared.phones.events import (
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.events import event_of, message_of
+from kouxing.shared.wire.message import Message
+from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.property
 
@@ -26,6 +28,31 @@ pytestmark = pytest.mark.property
 def test_rejects_garbage(parts: list[bytes]) -> None:
     with pytest.raises(BadMessage):
         decode(parts)
+
+
+@given(
+    st.sampled_from(SAMPLES),
+    st.sampled_from(SAMPLES),
+    st.floats(0, 1, exclude_max=True),
+    st.one_of(st.binary(max_size=40), st.integers(1, 60_000).map(lambda n: b"\x81\xa1x" * n)),
+)
+def test_rejects_a_damaged_message_or_reads_it_the_same_twice(
+    message: Message, other: Message, place: float, inserted: bytes
+) -> None:
+    label, body = encode(message)
+    at = int(place * len(body))
+    for damaged in (
+        body[:at],
+        body[:at] + inserted + body[at:],
+        body[:at] + inserted + body[at + len(inserted) :],
+        body[:at] + encode(other)[1] + body[at:],
+    ):
+        for topic in (label, encode(other)[0]):
+            try:
+                read = encode(decode([topic, damaged]))
+            except BadMessage:
+                continue
+            assert encode(decode(read)) == read
 
 
 @given(st.binary(max_size=1000), st.integers(0, 2**53), st.integers(0, 2**53))
