@@ -49,12 +49,6 @@ class ServiceFollower(Follower):
         super().start(epoch, endpoints)
         self._service.tick_callbacks.add(self.tick)
 
-    def tick(self) -> None:
-        """Do what is due, as ``Follower.tick``."""
-        super().tick()
-        if self.is_settled:
-            self._service.tick_callbacks.discard(self.tick)
-
     def close(self) -> None:
         """Unsubscribe, as ``Follower.close``."""
         super().close()

@@ -147,10 +147,12 @@ def test_without_control_the_error_names_the_remedy() -> None:
 
 
 def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
+    session = client.open_session("s")
     client.close()
     assert client.is_closed
     with pytest.raises(KouxingError, match="closed"):
         client.status()
+    session.close()  # does not wait for the thread, which has ended
 
 
 def test_asyncio_does_the_same(control: FakeControl) -> None:

@@ -128,7 +128,9 @@ class AsyncSession(BaseSession):
 
     async def close(self) -> None:
         """Close the session, as ``Session.close``."""
-        if not self._core.is_over and self._options is not None:
+        if self._core.is_over:
+            return
+        if self._options is not None:
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._signal.wait(self._is_delivered), LAST_ANSWER_S)
             with contextlib.suppress(Refused):  # it is closed already

@@ -165,7 +165,9 @@ class Session(BaseSession):
 
     def close(self) -> None:
         """Close the session if this program opened it, and all its connections."""
-        if not self._core.is_over and self._options is not None:
+        if self._core.is_over:
+            return
+        if self._options is not None:
             self._signal.wait(self._is_delivered, LAST_ANSWER_S)
             with contextlib.suppress(Refused):  # it is closed already
                 self._close().result()

@@ -155,11 +155,6 @@ class Follower:
             self._transport.close_connection(self._connection)
             self._subscribe()
 
-    @property
-    def is_settled(self) -> bool:
-        """Whether ``tick`` has nothing to do until the next ``start``."""
-        return self._retry_s == self._close_old_s == math.inf
-
     def drain(self) -> None:
         """Pass on all messages that have arrived."""
         self._close_old()
