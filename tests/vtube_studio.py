@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import threading
-from types import TracebackType
 
 from aiohttp import WSMsgType, web
 
@@ -17,27 +16,15 @@ PARAMETERS = ("MouthOpen", "MouthSmile", "EyeOpenLeft", "FaceAngleX", "MousePosi
 
 
 class VTubeStudioStub:
-    """A server in a thread, at a free port or a given one.
-
-    Attributes
-    ----------
-    requests
-        Kinds of the received messages, except frames.
-    frames
-        Parameters of each frame, by name.
-    token
-        The valid token. If it is empty, no token is valid.
-    is_asking
-        Whether a question to the user is open.
-    """
+    """A server in a thread, at a free port or a given one."""
 
     def __init__(self, port: int = 0, *, user_allows: bool = True, token: str = "") -> None:
         self.port = port
-        self.requests: list[str] = []
-        self.frames: list[dict[str, float]] = []
+        self.requests: list[str] = []  # kinds of the received messages, except frames
+        self.frames: list[dict[str, float]] = []  # parameters of each frame, by name
         self._user_allows = user_allows
-        self.token = token
-        self.is_asking = False
+        self.token = token  # the valid token; if it is empty, no token is valid
+        self.is_asking = False  # whether a question to the user is open
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever)
 
@@ -46,12 +33,7 @@ class VTubeStudioStub:
         asyncio.run_coroutine_threadsafe(self._serve(), self._loop).result()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
@@ -80,15 +62,8 @@ class VTubeStudioStub:
             is_authenticated = bool(self.token) and authenticated_by == self.token
             fault = _fault(asked) or _plugin_fault(kind, data)
             answered, answer = fault or self._answer(kind, data, is_authenticated)
-            await client.send_json(
-                {
-                    **API,
-                    "timestamp": 1625405710728,
-                    "requestID": asked.get("requestID", ""),
-                    "messageType": answered,
-                    "data": answer,
-                }
-            )
+            about = {"timestamp": 1625405710728, "requestID": asked.get("requestID", "")}
+            await client.send_json({**API, **about, "messageType": answered, "data": answer})
         return client
 
     def _answer(self, kind: object, data: dict[str, object], is_authenticated: bool) -> Answer:
@@ -102,10 +77,8 @@ class VTubeStudioStub:
             return _error(8, "This request requires authentication")
         if kind == "InputParameterListRequest":
             listed = [{"name": name, "value": 0.0, "min": 0, "max": 1} for name in PARAMETERS]
-            return "InputParameterListResponse", {
-                "defaultParameters": listed,
-                "customParameters": [],
-            }
+            answer = {"defaultParameters": listed, "customParameters": []}
+            return "InputParameterListResponse", answer
         if kind == "InjectParameterDataRequest":
             return self._inject(data)
         return _error(7, f"Unknown request type: {kind}")
@@ -124,13 +97,14 @@ class VTubeStudioStub:
             return _error(450, "No data was provided")
         if data.get("mode", "set") not in ("set", "add"):
             return _error(455, "Unknown mode")
-        if not all(isinstance(each["value"], int | float) for each in values):
-            return _error(451, "A value is no number")
-        if any(not abs(each["value"]) <= MAX_VALUE for each in values):
+        frame = {value["id"]: value["value"] for value in values}
+        if not all(isinstance(value, int | float) for value in frame.values()):
+            return _error(451, "A value is not a number")
+        if not all(abs(value) <= MAX_VALUE for value in frame.values()):
             return _error(451, "A value is out of range")
-        if any(each["id"] not in PARAMETERS for each in values):
+        if not frame.keys() <= {*PARAMETERS}:
             return _error(453, "Parameter not found")
-        self.frames.append({each["id"]: each["value"] for each in values})
+        self.frames.append(frame)
         return "InjectParameterDataResponse", {}
 
 

@@ -63,19 +63,6 @@ def test_reads_an_exported_head_unchanged(original: Head, tmp_path: Path) -> Non
     assert np.abs(pictures[0] - pictures[1]).mean() < 3
 
 
-def test_reads_an_exported_head_by_its_arkit_shapes(original: Head, tmp_path: Path) -> None:
-    path = tmp_path / "original.glb"
-    export_glb(original, path)
-    document, binary = read_chunks(path)
-    for mesh in document["meshes"]:
-        names = mesh.get("extras", {}).get("targetNames", [])
-        names[:] = [name if name in ARKIT.names else f"x{row}" for row, name in enumerate(names)]
-    write_chunks(path, document, binary)
-    head = read_glb(path)
-    for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
-        assert off(head, original, SHAPES[name]) < 0.25, name
-
-
 @pytest.mark.parametrize(
     "rename",
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -40,20 +41,12 @@ class Watched(SynthesizerService):
 
     def take(self, session: str, sequence: int, time_s: float) -> None:
         """Receive a progress message up to a time."""
-        progress = Progress(
-            session=session,
-            epoch=1,
-            sequence=sequence,
-            media_time=to_samples(time_s),
-            level_db=-60.0,
-        )
-        self._on_input(progress, Peer())
+        place: dict[str, Any] = {"session": session, "epoch": 1, "sequence": sequence}
+        self._on_input(Progress(**place, media_time=to_samples(time_s), level_db=-60.0), Peer())
 
     def frames(self, session: str) -> list[FapFrame]:
         """Return the frames of a session so far."""
-        return [
-            each for each in self.sent if isinstance(each, FapFrame) and each.session == session
-        ]
+        return [m for m in self.sent if isinstance(m, FapFrame) and m.session == session]
 
 
 @pytest.fixture
@@ -89,7 +82,7 @@ def test_a_gap_does_not_delay_other_sessions(service: Watched) -> None:
     end = Progress(session="gap", epoch=1, sequence=3, media_time=158_720, state=AudioState.ENDED)
     service._on_input(end, Peer())
     num_ticks = 0
-    while not any(isinstance(each, EndOfFaps) for each in service.sent):
+    while not any(isinstance(message, EndOfFaps) for message in service.sent):
         before = len(service.frames("gap"))
         service.on_tick(0.0)
         num_ticks += 1
