@@ -35,7 +35,7 @@ def adapt(
     output: Annotated[Path, typer.Option("--output", "-o", help="Mouth profile to write.")],
     json_file: JsonFile = None,
 ) -> None:
-    """Learn a mouth profile from tracked lips, for the option --mouth."""
+    """Learn a speaker's mouth profile from tracked lips, for the option --mouth."""
     from kouxing.services.mouth_profiles.adapt import learn_mouth_profile
     from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 

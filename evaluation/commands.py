@@ -38,13 +38,13 @@ class Part(StrEnum):
 
 SENTENCE = Path(__file__).parents[1] / "shared" / "demo" / "hello-female.wav"
 
-Manifest = Annotated[Path, typer.Option(help="Manifest, or folder of a corpus.")]
+Manifest = Annotated[Path, typer.Option(help="Manifest or corpus folder.")]
 AudioFolder = Annotated[
-    Path | None, typer.Option(help="Folder of the manifest's paths. Default: the manifest's own.")
+    Path | None, typer.Option(help="Folder of the audio files. Default: the manifest's folder.")
 ]
 Split = Annotated[str, typer.Option(help="Split of the corpus.")]
 Acoustic = Annotated[
-    list[str] | None, typer.Option(help="neural, blocks, gmm or a model file; repeatable.")
+    list[str] | None, typer.Option(help="Model: neural, blocks, gmm or a file; repeatable.")
 ]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
 Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
@@ -59,14 +59,12 @@ def recognizer(
     acoustic: Acoustic = None,
     look_ahead: Annotated[
         list[float] | None,
-        typer.Option("--look-ahead-ms", help="Look-ahead, for models that have one; repeatable."),
+        typer.Option("--look-ahead-ms", help="Look-ahead, for models with a choice; repeatable."),
     ] = None,
     confusions: Annotated[
-        Path | None, typer.Option(help="Plot the confusions of the last model (.png).")
+        Path | None, typer.Option(help="Plot the phone confusions of the last model (.png).")
     ] = None,
-    curve: Annotated[
-        Path | None, typer.Option(help="Plot the errors over the delay (.png).")
-    ] = None,
+    curve: Annotated[Path | None, typer.Option(help="Plot errors against delay (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Compare phone and viseme errors, delays and CPU cost of acoustic models."""
@@ -101,13 +99,13 @@ def lips(
     clips: Clips,
     parameters: Parameters = None,
     source: Annotated[
-        list[str] | None, typer.Option(help="Only clips named SOURCE_...; repeatable.")
+        list[str] | None, typer.Option(help="Use only clips named SOURCE_...; repeatable.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Compare every lip model with tracked lips, at several delays, on held-out clips.
 
-    The JSON file also has the figures by language, source and speaker.
+    The JSON file also contains the figures by language, source and speaker.
     """
     from kouxing.evaluation.lips.report import print_scores
     from kouxing.evaluation.lips.scores import score_lip_models
@@ -121,7 +119,7 @@ def lips(
 @app.command()
 def schemes(
     manifest: Annotated[
-        Path | None, typer.Option(help="Manifest or corpus; 20 sentences are used.")
+        Path | None, typer.Option(help="Manifest or corpus folder; 20 sentences are used.")
     ] = None,
     audio: AudioFolder = None,
     split: Split = "test",
@@ -136,20 +134,20 @@ def schemes(
         bool, typer.Option("--paper-rule", help="Phones as in the paper: N = 3, no corrections.")
     ] = False,
     videos: Annotated[
-        Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; existing ones stay.")
+        Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; skips existing files.")
     ] = None,
     anchor: Annotated[
         bool, typer.Option("--anchor", help="Also write videos with a mouth at rest.")
     ] = False,
     sound_at_once: Annotated[
-        bool, typer.Option("--sound-at-once", help="In videos of live faces, do not delay sound.")
+        bool,
+        typer.Option("--sound-at-once", help="Do not delay the sound in videos of live faces."),
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
     """Compare the four schemes of Li et al. 2011: aligned, recognized, live, next phone.
 
-    The default sentences are the samples of the package. The default recognizers are blocks and
-    gmm.
+    By default, the shipped samples are used, with the recognizers blocks and gmm.
     """
     from kouxing.evaluation.lips import sentences
     from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
@@ -187,13 +185,13 @@ def schemes(
 @app.command()
 def ferguson(
     clips: Clips,
-    part: Annotated[Part, typer.Option(help="Purpose of the clips.")] = Part.HELD,
+    part: Annotated[Part, typer.Option(help="Part of the clips to use.")] = Part.HELD,
     picture: Annotated[
-        Path | None, typer.Option(help="Plot the accuracy over the speaking rate (.png).")
+        Path | None, typer.Option(help="Plot accuracy against speaking rate (.png).")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Compare lips with tracked lips at several speaking rates, as Zhang et al. 2021 do."""
+    """Compare lip models with tracked lips at several speaking rates, as in Zhang et al. 2021."""
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.lips.speaking_rates import print_rates, rates_figure, score_rates
 
@@ -214,7 +212,7 @@ def visemes(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure how well the visemes fit held-out lips, as Wang & Cai 2003 do."""
+    """Measure how well the visemes fit held-out lips, as in Wang & Cai 2003."""
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.lips.viseme_fit import (
         fit_figure,
@@ -241,7 +239,7 @@ def attacks(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure what attackers cost: memory of the services, and delay of other clients."""
+    """Measure what attackers cost the services (memory) and other clients (delay)."""
     from kouxing.evaluation.system.attacks import measure, show
 
     check_output(json_file)
@@ -259,7 +257,7 @@ def faults(
     logs: Annotated[Path | None, typer.Option(help="Folder for the services' logs.")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure what faults do to a live face: how long it stops, what is lost, how far it jumps.
+    """Measure how faults affect a live face: how long it stops, lost frames, and jumps.
 
     Faults on this machine: "none", "recognizer killed", "recognizer stopped", "recognizer hangs",
     the same for "synthesizer", each of these also with ", one more" worker of the same kind,
@@ -279,12 +277,12 @@ def faults(
 @bench_app.command()
 def chain(
     audio: AudioFile,
-    repeats: Annotated[int, typer.Option(min=1, help="How often to stream the file.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="Times to stream the file.")] = 3,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure latency, CPU and images per second of the whole chain on this machine.
+    """Measure latency, CPU time and images per second of the whole chain on this machine.
 
-    The page is measured if Chromium is installed.
+    If Chromium is installed, the page is also measured.
     """
     from kouxing.evaluation.system import chromium, costs, latency, page
 
@@ -308,20 +306,20 @@ def chain(
 @bench_app.command()
 def load(
     audio: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings to speak. Default: the samples.")
+        list[Path] | None, typer.Argument(help="Recordings to stream. Default: the samples.")
     ] = None,
     sessions: Annotated[
-        int, typer.Option(min=1, max=1000, help="Number of sessions of the last step.")
+        int, typer.Option(min=1, max=1000, help="Number of sessions in the last step.")
     ] = 24,
     seconds: Annotated[
-        float, typer.Option(min=1.0, help="How long to measure each of up to 9 steps.")
+        float, typer.Option(min=1.0, help="Duration of each of up to 9 steps, in seconds.")
     ] = 12.0,
     picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Measure how many live sessions control, a recognizer and a synthesizer can serve here.
 
-    One process speaks in all of them, with different voices.
+    A single client process streams to all sessions, with different voices.
     """
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.system.load import draw, measure, show
@@ -341,7 +339,7 @@ def plot() -> None:
 
 @plot_app.command(name="heads")
 def plot_heads(
-    folder: Annotated[Path, typer.Argument(help="Folder for the sheets.")] = Path("out/heads"),
+    folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/heads"),
     choices: Annotated[
         Path | None, typer.Option(help="Folder for a small picture of every head.")
     ] = None,

@@ -18,21 +18,21 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the mo
 
 Corpora = Annotated[
     list[Path],
-    typer.Option("--corpus", help="Corpus folder or manifest; repeat for several."),
+    typer.Option("--corpus", help="Corpus folder or manifest; repeatable."),
 ]
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
-Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
+Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same model.")]
 SyntheticWeight = Annotated[
     float, typer.Option(help="Weight of synthetic relative to natural speech.")
 ]
 Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
 PhoneLm = Annotated[
     Path | None,
-    typer.Option(help="File with a phone language model: phone_lm.npz, or a recognizer's model."),
+    typer.Option(help="Phone language model: phone_lm.npz, or the file of an acoustic model."),
 ]
 AnyLicense = Annotated[
     bool,
-    typer.Option("--any-license", help="Also use data whose license excludes distribution."),
+    typer.Option("--any-license", help="Also use data whose license forbids distribution."),
 ]
 Whisper = Annotated[
     Path, typer.Option(help="Folder of Whisper base for faster-whisper, for its encoder.")
@@ -40,14 +40,14 @@ Whisper = Annotated[
 StartFrom = Annotated[
     Path | None,
     typer.Option(
-        help="Neural model that aligns, and whose HMMs and phone language model are used. "
-        "Default: the shipped one."
+        help="Neural model that aligns the recordings and provides the HMMs and the phone language "
+        "model. Default: the shipped model."
     ),
 ]
 Untranscribed = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Folder of recordings in any language, which the teacher labels; repeat for several."
+        help="Folder of recordings in any language, for the teacher to label; repeatable."
     ),
 ]
 
@@ -68,20 +68,22 @@ def phone_lm(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write (.npz).")],
     corpus: Annotated[
         list[Path] | None,
-        typer.Option("--corpus", help="Corpus whose sentences are counted; repeat for several."),
+        typer.Option("--corpus", help="Corpus whose sentences are counted; repeatable."),
     ] = None,
     text: Annotated[
-        list[Path] | None, typer.Option("--text", help="Text file, UTF-8; repeat for several.")
+        list[Path] | None, typer.Option("--text", help="Text file, UTF-8; repeatable.")
     ] = None,
     ngrams: Annotated[
-        Path | None, typer.Option(help="Output of `tslminfo -v`, to draw words from.")
+        Path | None, typer.Option(help="Output of `tslminfo -v`, to sample words from.")
     ] = None,
     dictionary: Annotated[
         Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, with the words of --ngrams.")
     ] = None,
-    words: Annotated[int, typer.Option(min=1, help="Number of words to draw.")] = 30_000_000,
+    words: Annotated[int, typer.Option(min=1, help="Number of words to sample.")] = 30_000_000,
     order: Annotated[int, typer.Option(min=2, max=10, help="Phones in the longest n-grams.")] = 6,
-    max_ngrams: Annotated[int, typer.Option(min=1000, help="N-grams to keep, about.")] = 1_000_000,
+    max_ngrams: Annotated[
+        int, typer.Option(min=1000, help="About how many n-grams to keep.")
+    ] = 1_000_000,
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
 ) -> None:
@@ -140,17 +142,17 @@ def neural(
     output: Model,
     aligner: Annotated[
         Path | None,
-        typer.Option(help="Model that aligns at first. Default: --start-from."),
+        typer.Option(help="Model for the first alignment. Default: --start-from."),
     ] = None,
     whisper: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of Whisper base for faster-whisper: teacher and initial weights."
+            help="Folder of Whisper base for faster-whisper: the teacher and the initial weights."
         ),
     ] = None,
     start_from: Annotated[
         Path | None,
-        typer.Option(help="Neural model to train further. Without --whisper there is no teacher."),
+        typer.Option(help="Neural model to train further; without --whisper, with no teacher."),
     ] = None,
     untranscribed: Untranscribed = None,
     phone_lm: PhoneLm = None,
@@ -239,12 +241,12 @@ def lips(
         list[Path] | None,
         typer.Option(
             help="Folder of speech in any language, of which the teacher labels up to an hour; "
-            "repeat for several."
+            "repeatable."
         ),
     ] = None,
     whisper: Annotated[
         Path | None,
-        typer.Option(help="Folder of Whisper base for faster-whisper: teacher."),
+        typer.Option(help="Folder of Whisper base for faster-whisper, the teacher."),
     ] = None,
     seed: Seed = 0,
     any_license: AnyLicense = False,
@@ -271,7 +273,7 @@ def ferguson(
     output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
     any_license: AnyLicense = False,
 ) -> None:
-    """Learn the table of the ferguson lip model: openings, durations, influence factors."""
+    """Train the table of the ferguson lip model: openings, durations and influence factors."""
     from kouxing.training.ferguson.recipe import train_ferguson
 
     check_output(output)

@@ -12,7 +12,9 @@ from rich.console import Console
 from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.shared.terminal import JsonFile, check_output, print_message, write_json
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Let people judge videos.")
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, help="Run listening tests: people rate videos."
+)
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the videos.")]
 
@@ -20,11 +22,11 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the video
 @app.command()
 def new(
     folder: Folder,
-    title: Annotated[str, typer.Option(help="Title of the page; default: the folder.")] = "",
-    reference: Annotated[str, typer.Option(help="Condition that is the hidden reference.")] = "",
-    anchor: Annotated[str, typer.Option(help="Condition that is bad on purpose.")] = "",
+    title: Annotated[str, typer.Option(help="Title of the page. Default: the folder.")] = "",
+    reference: Annotated[str, typer.Option(help="Condition used as hidden reference.")] = "",
+    anchor: Annotated[str, typer.Option(help="Condition used as low anchor.")] = "",
     condition: Annotated[
-        list[str] | None, typer.Option(help="Condition to take; repeatable. Default: all.")
+        list[str] | None, typer.Option(help="Condition to include; repeatable. Default: all.")
     ] = None,
 ) -> None:
     """Create a study from videos named CONDITION/SENTENCE.mp4."""
@@ -41,7 +43,8 @@ def new(
 def serve(
     folder: Folder,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Overrides gateway.port; 0: a free port.")
+        int | None,
+        typer.Option(min=0, max=65535, help="Port, instead of gateway.port; 0: any free."),
     ] = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
@@ -74,7 +77,7 @@ def report(
     picture: Annotated[Path | None, typer.Option(help="File for box plots (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Print mean opinion scores and which conditions differ."""
+    """Print mean opinion scores, and the conditions that differ significantly."""
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.mos.report import draw_boxes, make_report, print_report
     from kouxing.evaluation.mos.store import read_answers

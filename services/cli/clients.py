@@ -28,7 +28,7 @@ SHOWN_METRICS = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed",
 Control = Annotated[
     str,
     typer.Option(
-        help="Address of control; by default $KOUXING_CONTROL, or the system that you run here."
+        help="Address of control. Default: $KOUXING_CONTROL, or your system on this machine."
     ),
 ]
 
@@ -38,24 +38,26 @@ def speak(
         str,
         typer.Argument(
             metavar="FILE|-|mic|monitor",
-            help="'-' is standard input, raw int16 or WAV; 'monitor' is the sound output of this"
-            " machine.",
+            help="'-': standard input, raw int16 or WAV. 'mic': a microphone. 'monitor': the sound"
+            " that this machine plays.",
         ),
     ],
     session: Annotated[str, typer.Option(help="Name of the session.")] = "",
     record: Annotated[
         bool,
-        typer.Option("--record", help="Let the driver write <session>.mp4."),
+        typer.Option("--record", help="Record the face: the driver writes <session>.mp4."),
     ] = False,
     fast: Annotated[
         bool, typer.Option("--fast", help="Send as fast as possible instead of in real time.")
     ] = False,
     device: Annotated[
         str,
-        typer.Option(help="Part of the name of the 'mic' or 'monitor'; see 'kouxing devices'."),
+        typer.Option(
+            help="Device for 'mic' or 'monitor', by part of its name in 'kouxing devices'."
+        ),
     ] = "",
-    rate: Annotated[int, typer.Option(help="Sample rate of '-' in Hz.")] = 16000,
-    channels: Annotated[int, typer.Option(help="Number of channels of '-'.")] = 1,
+    rate: Annotated[int, typer.Option(help="Sample rate of raw standard input, Hz.")] = 16000,
+    channels: Annotated[int, typer.Option(help="Number of channels of raw standard input.")] = 1,
     mouth: MouthFile = None,
     control: Control = "",
 ) -> None:
@@ -107,19 +109,19 @@ def devices() -> None:
 def listen(
     session: Annotated[
         str,
-        typer.Argument(help="Name of the session, which may open later; by default the newest."),
+        typer.Argument(help="Name of the session. It may open later. Default: the newest."),
     ] = "",
     show: Annotated[
         Shown,
-        typer.Option(help="What to print; syllables and phones when they are final."),
+        typer.Option(help="What to print. Syllables and phones are printed once they are final."),
     ] = Shown.FAPS,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Record the frames: .fap, .csv, .jsonl or .glb."),
+        typer.Option("--output", "-o", help="File for the frames: .fap, .csv, .jsonl or .glb."),
     ] = None,
     form: Annotated[
         CurveForm,
-        typer.Option("--as", help="Values of the frames. Shapes are printed as lines of JSON."),
+        typer.Option("--as", help="Values of the frames. Shapes are printed as JSON lines."),
     ] = CurveForm.FAPS,
     control: Control = "",
 ) -> None:
@@ -138,11 +140,11 @@ def send(
         ),
     ],
     session: Annotated[
-        str, typer.Option(help="Name of the session; by default always the newest.")
+        str, typer.Option(help="Name of the session. Default: always the newest.")
     ] = "",
     control: Control = "",
 ) -> None:
-    """Send the face to avatars in other programs by VMC, Live Link Face, OSC or VTube Studio."""
+    """Animate avatars in other programs, over VMC, Live Link Face, OSC or VTube Studio's API."""
     from kouxing.services.cli.send import send_to
     from kouxing.services.senders.protocols import parse_target
     from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -162,7 +164,7 @@ def express(
         list[str] | None,
         typer.Argument(
             metavar="NAME=STRENGTH",
-            help=f"Strengths from 0 to 1. The names are {', '.join(ExpressionName)}.",
+            help=f"Expressions with strengths from 0 to 1: {', '.join(ExpressionName)}.",
         ),
     ] = None,
     hold: Annotated[
@@ -170,7 +172,7 @@ def express(
     ] = DEFAULT_HOLD_S,
     control: Control = "",
 ) -> None:
-    """Show expressions on the face of a session for a while. Without names, end them."""
+    """Show expressions on the face of a session. Without expressions, end those it shows."""
     from kouxing.shared.control_client import connect
 
     strengths = dict(map(_strength, expressions or ()))

@@ -22,12 +22,12 @@ def cluster(
     recognizers: Number = None,
     synthesizers: Number = None,
     address: Annotated[
-        str, typer.Option(help="Address of the Ray cluster; 'auto' is the cluster of this host.")
+        str, typer.Option(help="Address of the Ray cluster. 'auto': the cluster of this host.")
     ] = "auto",
     config: ConfigFile = None,
     assignments: ServiceAssignments = None,
 ) -> None:
-    """Start or stop workers on a Ray cluster until their numbers are right, then list them."""
+    """Scale the workers on a Ray cluster to the given numbers, then list them."""
     settings = read_settings(config, parse_assignments(assignments or []))
     try:
         from kouxing.services.cli.ray_workers import RayWorkers
@@ -43,4 +43,4 @@ def cluster(
         table = Table("worker", "host", box=box.SIMPLE)
         for name, host in workers.hosts().items():
             table.add_row(name, escape(host or "waits for a free core"))
-    Console().print(table if table.rows else "no worker runs on this cluster")
+    Console().print(table if table.rows else "no workers are running on this cluster")

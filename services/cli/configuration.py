@@ -44,16 +44,14 @@ command line, a list is a text with spaces between the items.
 
 
 def config(
-    service: Annotated[
-        str, typer.Argument(help=f"One of {', '.join(TABLES)}; by default all of them.")
-    ] = "",
+    service: Annotated[str, typer.Argument(help=f"One of {', '.join(TABLES)}. Default: all.")] = "",
     config: ConfigFile = None,
     assignments: Assignments = None,
     markdown: Annotated[
-        bool, typer.Option("--markdown", help="Print the documentation page instead.")
+        bool, typer.Option("--markdown", help="Print docs/configuration.md instead.")
     ] = False,
 ) -> None:
-    """Print all keys: meaning, allowed values, default, present value and its origin."""
+    """Print all keys with their meaning, allowed values, default, current value and its origin."""
     if service and service not in TABLES:
         raise UserError(f"there is no service {service!r}; choose one of {', '.join(TABLES)}")
     values = parse_assignments(assignments or [])

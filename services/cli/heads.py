@@ -22,7 +22,7 @@ from kouxing.shared.terminal import print_message
 _DRIVER_HEADS = Path(str(resources.files("kouxing.services.driver"))) / "head"
 _PAGE = Path(str(resources.files("kouxing.services.gateway"))) / "page"
 
-app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")
+app = typer.Typer(no_args_is_help=True, help="Export and import 3-D heads.")
 
 
 @app.command("export")
@@ -36,10 +36,10 @@ def export_head(
     ],
     head: HeadName = DEFAULT_HEAD,
     all_heads: Annotated[
-        bool, typer.Option("--all", help="Export all heads of the package for the page.")
+        bool, typer.Option("--all", help="Export all built-in heads, for the page.")
     ] = False,
 ) -> None:
-    """Write a head for an engine: a GLB with FAPs and ARKit shapes, or a VRM 1.0 avatar."""
+    """Write a head for a game engine: a GLB with FAPs and ARKit shapes, or a VRM 1.0 avatar."""
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head
 
@@ -57,13 +57,13 @@ def import_mesh(
     points: Annotated[
         Path,
         typer.Option(
-            help="MPEG-4 feature points: a file with lines 'point x y z' or 'point vertex' (the"
-            " first vertex is 0), or an XfaceEd .fdp file."
+            help="MPEG-4 feature points: a file of lines 'point x y z' or 'point vertex' (counted"
+            " from 0), or an XfaceEd .fdp file."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Head to write (.npz).")],
 ) -> None:
-    """Convert a mesh to a head that FAPs can move. Use it with --head."""
+    """Convert a mesh to a head that FAPs can move, for the option --head."""
     from kouxing.services.driver.head.import_head import import_head
 
     for remark in import_head(mesh, points, output):

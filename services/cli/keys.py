@@ -23,12 +23,12 @@ from kouxing.shared.keys import (
 )
 from kouxing.shared.terminal import print_message
 
-app = typer.Typer(no_args_is_help=True, help="Keys that may connect to the services.")
+app = typer.Typer(no_args_is_help=True, help="Manage the keys that may connect to the services.")
 
 
 @app.command()
 def init() -> None:
-    """Create all keys of a system on this machine: those of its services and of your commands."""
+    """Create all keys of a system on this machine, for its services and for your commands."""
     for kind in KINDS.values():
         load_key(kind.name, kind.key_roles)
     user_key()
@@ -37,20 +37,20 @@ def init() -> None:
 
 @app.command()
 def add(
-    name: Annotated[str, typer.Argument(help="Name of a machine, program or person.")],
+    name: Annotated[str, typer.Argument(help="Name of the machine, program or person.")],
     roles: Annotated[
         list[str] | None,
         typer.Option(
             "--role",
-            help="client (the default), operator, service:KIND, subscriber:SESSION or"
+            help="Role: client (the default), operator, service:KIND, subscriber:SESSION or"
             " 'subscriber:*'; repeatable.",
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write; by default NAME.key.")
+        Path | None, typer.Option("--output", "-o", help="File to write. Default: NAME.key.")
     ] = None,
 ) -> None:
-    """Create a key for another machine, and allow it at once."""
+    """Create a key for another machine, and allow it immediately."""
     roles = roles or [CLIENT]
     path = output or Path(f"{name}.key")
     add_key(name, roles, path)
@@ -71,7 +71,7 @@ def list_keys() -> None:
 
 
 @app.command()
-def revoke(name: Annotated[str, typer.Argument(help="Name in 'kouxing keys list'.")]) -> None:
-    """Revoke a key. Its connections end at once."""
+def revoke(name: Annotated[str, typer.Argument(help="Name, as in 'kouxing keys list'.")]) -> None:
+    """Revoke a key, and close its connections immediately."""
     revoke_key(name)
     print_message(f"revoked the key of {name}")

@@ -38,7 +38,7 @@ class PhoneFormat(StrEnum):
 
 Form = Annotated[
     PhoneFormat | None,
-    typer.Option("--format", help="Output format; by default from the file's suffix, or a table."),
+    typer.Option("--format", help="Output format. Default: from the output's suffix, or a table."),
 ]
 Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]
 _FORMAT_OF_SUFFIX = {
@@ -54,16 +54,16 @@ def render(
     output: Annotated[
         Path,
         typer.Argument(
-            help="A video (.mp4, .mov, .webm, or .webp without sound), one picture (.png), numbered"
-            " pictures (a folder, or a name with a number such as face%05d.png), or the curves of"
-            " the face (.fap, .csv, .jsonl, or .glb: the animated head)."
+            help="File to write: a video (.mp4, .mov, .webm, or .webp without sound), one picture"
+            " (.png), numbered pictures (a folder, or a pattern such as face%05d.png), curves"
+            " (.fap, .csv, .jsonl) or an animated head (.glb)."
         ),
     ],
     lips: Annotated[
         list[str] | None,
         typer.Option(
-            help="Lip model for a sound, such as learnt or dynamic-visemes. Repeat it to see faces"
-            " side by side."
+            help="Lip model, such as learnt or dynamic-visemes. Repeat the option to show several"
+            " faces side by side."
         ),
     ] = None,
     live: Annotated[
@@ -72,19 +72,19 @@ def render(
     text: Annotated[
         str | None,
         typer.Option(
-            help="Spoken text, or a file with it, in Chinese characters or pinyin. It improves the"
-            " lips. Only for recordings, because its phones are aligned with the whole sound."
+            help="Spoken text, or a file that contains it, in Chinese characters or pinyin. It is"
+            " aligned with the recording and improves the lips."
         ),
     ] = None,
     form: Annotated[
-        CurveForm, typer.Option("--as", help="Values of a curve file.")
+        CurveForm, typer.Option("--as", help="Values to write to a curve file.")
     ] = CurveForm.FAPS,
     head: HeadName = DEFAULT_HEAD,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "1280x720",
     background: Annotated[
         str, typer.Option(help="studio, transparent (not for .mp4), #rrggbb, or a color name.")
     ] = "studio",
-    camera: Annotated[Framing, typer.Option(help="What fills the picture.")] = Framing.FACE,
+    camera: Annotated[Framing, typer.Option(help="Part that fills the picture.")] = Framing.FACE,
     yaw: Annotated[
         float,
         typer.Option(min=-180, max=180, help="Camera angle toward the face's left, in degrees."),
@@ -95,15 +95,15 @@ def render(
     rate: Annotated[
         float | None,
         typer.Option(
-            min=1, max=240, help="Images per second; by default 25, or the rate of the .fap file."
+            min=1, max=240, help="Images per second. Default: 25, or the rate of the .fap file."
         ),
     ] = None,
-    sound: Annotated[Path | None, typer.Option(help="Sound for a .fap file.")] = None,
+    sound: Annotated[Path | None, typer.Option(help="Sound to add to a .fap file.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, in seconds.")] = None,
     mouth: MouthFile = None,
     expressiveness: Annotated[
         float | None,
-        typer.Option(min=0.5, max=2, help="Size of the mouth's movements; only for a sound."),
+        typer.Option(min=0.5, max=2, help="Size of the mouth movements; not for .fap files."),
     ] = None,
 ) -> None:
     """Make a video, pictures or curves from an audio, video or FAP file."""
@@ -177,13 +177,13 @@ def phones(
 def align(
     audio: Audio,
     text: Annotated[
-        str, typer.Argument(help="Spoken text, or a file with it, in Chinese characters or pinyin.")
+        str, typer.Argument(help="Spoken text or a text file, in Chinese characters or pinyin.")
     ],
     acoustic: Acoustic = "blocks",
     form: Form = None,
     output: Output = None,
 ) -> None:
-    """Find the times of the phones of a known text. The exit status is 1 if it does not fit."""
+    """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import does_not_fit, read_mono_16k, read_text
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
@@ -209,14 +209,14 @@ def lips(
         list[str],
         typer.Argument(
             metavar="[TEXT] OUTPUT",
-            help="Spoken text in Chinese characters or pinyin (without it, phones are recognized),"
-            " then the file to write: .svg or .png (the mouth at every key frame), .mp4, or .csv"
-            " (the contour).",
+            help="Spoken text in Chinese characters or pinyin, then the file to write: .svg or"
+            " .png (the mouth at every key frame), .mp4, or .csv (the contour). Without a text,"
+            " phones are recognized.",
         ),
     ],
     timing: Annotated[
         Timing | None,
-        typer.Option(help="How to time a text: energy and zero crossings, or forced alignment."),
+        typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
     ] = None,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Interpolate smoothly between key frames.")
@@ -229,10 +229,10 @@ def lips(
     ] = 21,
     speech_to_text: Annotated[
         Path | None,
-        typer.Option(help="Folder of a sherpa-onnx model that recognizes the text."),
+        typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text."),
     ] = None,
 ) -> None:
-    """Draw only the mouth, in two dimensions: for cartoons, teaching and papers."""
+    """Draw the mouth in two dimensions, for cartoons, teaching and papers."""
     from kouxing.services.cli.mouth_drawing import draw_mouth
 
     *text, output = text_and_output

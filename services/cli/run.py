@@ -33,28 +33,28 @@ BOUND_CONTROL = variable("control", "control")
 def run(
     config: ConfigFile = None,
     play: Annotated[
-        Path | None, typer.Option(help="Speak this file first, and record it as out/demo.mp4.")
+        Path | None, typer.Option(help="Play this file first, and record it as out/demo.mp4.")
     ] = None,
     stop_after: Annotated[
-        bool, typer.Option("--stop-after", help="Stop when the file has been played.")
+        bool, typer.Option("--stop-after", help="Stop after playing the file.")
     ] = False,
     head: HeadName = "",
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Port of the page; by default 8080.")
+        int | None, typer.Option(min=0, max=65535, help="Port of the page. Default: 8080.")
     ] = None,
     workers: Annotated[
         int,
         typer.Option(
             min=1,
             max=64,
-            help="Number of recognizers and of synthesizers. With two or more, another worker"
-            " takes over at once if one fails.",
+            help="Number of recognizers, and of synthesizers. With two or more, another worker"
+            " takes over immediately if one fails.",
         ),
     ] = 1,
     assignments: ServiceAssignments = None,
 ) -> None:
-    """Run all services on this machine, and restart those that crash."""
+    """Run all services on this machine, and restart any that crashes or hangs."""
     from kouxing.services.cli.supervisor import Supervisor
     from kouxing.shared.audio_file import open_audio
 

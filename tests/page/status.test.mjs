@@ -125,7 +125,7 @@ test("errors are translated by their code, others are shown as they are", () => 
 
 test("reduced quality and the head's rotation are described", () => {
   const drawing = { isCoarse: true, width: 550, height: 400 };
-  assert.match(drawingText(drawing), /no graphics card.*550 × 400/);
+  assert.match(drawingText(drawing), /No graphics card.*550 × 400/);
   assert.equal(drawingText({ ...drawing, isCoarse: false }), "");
   assert.equal(turnText({ left: 0.2, up: -0.3 }), "from the front");
   assert.equal(turnText({ left: -20, up: 10 }), "turned 20° to the right, 10° up");

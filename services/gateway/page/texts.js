@@ -202,7 +202,7 @@ export const TEXTS = {
     en: "The camera or the microphone is blocked. Allow both for this page and try again.",
     zh: "未允许使用摄像头和麦克风。请允许后重试。",
   },
-  cameraMissing: { en: "The camera or the microphone is missing. Plug it in and try again.", zh: "没有摄像头或麦克风。请接上后重试。" },
+  cameraMissing: { en: "No camera or microphone was found. Connect both and try again.", zh: "没有摄像头或麦克风。请接上后重试。" },
   cameraBusy: {
     en: "Another program uses the camera or the microphone. Close it and try again.",
     zh: "摄像头或麦克风被其他程序占用。请关闭后重试。",
