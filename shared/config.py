@@ -112,21 +112,21 @@ class ServiceConfig(BaseModel):
     """What to do instead of binding an unencrypted address that other machines can reach."""
 
     control: Endpoint = "tcp://127.0.0.1:5550"
-    """Address where control takes commands."""
+    """Address at which control accepts commands."""
     advertise: Host = ""
-    """Host name or address by which others reach this service, for example behind NAT. If empty,
-    the bound address; for 0.0.0.0, the address of this host that is used to reach control."""
+    """Host name or address at which others reach this service, for example behind NAT. If empty,
+    the bound address is used; for 0.0.0.0, the address from which this host reaches control."""
     insecure: Switch = False
-    """Accept unencrypted connections from anybody. docs/security.md describes the risks."""
+    """Accept unencrypted connections from anyone. docs/security.md describes the risks."""
     log_level: LogLevel = "info"
-    """Lowest level of the log lines that are written."""
+    """Lowest level of log messages to write."""
     instance: str = ""
-    """Name of this process; if empty, a name is made up."""
+    """Name of this process. If empty, a name is generated."""
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Port of the metrics for Prometheus (/metrics) and of the health check (/healthz), over plain
-    HTTP; 0: none. Services on one machine need different ports."""
+    """Port for Prometheus metrics (/metrics) and the health check (/healthz), over plain HTTP.
+    0 turns both off. Services on one machine need different ports."""
     metrics_host: Annotated[str, _HOST] = "127.0.0.1"
-    """Address to bind for the metrics; 0.0.0.0 lets other machines read them."""
+    """Address to bind for the metrics. With 0.0.0.0, other machines can read them."""
 
     @property
     def own_host(self) -> str:

@@ -77,7 +77,7 @@ def report(
     picture: Annotated[Path | None, typer.Option(help="File for box plots (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Print mean opinion scores, and the conditions that differ significantly."""
+    """Print mean opinion scores with 95 % confidence intervals."""
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.mos.report import draw_boxes, make_report, print_report
     from kouxing.evaluation.mos.store import read_answers

@@ -30,13 +30,13 @@ The sources of a value, from weakest to strongest:
 3. the environment: `KOUXING_<SERVICE>_<KEY>`, such as `KOUXING_RECOGNIZER_MIN_CONFIDENCE`
 4. the command line: `--set KEY=VALUE` of a service, `--set SERVICE.KEY=VALUE` of `kouxing run`
 
-Every service also has the keys of `[common]`. To set one for all services, use the table `[common]`
-or `KOUXING_<KEY>`.
+Every service also has the keys of `[common]`. To set such a key for all services, use the table
+`[common]` or the variable `KOUXING_<KEY>`.
 Within one source, a value for one service overrides the value for all services.
 An unknown key, table or variable is an error.
 
-The TOML file has lists, such as `senders = ["vmc://", "vts://"]`. In the environment and on the
-command line, a list is a text with spaces between the items.
+In a TOML file, write a list as `senders = ["vmc://", "vts://"]`. In the environment and on the
+command line, separate the items of a list with spaces.
 
 `kouxing config` prints a TOML file with all keys, their values and the origin of each value.
 `kouxing config recognizer --set min_confidence=0.8` does the same for one service.
@@ -53,7 +53,7 @@ def config(
 ) -> None:
     """Print all keys with their meaning, allowed values, default, current value and its origin."""
     if service and service not in TABLES:
-        raise UserError(f"there is no service {service!r}; choose one of {', '.join(TABLES)}")
+        raise UserError(f"unknown service {service!r}; choose one of {', '.join(TABLES)}")
     values = parse_assignments(assignments or [])
     if markdown:
         text = markdown_page()

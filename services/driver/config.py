@@ -28,26 +28,26 @@ class DriverConfig(FaceConfig):
     """The driver's configuration keys."""
 
     view: Literal["auto", "window", "none"] = "auto"
-    """Whether to open a window; with auto, if there is a display."""
+    """Whether to open a window. auto opens one if a display is available."""
     session: Annotated[
         str,
         Field(pattern="^[A-Za-z0-9_-]{1,64}$"),
         Form("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
     ] = "newest"
-    """The session to show; "newest" is the one that opened last."""
+    """Session to show. "newest" shows the session that was opened last."""
     out: str = "out"
     """Folder for recorded videos."""
     head: str = "woman"
-    """Name of a built-in head, an imported .npz, or a .glb with morph targets."""
+    """Name of a built-in head, an imported .npz file, or a .glb file with morph targets."""
     background: str = "studio"
-    """studio, #rrggbb, or the name of a color."""
+    """Background: studio, #rrggbb, or a color name."""
     camera: Framing = Framing.FACE
     """The part of the head that fills the picture."""
     virtual_camera: Switch = False
-    """Whether other programs can use the picture as a camera."""
+    """Whether to offer the picture to other programs as a camera."""
     width_px: Annotated[int, Field(ge=16, le=7680, multiple_of=2)] = 1280
-    """Width of window and video; even because of H.264."""
+    """Width of the window and of videos. H.264 requires an even number."""
     height_px: Annotated[int, Field(ge=16, le=4320, multiple_of=2)] = 720
-    """Height of window and video; even because of H.264."""
+    """Height of the window and of videos. H.264 requires an even number."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
     """Images per second."""

@@ -59,22 +59,22 @@ class GatewayConfig(FaceConfig):
     port: BoundPort = 8080
     """Port at which the page is served; 0 uses any free port."""
     head: str = ""
-    """GLB file to show as the page's head, from 'kouxing head export'."""
+    """GLB file with the page's head, written by 'kouxing head export'."""
     certificate: str = ""
-    """PEM file with a certificate and its private key, for https. If the file does not exist, it is
-    created with a self-signed certificate."""
+    """PEM file with a certificate and its private key, for https. If the file does not exist, the
+    gateway creates it with a self-signed certificate."""
     token: str = ""
-    """Secret that the page's address must contain. If empty, one is created when a certificate or
-    plain_http is set."""
+    """Secret that the page's address must contain. If empty, the gateway creates a token when
+    certificate or plain_http is set."""
     plain_http: Switch = False
-    """Serve unencrypted http at an address that other machines can reach. Use it only behind a
-    proxy that encrypts, or for a port that is published to this machine only."""
+    """Serve unencrypted http at an address that other machines can reach. Use this only behind an
+    encrypting proxy, or for a port that is published only to this machine."""
     names: Names = ()
-    """Other host names of the page, for example a proxy's."""
+    """Additional host names of the page, such as that of a proxy."""
     allowed_origins: Origins = ()
-    """Origins of other pages that may connect to the page's sessions."""
+    """Origins of other pages that may connect to the gateway's sessions."""
     frame_ancestors: Origins = ()
-    """Origins of other pages that may show this page in a frame."""
+    """Origins of other pages that may embed this page in a frame."""
     senders: Targets = ()
     """Programs to send the face to: vmc://, livelink://, osc:// and vts:// addresses, as for
     'kouxing send'."""

@@ -16,16 +16,17 @@ class RecognizerConfig(ServiceConfig):
     """The keys of the recognizer."""
 
     audio: BoundEndpoint = "tcp://127.0.0.1:5560"
-    """Where clients send the audio of live sessions."""
+    """Endpoint to which clients send the audio of live sessions."""
     phones: BoundEndpoint = "tcp://127.0.0.1:5561"
-    """Where phones and audio are published."""
+    """Endpoint that publishes phones, lip positions, speech and sound."""
     unpaced_audio: BoundEndpoint = "tcp://127.0.0.1:5562"
-    """Where clients send the audio of sessions that are not paced. Live audio takes precedence."""
+    """Endpoint to which clients send the audio of sessions that are not paced. Live audio takes
+    precedence."""
     acoustic: str = "blocks"
     """Acoustic model: blocks (fewest errors), neural (half the processor time), gmm, or a file."""
     look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0
-    """Future audio that the neural model waits for, ms: 10, 30, 60, 100, 200. The neural model also
-    runs alongside blocks."""
+    """Future audio that the neural model waits for, in ms: 10, 30, 60, 100 or 200. The neural model
+    also runs alongside blocks."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
         default_factory=DefaultBy(
             "acoustic",
@@ -33,7 +34,7 @@ class RecognizerConfig(ServiceConfig):
             _DEFAULT_RULE.num_stable_frames,
         )
     )
-    """Frames that must agree before a phone is emitted (N of Li 2011, who uses 3)."""
+    """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011)."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         default_factory=DefaultBy(
             "acoustic",
@@ -41,7 +42,7 @@ class RecognizerConfig(ServiceConfig):
             _DEFAULT_RULE.min_confidence,
         )
     )
-    """Confidence that each of these frames must reach; 0 is the rule of Li 2011."""
+    """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011."""
 
     @property
     def output_rule(self) -> OutputRuleConfig:

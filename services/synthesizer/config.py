@@ -27,7 +27,7 @@ class SynthesizerConfig(FaceConfig):
     """The synthesizer's configuration keys."""
 
     phone_input: BoundEndpoint = "tcp://127.0.0.1:5570"
-    """Endpoint for phones from the recognizer."""
+    """Endpoint that receives phones and lip positions from recognizers."""
     faps: BoundEndpoint = "tcp://127.0.0.1:5571"
     """Endpoint that publishes FAP frames."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
@@ -35,10 +35,10 @@ class SynthesizerConfig(FaceConfig):
     lips: Annotated[str, AfterValidator(_check_lip_model), Form(" or ".join(lip_models()))] = (
         DEFAULT_LIP_MODEL
     )
-    """Lip model; a client can choose another one."""
+    """Default lip model. A client can choose another one for its session."""
     delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(
         default_factory=DefaultBy("lips", _DELAYS_MS, _DELAYS_MS[DEFAULT_LIP_MODEL])
     )
-    """How much later than its audio a frame is made, in steps of 20 ms."""
+    """Time from a frame's audio until the frame is made, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
-    """Size of the mouth movements; 1 leaves the lip model unchanged. Closures stay closed."""
+    """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""

@@ -13,4 +13,4 @@ class FaceConfig(ServiceConfig):
     """The keys of services that make or show a face."""
 
     idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
-    """Seed of the idle motion: blinks, gaze, brows and head motion; 0: no idle motion."""
+    """Random seed of the idle motion: blinks, gaze, brows and head motion. 0 turns it off."""
