@@ -165,10 +165,7 @@ def add_key(name: str, roles: Collection[str], path: Path) -> None:
 
 
 def revoke_key(name: str) -> None:
-    """Revoke a key.
-
-    Raises ``UserError`` if no key has this name.
-    """
+    """Revoke a key; raise ``UserError`` if no key has this name."""
     with _locked_folder() as folder:
         grants = _parse_grants(folder / _ALLOWED)  # unchecked, so that it works with too many keys
         kept = {public: grant for public, grant in grants.items() if grant.name != name}

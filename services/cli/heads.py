@@ -72,10 +72,7 @@ def import_mesh(
 
 
 def export_page_heads(folder: Path) -> None:
-    """Export all heads of the package.
-
-    Raises ``UserError`` if a file cannot be written.
-    """
+    """Export all heads of the package; raise ``UserError`` if a file cannot be written."""
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head
 

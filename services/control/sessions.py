@@ -50,10 +50,7 @@ class Sessions:
         return self._records.get(name)
 
     def find(self, name: str) -> SessionRecord:
-        """Return a session.
-
-        Raises ``Refusal`` if there is no such session.
-        """
+        """Return a session; raise ``Refusal`` if there is no such session."""
         record = self._records.get(name)
         if record is None:
             text = f"there is no session {name!r}; open it first"
