@@ -16,11 +16,11 @@ class FakeStorage {
 
 test("preferences are stored for the next visit", () => {
   const storage = new FakeStorage();
-  const preferences = new Preferences(storage);
+  const preferences = new Preferences(() => storage);
   assert.equal(preferences.get("lips"), null);
   preferences.set("lips", "ferguson");
   preferences.set("expressiveness", 1.2);
-  const later = new Preferences(storage);
+  const later = new Preferences(() => storage);
   assert.deepEqual([later.get("lips"), later.get("expressiveness")], ["ferguson", 1.2]);
 });
 
@@ -31,7 +31,7 @@ test("preferences need no storage, and invalid content is ignored", () => {
   for (const text of ["{", "null", "7"]) {
     const storage = new FakeStorage();
     storage.items["kouxing.choices"] = text;
-    assert.equal(new Preferences(storage).get("lips"), null, text);
+    assert.equal(new Preferences(() => storage).get("lips"), null, text);
   }
 });
 
@@ -73,13 +73,13 @@ test("every text that the page uses exists, and every text is used", () => {
 test("a mouth profile is stored until it is deleted", () => {
   const storage = new FakeStorage();
   const learned = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
-  new MouthProfileStore(storage).keep(learned);
-  const later = new MouthProfileStore(storage);
+  new MouthProfileStore(() => storage).keep(learned);
+  const later = new MouthProfileStore(() => storage);
   assert.deepEqual(later.current, learned);
   later.keep(null);
   assert.deepEqual(storage.items, {});
   assert.equal(later.current, null);
-  assert.equal(new MouthProfileStore(storage).current, null);
+  assert.equal(new MouthProfileStore(() => storage).current, null);
 });
 
 test("a mouth profile needs no storage, and invalid content is ignored", () => {
@@ -89,6 +89,6 @@ test("a mouth profile needs no storage, and invalid content is ignored", () => {
   for (const text of ["{", "1", '{"profile": 5}', '{"profile": ""}']) {
     const storage = new FakeStorage();
     storage.items["kouxing.voice"] = text;
-    assert.equal(new MouthProfileStore(storage).current, null);
+    assert.equal(new MouthProfileStore(() => storage).current, null);
   }
 });

@@ -100,13 +100,7 @@ export class ImageQueue {
     return !this.#isDrawing && this.#drawRate.isDue(nowMs);
   }
 
-  /**
-   * Draw an image.
-   *
-   * @param nowMs time of its face
-   * @param render function that draws it
-   * @param onVisible called with the time at which it becomes visible, ms
-   */
+  /** Draw the face of a time with render(). onVisible gets the time at which it becomes visible, ms. */
   draw(nowMs, render, onVisible = () => {}) {
     this.#isDrawing = true;
     const startMs = performance.now();

@@ -97,9 +97,7 @@ export class Head {
     this.#setCamera(info.camera);
   }
 
-  /**
-   * Draw for a video: on a CSS color and with a constant number of pixels. null ends the video.
-   */
+  /** Draw for a video: on a CSS color and with a constant number of pixels. null ends the video. */
   film(color) {
     this.#isFilmed = color !== null;
     this.#renderer.setClearColor(color ?? 0, color === null ? 0 : 1);
@@ -120,11 +118,7 @@ export class Head {
     rotateJoints(this.#joints, faps);
   }
 
-  /**
-   * Draw if the face has changed and it is time for an image.
-   *
-   * @param onVisible called with the time at which the image becomes visible, ms
-   */
+  /** Draw if the face has changed and it is time for an image. */
   draw(nowMs, onVisible) {
     if (!this.#needsDrawing || !this.#images.isDue(nowMs)) return;
     if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize(); // this clears the canvas

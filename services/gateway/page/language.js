@@ -15,12 +15,7 @@ export function languageFor(preferred) {
   return known.find((name) => name === "zh" || name === "en") ?? "en";
 }
 
-/**
- * Return a text of the table in the page's language.
- *
- * @param {string} key of TEXTS; without an entry, the text is the part after the last dot
- * @param {object} values by the names of their placeholders
- */
+/** Return a text of TEXTS with values. Without an entry, it is the part of the key after the last dot. */
 export function say(key, values = {}) {
   const text = TEXTS[key]?.[language] ?? key.split(".").at(-1);
   return text.replace(/\{(\w+)\}/g, (_, name) => values[name]);

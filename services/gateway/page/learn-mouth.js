@@ -31,10 +31,7 @@ export class MouthLesson {
   #recording = null; // landmark file that was not used yet
   #learned = null; // profile that the user has neither kept nor discarded
 
-  /**
-   * @param profiles MouthProfileStore
-   * @param handlers { opened(), closed(), profileChanged() }
-   */
+  /** @param handlers { opened(), closed(), profileChanged() } */
   constructor(profiles, handlers) {
     this.#profiles = profiles;
     this.#handlers = handlers;

@@ -20,9 +20,8 @@ const STATUS_INTERVAL_MS = 250;
 
 const query = new URLSearchParams(location.search);
 const offers = await (await fetch("offers.json")).json();
-const storage = localStorageOrNull();
-const preferences = new Preferences(storage);
-const mouthProfiles = new MouthProfileStore(storage);
+const preferences = new Preferences(() => localStorage);
+const mouthProfiles = new MouthProfileStore(() => localStorage);
 const notice = new Notice();
 const meter = new LevelMeter();
 const gateway = new GatewayState();
@@ -81,26 +80,21 @@ const socket = new ViewerSocket(
 );
 
 function handleMessage(message) {
-  switch (message.type) {
-    case "session":
-      showSession(message);
-      break;
-    case "lips":
+  const handle = {
+    session: showSession,
+    syllable: () => caption.add(message),
+    phone: () => caption.add(message),
+    error: showError,
+    lips() {
       gateway.lips = message.lips;
       showLips();
-      break;
-    case "status":
+    },
+    status() {
       gateway.missing = message.missing;
       statusBar.show();
-      break;
-    case "syllable":
-    case "phone":
-      caption.add(message);
-      break;
-    case "error":
-      showError(message);
-      break;
-  }
+    },
+  }[message.type];
+  handle?.(message);
 }
 
 function showSession(message) {
@@ -143,14 +137,6 @@ function sendExpressiveness() {
 
 function showMouthProfile() {
   element("learn").setAttribute("aria-pressed", mouthProfiles.current !== null);
-}
-
-function localStorageOrNull() {
-  try {
-    return window.localStorage;
-  } catch {
-    return null; // the browser forbids it
-  }
 }
 
 let statusMs = 0; // when the status was shown last

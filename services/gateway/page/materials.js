@@ -64,14 +64,7 @@ function lightUniforms(name, gltf, cel) {
   };
 }
 
-/**
- * Return the driver's shading for a part of the head.
- *
- * @param name of the part
- * @param gltf the part's material in the file; its texture is set to the cheapest filter
- * @param head node whose rotation the skin follows
- * @param cel whether the head is a cartoon
- */
+/** Return the driver's shading for a part. Its skin follows the rotation of the node `head`. */
 export function plainMaterial(name, gltf, head, cel) {
   gltf.map.colorSpace = THREE.NoColorSpace;
   gltf.map.minFilter = THREE.LinearMipmapNearestFilter;

@@ -1,5 +1,5 @@
-// What the page stores for the user's next visit. The browser's localStorage is injected; it is null if
-// the browser forbids it.
+// What the page stores for the user's next visit. The browser's localStorage is injected as a function; it
+// throws if the browser forbids it.
 
 /** A value in the storage. It lasts until the page closes if nothing can be stored. */
 class StoredValue {
@@ -13,7 +13,7 @@ class StoredValue {
 
   read() {
     try {
-      return JSON.parse(this.#storage?.getItem(this.#key) ?? "null");
+      return JSON.parse(this.#storage().getItem(this.#key));
     } catch {
       return null; // not written by this page
     }
@@ -22,10 +22,10 @@ class StoredValue {
   /** Store a value; null deletes it. */
   write(value) {
     try {
-      if (value === null) this.#storage?.removeItem(this.#key);
-      else this.#storage?.setItem(this.#key, JSON.stringify(value));
+      if (value === null) this.#storage().removeItem(this.#key);
+      else this.#storage().setItem(this.#key, JSON.stringify(value));
     } catch {
-      // the storage is full
+      // the storage is full or forbidden
     }
   }
 }
