@@ -1,7 +1,5 @@
 /** Set of blend shapes. */
 export type ShapeSet = "arkit" | "oculus" | "vrm";
-/** Number of FAPs. */
-export const NUM_FAPS: 68;
 
 /** Media time: samples at 16 kHz since the session's first sample. */
 export type MediaTime = number;
@@ -102,17 +100,6 @@ export function readRecording(text: string): {
   names: string[] | null;
   frames: [MediaTime, Float32Array][];
 };
-
-/** Read one of the gateway's binary messages; null for an unknown type. */
-export function readMessage(
-  data: ArrayBuffer,
-):
-  | { mediaTime: MediaTime; faps: Float32Array }
-  | { mediaTime: MediaTime; weights: Float32Array }
-  | { mediaTime: MediaTime; samples: Int16Array }
-  | { restWeights: Float32Array }
-  | { rest: Float32Array }
-  | null;
 
 /** Frames or weights in order of media time, with interpolation. */
 export class FapTrack {

@@ -7,7 +7,7 @@ import base64
 import io
 import os
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from kouxing.services.gateway.http import MAX_UPLOAD_BYTES, make_application
 from kouxing.services.gateway.learn_mouth import MouthLearner
 from kouxing.services.mouth_profiles.worker import Learn
 from kouxing.shared.errors import UserError
+from tests.process.gateway_system import async_test
 
 pytestmark = pytest.mark.process
 
@@ -71,17 +72,9 @@ async def serve(learn: Learn) -> AsyncIterator[Gateway]:
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     address = f"http://127.0.0.1:{runner.addresses[0][1]}/learn-mouth"
-    async with aiohttp.ClientSession() as http:
+    async with aiohttp.ClientSession() as http, asyncio.timeout(100):
         yield Gateway(learner, address, http)
     await runner.cleanup()
-
-
-def run(learn: Learn, use: Callable[[Gateway], Coroutine[None, None, None]]) -> None:
-    async def serve_and_use() -> None:
-        async with serve(learn) as gateway:
-            await asyncio.wait_for(use(gateway), 100)
-
-    asyncio.run(serve_and_use())
 
 
 async def process_in(path: Path) -> int:
@@ -96,12 +89,11 @@ async def wait_until_ended(process: int) -> None:
         await asyncio.sleep(0.02)
 
 
-def test_answers_with_the_profile_and_its_figures() -> None:
-    async def use(gateway: Gateway) -> None:
+@async_test
+async def test_answers_with_the_profile_and_its_figures() -> None:
+    async with serve(reverse) as gateway:
         profile = base64.b64encode(b"cba").decode()
         assert await gateway.post() == (200, {"mouth_profile": profile, "after": {"opening": 0.5}})
-
-    run(reverse, use)
 
 
 @pytest.mark.parametrize(
@@ -112,34 +104,34 @@ def test_answers_with_the_profile_and_its_figures() -> None:
         (crash, "learning failed; see the gateway's log"),
     ],
 )
-def test_answers_with_the_error(learn: Learn, error: str) -> None:
-    async def use(gateway: Gateway) -> None:
+@async_test
+async def test_answers_with_the_error(learn: Learn, error: str) -> None:
+    async with serve(learn) as gateway:
         assert await gateway.post() == (422, {"error": error})
         assert await gateway.post() == (422, {"error": error})  # and accepts the next one
 
-    run(learn, use)
 
-
-def test_rejects_a_recording_that_is_too_large() -> None:
-    async def use(gateway: Gateway) -> None:
+@async_test
+async def test_rejects_a_recording_that_is_too_large() -> None:
+    async with serve(reverse) as gateway:
         status, answer = await gateway.post(bytes(MAX_UPLOAD_BYTES + 1))
         assert (status, answer) == (413, {"error": "the recording is larger than 8 MiB"})
         assert (await gateway.post(bytes(MAX_UPLOAD_BYTES)))[0] == 200
 
-    run(reverse, use)
 
-
-def test_rejects_pages_of_other_origins() -> None:
-    async def use(gateway: Gateway) -> None:
+@async_test
+async def test_rejects_pages_of_other_origins() -> None:
+    async with serve(reverse) as gateway:
         origin = {"Origin": "http://evil.example"}
         async with gateway.http.post(gateway.address, data=b"abc", headers=origin) as answer:
             assert answer.status == 403
 
-    run(reverse, use)
 
-
-def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(tmp_path: Path) -> None:
-    async def use(gateway: Gateway) -> None:
+@async_test
+async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
+    tmp_path: Path,
+) -> None:
+    async with serve(hang) as gateway:
         path = tmp_path / "process"
         first = asyncio.create_task(gateway.post(str(path).encode()))
         process = await process_in(path)
@@ -153,25 +145,22 @@ def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(tmp_pat
         assert not gateway.learner.is_learning
         assert await gateway.post() == (503, {"error": "the gateway is stopping"})
 
-    run(hang, use)
 
-
-def test_stops_learning_at_the_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@async_test
+async def test_stops_learning_at_the_time_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(learn_mouth, "LEARNING_LIMIT_S", 0.5)
-
-    async def use(gateway: Gateway) -> None:
+    async with serve(hang) as gateway:
         recording = str(tmp_path / "process").encode()
         assert await gateway.post(recording) == (422, {"error": "learning took longer than 0.5 s"})
 
-    run(hang, use)
 
-
-def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> None:
-    async def use(gateway: Gateway) -> None:
+@async_test
+async def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> None:
+    async with serve(hang) as gateway:
         path = tmp_path / "process"
         request = asyncio.create_task(gateway.post(str(path).encode()))
         process = await process_in(path)
         request.cancel()
         await wait_until_ended(process)
-
-    run(hang, use)

@@ -1,6 +1,6 @@
 // The API in TypeScript. Only the types are checked.
 
-import { FapTrack, Playout, Speaker, Viewer, readMessage, readRecording } from "kouxing-client";
+import { FapTrack, Playout, Speaker, Viewer, readRecording } from "kouxing-client";
 import type { KouxingFace } from "kouxing-client/face";
 
 const gateway = "http://localhost:8080";
@@ -27,8 +27,7 @@ viewer.send({ express: { joy: 0.5 } });
 viewer.close();
 
 const [[time, values]] = readRecording("").frames;
-const message = readMessage(new ArrayBuffer(16));
-if (message !== null && "samples" in message) console.log(message.samples.length, time, values.length);
+console.log(time, values.length);
 
 const face: KouxingFace = document.createElement("kouxing-face");
 face.addEventListener("session", ({ detail }) => console.log(detail.epoch));
