@@ -45,7 +45,6 @@ MISSING = (
 @dataclass(slots=True, eq=False)
 class _Client:
     shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
-    quota: contextlib.ExitStack  # closing it releases the client's share of the quota
     peer: Peer | None = None
     session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session
@@ -87,29 +86,27 @@ class WhipClients:
             shape_encoder = parse_shape_query(request.query)
         except UserError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
-        quota = contextlib.ExitStack()
-        quota.enter_context(self._quota.hold(request))
-        name, client = secrets.token_urlsafe(12), _Client(shape_encoder, quota)
-        self._clients[name] = client
-        try:
-            client.peer = await self._make_peer(client)
-            answer = await client.peer.answer(offer)
-        except UserError as error:
-            await self._remove(name)
-            raise web.HTTPUnprocessableEntity(text=f"{error}\n") from None
-        except BaseException:
-            await self._remove(name)
-            raise
-        opened: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        task = asyncio.create_task(self._stream(name, client, client.peer, opened))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        try:
-            await opened
-        except KouxingError as error:
-            wait_s = error.retry_after_s if isinstance(error, Refused) else 0.0
-            headers = {"Retry-After": str(math.ceil(wait_s))} if wait_s else {}
-            raise web.HTTPServiceUnavailable(text=f"{error}\n", headers=headers) from None
+        name, client = secrets.token_urlsafe(12), _Client(shape_encoder)
+        async with contextlib.AsyncExitStack() as stack:
+            stack.enter_context(self._quota.hold(request))
+            self._clients[name] = client
+            stack.push_async_callback(self._remove, name)
+            try:
+                client.peer = peer = await self._make_peer(client)
+                answer = await peer.answer(offer)
+                opening = self._audio_sessions.open(
+                    encoding="s16le", sample_rate_hz=peer.rate_hz, num_channels=peer.num_channels
+                )
+                client.session = session = await stack.enter_async_context(opening)
+            except UserError as error:
+                raise web.HTTPUnprocessableEntity(text=f"{error}\n") from None
+            except KouxingError as error:
+                wait_s = error.retry_after_s if isinstance(error, Refused) else 0.0
+                headers = {"Retry-After": str(math.ceil(wait_s))} if wait_s else {}
+                raise web.HTTPServiceUnavailable(text=f"{error}\n", headers=headers) from None
+            task = asyncio.create_task(self._stream(client, peer, session, stack.pop_all()))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
         headers = {"Location": f"{request.path}/{name}"}
         return web.Response(status=201, text=answer, content_type=SDP, headers=headers)
 
@@ -146,32 +143,24 @@ class WhipClients:
         return peer
 
     async def _stream(
-        self, name: str, client: _Client, peer: Peer, opened: asyncio.Future[None]
+        self,
+        client: _Client,
+        peer: Peer,
+        session: AudioSession,
+        stack: contextlib.AsyncExitStack,
     ) -> None:
-        """Open a session for a client and stream its sound until it disconnects."""
-        try:
-            async with self._audio_sessions.open(
-                encoding="s16le", sample_rate_hz=peer.rate_hz, num_channels=peer.num_channels
-            ) as session:
-                client.session = session
-                opened.set_result(None)
-                LOG.info("a WebRTC client is streaming", extra={"session": session.name})
-                async for num_lost, pcm, num_frames in peer.sound():
-                    session.skip(num_lost)
-                    session.send(pcm, num_frames)
-                    for error in session.errors():
-                        self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
-                client.is_ending = True
-        except Exception as error:
-            if opened.done():
-                raise
-            opened.set_exception(error)
-        finally:
-            await self._remove(name)
+        """Stream a client's sound into its session until it disconnects, then close the stack."""
+        async with stack:
+            LOG.info("a WebRTC client is streaming", extra={"session": session.name})
+            async for num_lost, pcm, num_frames in peer.sound():
+                session.skip(num_lost)
+                session.send(pcm, num_frames)
+                for error in session.errors():
+                    self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
+            client.is_ending = True
 
     async def _remove(self, name: str) -> None:
         client = self._clients.pop(name)
-        client.quota.close()
         for task in client.tasks:
             task.cancel()
         if client.peer is not None:

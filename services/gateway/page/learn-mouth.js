@@ -79,6 +79,7 @@ export class MouthLesson {
 
   #show(step) {
     dialog.dataset.step = step;
+    for (const section of dialog.querySelectorAll("section")) section.hidden = section.dataset.step !== step;
   }
 
   #fail(text) {

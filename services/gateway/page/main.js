@@ -27,7 +27,7 @@ const meter = new LevelMeter();
 const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {
   heads: (name) => stage.load(name),
-  lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.chooseLips(name)),
+  lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLips(name)),
   expressiveness: sendExpressiveness,
   express: (strengths) => socket.send({ express: strengths }),
 });
@@ -48,7 +48,7 @@ const speech = new SpeechControls(sound, {
   },
 });
 const player = new Player(sound, (nowMs, mediaTime) =>
-  gateway.session === speech.session ? speech.ageMs(nowMs, mediaTime) : null,
+  gateway.session === speech.session ? speech.microphone.ageMs(nowMs, mediaTime) : null,
 );
 const stage = new Stage(player.faps, sound, {
   loaded: () => player.playout.reset(),

@@ -13,7 +13,7 @@ export class Player {
   restFaps; // shown while no session moves the face
   numFrames = 0; // received
   #track = new FapTrack();
-  #activity = new StreamActivity();
+  activity = new StreamActivity();
   #streamFaps;
   #imageDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to the image
   #frameDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to its frame
@@ -45,7 +45,7 @@ export class Player {
   addFrame(mediaTime, faps) {
     const nowMs = performance.now();
     if (this.#track.push(mediaTime, faps)) this.playout.frameArrived(nowMs, mediaTime);
-    this.#activity.frameArrived(nowMs);
+    this.activity.frameArrived(nowMs);
     this.#addVoiceAge(this.#frameDelays, nowMs, mediaTime);
     this.numFrames++;
   }
@@ -54,12 +54,8 @@ export class Player {
     const nowMs = performance.now();
     this.playout.soundArrived(nowMs, mediaTime, samples.length);
     this.#sync(nowMs); // nothing else calls it while the page is hidden
-    this.#activity.soundArrived(nowMs);
+    this.activity.soundArrived(nowMs);
     this.#sound.push(mediaTime, samples);
-  }
-
-  isLive(nowMs) {
-    return this.#activity.isLive(nowMs);
   }
 
   /**
@@ -74,7 +70,7 @@ export class Player {
     this.#sync(nowMs);
     const mediaTime = this.playout.mediaAt(nowMs + imageDelayMs);
     const frameTime = mediaTime === null ? null : this.#track.sample(mediaTime, this.#streamFaps);
-    const share = this.#activity.update(nowMs, frameTime !== null);
+    const share = this.activity.update(nowMs, frameTime !== null);
     return { mediaTime, frameTime, hasChanged: this.#mix(share) };
   }
 
@@ -107,7 +103,7 @@ export class Player {
   }
 
   #addVoiceAge(delays, nowMs, mediaTime) {
-    const ageMs = this.isLive(nowMs) ? this.#voiceAgeMs(nowMs, mediaTime) : null;
+    const ageMs = this.activity.isLive(nowMs) ? this.#voiceAgeMs(nowMs, mediaTime) : null;
     if (ageMs !== null) delays.add(nowMs, ageMs);
   }
 

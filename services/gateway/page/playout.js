@@ -37,7 +37,7 @@ export class Playout {
   isAudible = true;
   outputLatencyMs = 0; // from the audio thread to the loudspeaker; sound is played earlier by this
   imageDelayMs = 0; // from computing a face until its image is visible; it is drawn earlier by this
-  #offsetMs = null;
+  offsetMs = null; // read only
   #startMs = 0; // when the first offset was set
   #targetMs = null; // of the offset
   #adjustedMs = 0; // when the target was set
@@ -50,7 +50,7 @@ export class Playout {
 
   /** Start again: another session, or the stream paused. */
   reset() {
-    this.#offsetMs = null;
+    this.offsetMs = null;
     this.#targetMs = null;
     this.#lateSinceMs = null;
     // Lateness: arrival - media time, ms.
@@ -59,25 +59,21 @@ export class Playout {
     this.soundEnds = new SlidingWindow(WINDOW_MS);
   }
 
-  get offsetMs() {
-    return this.#offsetMs;
-  }
-
   /** How long sound waits for its image, ms; null before any sound. */
   get delayMs() {
-    if (this.#offsetMs === null || this.soundEnds.count === 0) return null;
-    return this.#offsetMs - this.soundEnds.percentile(0.05);
+    if (this.offsetMs === null || this.soundEnds.count === 0) return null;
+    return this.offsetMs - this.soundEnds.percentile(0.05);
   }
 
   /** How long after its arrival a frame is visible, ms; null before any frame. */
   get frameWaitMs() {
-    if (this.#offsetMs === null || this.frames.count === 0) return null;
-    return this.#offsetMs - this.frames.percentile(0.5);
+    if (this.offsetMs === null || this.frames.count === 0) return null;
+    return this.offsetMs - this.frames.percentile(0.5);
   }
 
   /** Media time that is due at a time, samples; null before the first arrival. */
   mediaAt(nowMs) {
-    return this.#offsetMs === null ? null : (nowMs - this.#offsetMs) * SAMPLES_PER_MS;
+    return this.offsetMs === null ? null : (nowMs - this.offsetMs) * SAMPLES_PER_MS;
   }
 
   /** Record the arrival of a frame. Its media time must be greater than that of the frame before. */
@@ -101,10 +97,10 @@ export class Playout {
   /** Move the offset towards its target. Call it for every image. */
   adjust(nowMs) {
     this.#glide(nowMs);
-    if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
+    if (this.offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
     if (this.frames.count < MIN_FRAMES) return;
     this.#adjustedMs = nowMs;
-    if (this.frames.maxSince(nowMs - ADJUST_EVERY_MS) < this.#offsetMs - JUMP_MS) {
+    if (this.frames.maxSince(nowMs - ADJUST_EVERY_MS) < this.offsetMs - JUMP_MS) {
       this.reset(); // delayed data has arrived, and the stream is on time again
       return;
     }
@@ -116,23 +112,23 @@ export class Playout {
       latestMs = Math.max(latestMs, soundMs);
     }
     this.#targetMs = latestMs + marginMs;
-    const errorMs = this.#targetMs - this.#offsetMs;
-    if (Math.abs(errorMs) > leapMs) this.#offsetMs += errorMs / 2;
+    const errorMs = this.#targetMs - this.offsetMs;
+    if (Math.abs(errorMs) > leapMs) this.offsetMs += errorMs / 2;
   }
 
   #glide(nowMs) {
     const maxMs = MAX_GLIDE * (nowMs - this.#glidedMs);
     this.#glidedMs = nowMs;
     if (this.#targetMs === null) return;
-    const errorMs = this.#targetMs - this.#offsetMs;
-    this.#offsetMs += Math.max(-maxMs, Math.min(maxMs, errorMs));
+    const errorMs = this.#targetMs - this.offsetMs;
+    this.offsetMs += Math.max(-maxMs, Math.min(maxMs, errorMs));
   }
 
   /** Set the first offset. Queued data arrives in a burst, and its end gives the best estimate. */
   #start(nowMs, offsetMs) {
-    if (this.#offsetMs === null) this.#startMs = nowMs;
+    if (this.offsetMs === null) this.#startMs = nowMs;
     if (nowMs - this.#startMs < LATE_MS) {
-      this.#offsetMs = Math.min(this.#offsetMs ?? Infinity, offsetMs);
+      this.offsetMs = Math.min(this.offsetMs ?? Infinity, offsetMs);
     }
   }
 
@@ -141,8 +137,8 @@ export class Playout {
    * or by a busy page arrives in one burst whose end is on time. This is not a pause.
    */
   #resyncIfFar(nowMs, latenessMs) {
-    if (this.#offsetMs === null) return;
-    const lateMs = latenessMs - this.#offsetMs;
+    if (this.offsetMs === null) return;
+    const lateMs = latenessMs - this.offsetMs;
     if (lateMs <= JUMP_MS) this.#lateSinceMs = null;
     else this.#lateSinceMs ??= nowMs;
     const hasPaused = this.#lateSinceMs !== null && nowMs - this.#lateSinceMs > LATE_MS;

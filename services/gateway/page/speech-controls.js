@@ -5,11 +5,11 @@ import { say } from "./language.js";
 import { Microphone } from "./microphone.js";
 
 export class SpeechControls {
+  microphone;
   state = "off"; // of the microphone
   session = null; // of the microphone
   #sound;
   #handlers;
-  #microphone;
   #wasSoundWanted = false; // before the microphone or a lesson muted the sound
 
   /**
@@ -20,18 +20,18 @@ export class SpeechControls {
   constructor(sound, handlers) {
     this.#sound = sound;
     this.#handlers = handlers;
-    this.#microphone = new Microphone({
+    this.microphone = new Microphone({
       ...handlers,
       state: (state) => this.#onState(state),
       session: (name) => this.#onSession(name),
     });
     element("microphone").onclick = () => {
-      const isOn = this.#microphone.isActive && !this.#microphone.isFile;
-      this.#microphone.stop();
-      if (!isOn) this.#microphone.start();
+      const isOn = this.microphone.isActive && !this.microphone.isFile;
+      this.microphone.stop();
+      if (!isOn) this.microphone.start();
     };
     element("open-file").onclick = () => {
-      if (this.#microphone.isFile) this.#microphone.stop();
+      if (this.microphone.isFile) this.microphone.stop();
       else element("file").click();
     };
     element("file").onchange = ({ target }) => {
@@ -49,19 +49,9 @@ export class SpeechControls {
     };
   }
 
-  /** Return how long ago a media time of the microphone's session was spoken, ms, or null. */
-  ageMs(nowMs, mediaTime) {
-    return this.#microphone.ageMs(nowMs, mediaTime);
-  }
-
-  /** Change the lip model of the microphone's session. */
-  chooseLips(name) {
-    this.#microphone.chooseLips(name);
-  }
-
   /** Stop the microphone and mute the sound, for a lesson. */
   pause() {
-    this.#microphone.stop();
+    this.microphone.stop();
     this.#mute();
   }
 
@@ -86,7 +76,7 @@ export class SpeechControls {
 
   #speakFile(file) {
     this.unblockSound();
-    this.#microphone.startFile(file);
+    this.microphone.startFile(file);
   }
 
   #mute() {
@@ -101,8 +91,8 @@ export class SpeechControls {
     this.state = state;
     const isOn = state === "on" || state === "interrupted";
     const isBusy = state === "starting" || state === "interrupted";
-    element("microphone").setAttribute("aria-pressed", isOn && !this.#microphone.isFile);
-    element("open-file").setAttribute("aria-pressed", isOn && this.#microphone.isFile);
+    element("microphone").setAttribute("aria-pressed", isOn && !this.microphone.isFile);
+    element("open-file").setAttribute("aria-pressed", isOn && this.microphone.isFile);
     element("microphone").setAttribute("aria-busy", isBusy);
     if (state === "off" && this.session !== null) {
       this.session = null;
@@ -113,7 +103,7 @@ export class SpeechControls {
 
   #onSession(name) {
     // Users do not want to hear their own voice late. A file stays audible.
-    if (this.session === null && !this.#microphone.isFile) this.#mute();
+    if (this.session === null && !this.microphone.isFile) this.#mute();
     else if (this.session === null) this.#wasSoundWanted = this.#sound.isWanted;
     this.session = name;
     this.#handlers.session(name);

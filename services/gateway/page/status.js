@@ -129,7 +129,7 @@ export class StatusBar {
   show() {
     const { gateway, player, speech, sound, notice, senders } = this.#parts;
     const { isConnected, session } = gateway;
-    const isLive = isConnected && player.isLive(performance.now());
+    const isLive = isConnected && player.activity.isLive(performance.now());
     this.#wasLive ||= isLive;
     const isMicrophoneInterrupted = speech.state === "interrupted";
     const isStalled = this.#wasLive && session !== null && session === speech.session;
