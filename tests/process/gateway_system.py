@@ -101,23 +101,19 @@ class ScriptedSystem(FakeControl):
             Sound(session=session, epoch=EPOCH, media_time=320, pcm=b"\x01\x00\xff\x7f")
         )
         self.phones.send(Speech(session=session, epoch=EPOCH, media_time=320, active=True))
-        self.phones.send(
-            Phone(
-                session=session,
-                epoch=EPOCH,
-                media_time=320,
-                index=0,
-                symbol="iao",
-                duration=1600,
-                confidence=0.5,
-                final=False,
-            )
-        )
+        self.publish_phone(session, "iao")
         self.faps.send(
             FapFrame(
                 session=session, epoch=EPOCH, media_time=320, values=FACE, mask=bytes(MASK_BYTES)
             )
         )
+
+    def publish_phone(self, session: str, symbol: str) -> None:
+        phone = Phone(
+            session=session, epoch=EPOCH, media_time=320, index=0, symbol=symbol, duration=1600,
+            confidence=0.5, final=False,
+        )  # fmt: skip
+        self.phones.send(phone)
 
     def on_open(self, opening: OpenSession, client: Peer) -> None:
         self.profiles.append(opening.mouth_profile or b"")
