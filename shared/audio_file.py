@@ -133,13 +133,7 @@ def _media_blocks(
 
 
 def read_audio(path: Path) -> tuple[Samples, int]:
-    """Return all samples of a file, shape ``(n, channels)``, and their rate in Hz.
-
-    Raises
-    ------
-    UserError
-        As ``open_audio``.
-    """
+    """Return all samples, (n, channels), and their rate in Hz; raises as ``open_audio``."""
     source = open_audio(path, block_s=1.0)
     return np.concatenate(list(source.blocks)), source.sample_rate_hz
 

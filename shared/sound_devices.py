@@ -80,10 +80,7 @@ def microphone(name: str = "") -> AudioSource:
 def monitor(name: str = "") -> AudioSource:
     """Record what this machine plays until interrupted, or until the recorded program ends.
 
-    Parameters
-    ----------
-    name
-        Part of the name of an output or a program; empty: the default output.
+    ``name`` is a part of the name of an output or a program; empty: the default output.
 
     Raises
     ------
@@ -144,15 +141,14 @@ def _monitors() -> list[SoundDevice]:
         if source["properties"].get("device.class") == "monitor"
     ]
     programs = [
-        SoundDevice("program", _program(playing), f"--monitor-stream={playing['index']}")
+        SoundDevice(
+            "program",
+            playing["properties"].get("application.name", "unnamed"),
+            f"--monitor-stream={playing['index']}",
+        )
         for playing in _list_from_sound_server("sink-inputs")
     ]
     return outputs + programs
-
-
-def _program(playing: dict[str, Any]) -> str:
-    name: str = playing["properties"].get("application.name", "unnamed")
-    return name
 
 
 def _list_from_sound_server(kind: str) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ _EXTENSIBLE, _TAG_PLACE = 0xFFFE, 24  # the tag is later in the chunk
 _ENCODINGS = {(1, 16): "s16le", (3, 32): "f32le"}  # by tag and bits
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class WavHeader:
     """The format that a WAV header states."""
 
@@ -51,11 +51,6 @@ def read_wav_header(begin: bytes) -> WavHeader | None:
                     f"the WAV header states format {tag} with {bits} bits; use 16-bit PCM or "
                     "32-bit float"
                 )
-            return WavHeader(
-                sample_rate_hz=rate_hz,
-                num_channels=num_channels,
-                encoding=encoding,
-                num_bytes=place,
-            )
+            return WavHeader(rate_hz, num_channels, encoding, num_bytes=place)
         place += size + size % 2
     raise UserError("the WAV header is incomplete; send all of it at once")

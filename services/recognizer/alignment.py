@@ -53,16 +53,8 @@ def align_text(
 ) -> list[Phone]:
     """Find the onset and duration of each phone and pause of a text.
 
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    samples
-        Shape (n,) or (n, channels), in [-1, 1].
-    sample_rate_hz
-        Rate of the samples, 8000 to 48000.
-    text
-        The spoken words, in a spelling that the model's language can read.
+    ``samples`` have the shape (n,) or (n, channels). The text is in a spelling that the model's
+    language can read.
 
     Raises
     ------

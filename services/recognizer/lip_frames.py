@@ -56,14 +56,6 @@ class LipFrameModel(Protocol):
 
 
 def delay_for(delays_s: Sequence[float], face_delay_s: float) -> float:
-    """Choose the longest delay whose lip frames are in time for the face.
-
-    Parameters
-    ----------
-    delays_s
-        Delays to choose from, seconds, rising; a negative one is a forecast.
-    face_delay_s
-        How much later than its audio a frame of the face is made.
-    """
+    """Choose the longest delay whose lip frames are in time for a face with a delay."""
     in_time = [delay for delay in delays_s if delay + POSITION_LAG_S <= face_delay_s + 1e-6]
     return max(in_time, default=min(delays_s))

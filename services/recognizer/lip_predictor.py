@@ -102,22 +102,15 @@ class LipPredictor:
         """
         key = tuple(delays)
         if key not in self._of_delays:
-            chosen = [
-                weights[..., list(delays), :]
+            history, output = (
+                weights[..., list(delays), :].reshape(-1, len(delays) * NUM_OUTPUTS)
                 for weights in (self.history_weights, self.output_weights)
-            ]
-            history, output = (weights.reshape(-1, len(delays) * NUM_OUTPUTS) for weights in chosen)
+            )
             self._of_delays[key] = history, output
         return self._of_delays[key]
 
     def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
-        """Create a session's stream with some of the delays.
-
-        Raises
-        ------
-        UserError
-            If the model does not offer one of them.
-        """
+        """Create a session's stream; ``UserError`` if the model lacks one of the delays."""
         unknown = [delay_s for delay_s in delays_s if delay_s not in self.delays_s]
         if unknown:
             choices = ", ".join(f"{1e3 * delay_s:g}" for delay_s in self.delays_s)
@@ -141,13 +134,7 @@ class LipPredictor:
         return num_inner, num_delays, len(LIP_FAPS)
 
     def with_mouth_profile(self, content: bytes) -> LipPredictor:
-        """Adapt the model to the speaker of a mouth profile.
-
-        Raises
-        ------
-        UserError
-            If the content is not a mouth profile, or was made for another model.
-        """
+        """Adapt the model to a mouth profile; raises as ``parse_mouth_profile``."""
         return self.adapt(parse_mouth_profile(content, self.digest, self.residual_shape))
 
     def adapt(self, profile: MouthProfile) -> LipPredictor:
@@ -174,13 +161,6 @@ class LipPredictor:
 class LipPredictorStream:
     """The lip frames of one session, one segment of speech after the other.
 
-    Parameters
-    ----------
-    model
-        The model of all streams.
-    delays
-        Indices of the delays to predict.
-
     Attributes
     ----------
     inner : NDArray
@@ -203,17 +183,7 @@ class LipPredictorStream:
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
     def process_position(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
-        """Return the lip frames that follow from a position, one for each delay.
-
-        Parameters
-        ----------
-        known_s
-            Media time of the last sample that the position has seen, seconds.
-        frames
-            Its two newest log-mel frames, shape (2, 80).
-        values
-            Attention values of its layers, shape (layers, heads, size).
-        """
+        """Return the lip frames that follow from a position; see ``LipFrameStream``."""
         outputs = self.step(features_at(frames, values))
         return [
             LipFrame(
@@ -269,13 +239,7 @@ def _sigmoid(x: Floats) -> Floats:
 
 
 def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
-    """Read a lip predictor's file.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, broken or of another format.
-    """
+    """Read a file; ``UserError`` if it is missing, broken or of another format."""
     archive = read_archive(path)
     try:
         form = str(archive.array("format", ()))
@@ -298,13 +262,7 @@ def lip_predictor_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredic
 
 
 def lips_from(archive: Archive) -> LipPredictor:
-    """Build the predictor after checking every size.
-
-    Raises
-    ------
-    ValueError
-        If an array does not fit.
-    """
+    """Build the predictor after checking every size; ``ValueError`` if an array does not fit."""
     delays = archive.floats("delays", *_sizes(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
         raise ValueError(f"its delays are {delays.tolist()}")

@@ -61,13 +61,6 @@ class LiveDecoder:
     If the model has provisional scores, the search continues over them. When the next scores come,
     it restarts from the last settled frame. The output rule gets each frame once, as soon as the
     frame has a score of either kind. So phones are emitted early and corrected by better scores.
-
-    Parameters
-    ----------
-    topology
-        The phones' HMMs and the phone language model.
-    rule
-        The output rule.
     """
 
     def __init__(self, topology: Topology, rule: OutputRuleConfig) -> None:

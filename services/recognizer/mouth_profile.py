@@ -61,16 +61,9 @@ class MouthProfile:
 def parse_mouth_profile(
     content: bytes, model_digest: bytes, shape: tuple[int, int, int]
 ) -> MouthProfile:
-    """Parse a profile from an untrusted source.
+    """Parse a profile from an untrusted source, for the lip model with this SHA-256.
 
-    Parameters
-    ----------
-    content
-        The profile's bytes.
-    model_digest
-        SHA-256 of the lip model that will use the profile.
-    shape
-        Shape of the residual with this model.
+    ``shape`` is that of the residual with this model.
 
     Raises
     ------
@@ -102,13 +95,7 @@ def parse_mouth_profile(
 
 
 def read_mouth_profile(path: Path) -> bytes:
-    """Read a file that starts like a mouth profile.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read or is not a mouth profile.
-    """
+    """Read a file that starts like a mouth profile; ``UserError`` if it does not."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_MOUTH_PROFILE_BYTES + 1)

@@ -23,17 +23,7 @@ from kouxing.shared.phones.events import Phone
 
 
 def recognize(model: AcousticModel, samples: Floats, sample_rate_hz: int) -> list[Phone]:
-    """Recognize the phones of a recording, silence within speech included.
-
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    samples
-        Shape (n,) or (n, channels), in [-1, 1].
-    sample_rate_hz
-        Rate of the samples.
-    """
+    """Recognize the phones of a recording, (n,) or (n, channels), and silence within speech."""
     return decode_offline(model, score_recording(model, samples, sample_rate_hz))
 
 

@@ -25,14 +25,7 @@ _WARM_UP_ROWS = 200  # of equal scores: enough live paths for the search to drop
 
 
 class Recognizer:
-    """Recognizes phones in any number of live streams.
-
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    rule
-        When a phone is emitted.
+    """Recognizes phones in any number of live streams; ``rule``: when a phone is emitted.
 
     Examples
     --------
@@ -61,10 +54,8 @@ class Recognizer:
 
         Parameters
         ----------
-        sample_rate_hz
-            Rate of the audio, 8000 to 48000.
-        num_channels
-            Channels of the audio; they are averaged.
+        sample_rate_hz, num_channels
+            Of the audio: 8000 to 48000 Hz; channels are averaged.
         lips
             Predicts lip frames; the acoustic model must have positions. None: no lip frames.
         face_delay_s

@@ -72,15 +72,7 @@ class ReplayWindow:
 
 
 class Resumption:
-    """Suppresses results that are already known.
-
-    Parameters
-    ----------
-    time_s
-        Media time up to which phones are known, by the middle of the phone.
-    silence
-        The symbol of silence.
-    """
+    """Suppresses results that are already known: up to ``time_s``, by the middle of a phone."""
 
     def __init__(self, time_s: float, silence: str) -> None:
         self._time_s = time_s
@@ -121,10 +113,11 @@ class Resumption:
                 return self._new_change(result)
             case Waveform():
                 return self._new_waveform(result)
-        is_known = (isinstance(result, Progress) and result.time_s <= self._time_s) or (
-            isinstance(result, LipFrame) and result.time_s < self._time_s
-        )
-        return None if is_known else result
+            case Progress() if result.time_s <= self._time_s:
+                return None
+            case LipFrame() if result.time_s < self._time_s:
+                return None
+        return result
 
     def _new_change(self, change: SpeechChange) -> SpeechChange | None:
         if not self._has_emitted and change.time_s <= self._time_s:

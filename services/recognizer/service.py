@@ -22,7 +22,7 @@ from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk
-from kouxing.services.recognizer.session import AudioRejected, RecognizerSession, create_session
+from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.keys import Peer
@@ -127,7 +127,9 @@ class RecognizerService(Service):
             if session is not None:
                 self._unpaced.drop(session, keep_end=False)
             socket = self._audio if start.paced else self._unpaced_audio
-            session = create_session(start, self._recognizer, self._lips, socket, time.monotonic())
+            session = RecognizerSession(
+                start, self._recognizer, self._lips, socket, time.monotonic()
+            )
             self._sessions[start.session] = session
         if is_new or session.start.epoch != start.epoch:
             session.start = start

@@ -11,7 +11,6 @@ from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
-from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
@@ -42,41 +41,43 @@ class AudioRejected(Exception):
 
 
 class RecognizerSession:
-    """A session's state.
-
-    Parameters
-    ----------
-    start
-        Control's message.
-    stream
-        The session's stream.
-    socket
-        Where its audio arrives.
-    resumption
-        What to suppress, if another recognizer has lost the session.
-    now_s
-        Time of the monotonic clock.
-    """
+    """A session's state. A mouth profile that does not fit is ignored and reported."""
 
     def __init__(
         self,
         start: StartSession,
-        stream: SpeechStream,
+        recognizer: Recognizer,
+        lips: LipFrameModel | None,
         socket: Socket,
-        resumption: Resumption | None,
         now_s: float,
     ) -> None:
         self.start = start
         self.first_epoch = start.epoch
         self.face = CurrentFace(start.face, now_s)
-        self.stream = stream
         self.socket = socket
-        self.resumption = resumption
+        self.mouth_profile_error = ""  # why the profile is not used; empty once reported
+        if start.mouth_profile is not None:
+            try:
+                if lips is None:
+                    raise UserError("this recognizer has no lip predictor")
+                lips = lips.with_mouth_profile(start.mouth_profile)
+            except UserError as error:
+                self.mouth_profile_error = f"the mouth profile is not used: {error}"
+        self.stream = recognizer.create_stream(
+            sample_rate_hz=start.sample_rate_hz,
+            num_channels=start.num_channels,
+            lips=lips,
+            face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
+            speech_time=start.speech_time or 0,
+        )
+        self.resumption: Resumption | None = None  # if another recognizer has lost the session
+        if start.media_time:
+            silence = recognizer.model.inventory.silence
+            self.resumption = Resumption(to_seconds(start.media_time), silence)
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.order = AudioOrder()
         self.client = NO_PEER  # sender of the newest audio
-        self.mouth_profile_error = ""  # why the profile is not used; empty once reported
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded
         self.last_audio_s = now_s
@@ -185,38 +186,6 @@ class RecognizerSession:
             is_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED
             if isinstance(message, SpeechMessage) and not is_stalled:
                 self.replay_window.update(event_of(message), self.order.last)
-
-
-def create_session(
-    start: StartSession,
-    recognizer: Recognizer,
-    lips: LipFrameModel | None,
-    socket: Socket,
-    now_s: float,
-) -> RecognizerSession:
-    """Create a session, with its own mouth profile if that fits."""
-    mouth_profile_error = ""
-    if start.mouth_profile is not None:
-        try:
-            if lips is None:
-                raise UserError("this recognizer has no lip predictor")
-            lips = lips.with_mouth_profile(start.mouth_profile)
-        except UserError as error:
-            mouth_profile_error = f"the mouth profile is not used: {error}"
-    stream = recognizer.create_stream(
-        sample_rate_hz=start.sample_rate_hz,
-        num_channels=start.num_channels,
-        lips=lips,
-        face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
-        speech_time=start.speech_time or 0,
-    )
-    resumption = None
-    if start.media_time:
-        silence = recognizer.model.inventory.silence
-        resumption = Resumption(to_seconds(start.media_time), silence)
-    session = RecognizerSession(start, stream, socket, resumption, now_s)
-    session.mouth_profile_error = mouth_profile_error
-    return session
 
 
 class _LeadLimit:

@@ -77,10 +77,8 @@ class SpeechScorer:
 
     Parameters
     ----------
-    model
-        The acoustic model.
-    lips
-        The session's lip frames, which follow the scores; the model must have positions.
+    model, lips
+        The acoustic model must have positions if there are lip frames.
     start_frame
         Frame at which speech started, if another recognizer processed its start; negative before
         the audio. The first speech then starts where the network's blocks align with those of the

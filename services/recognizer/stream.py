@@ -91,14 +91,9 @@ class SpeechStream:
         return [segment.scorer for segment in self._segments]
 
     def accept_waveform(self, samples: Floats, media_time: int | None = None) -> None:
-        """Queue samples for decoding.
+        """Queue samples, (n,) or (n, channels), in [-1, 1], for decoding.
 
-        Parameters
-        ----------
-        samples
-            Shape (n,) or (n, channels), in [-1, 1], at the stream's rate.
-        media_time
-            Media time of the first sample, samples at 16 kHz. None: there is no gap.
+        ``media_time`` is that of the first sample, samples at 16 kHz. None: there is no gap.
 
         Raises
         ------

@@ -54,13 +54,7 @@ VisemeShares = tuple[tuple[str, float], ...]  # (viseme, share of the phone's du
 
 @dataclass(frozen=True, kw_only=True)
 class PhoneInventory:
-    """The phones, visemes and lexicon of a language.
-
-    Raises
-    ------
-    UserError
-        If the phones or visemes are not valid.
-    """
+    """The phones, visemes and lexicon of a language; ``UserError`` if they are not valid."""
 
     language: str
     phones: tuple[str, ...]  # (num_phones,) in the order of the acoustic models' outputs
@@ -109,21 +103,19 @@ class PhoneInventory:
     @cached_property
     def initials(self) -> frozenset[str]:
         """Consonants that begin a syllable."""
-        return self._of_kind("initial")
+        return frozenset(
+            p for p, kind in zip(self.phones, self.kinds, strict=True) if kind == "initial"
+        )
 
     @cached_property
     def vowels(self) -> frozenset[str]:
         """Vowels, including the rest of the syllable."""
-        return self._of_kind("vowel")
+        return frozenset(
+            p for p, kind in zip(self.phones, self.kinds, strict=True) if kind == "vowel"
+        )
 
     def read(self, text: str) -> Transcript:
-        """Return a text's syllables with their spelling, and the parts that cannot be read.
-
-        Raises
-        ------
-        UserError
-            If the text cannot be read.
-        """
+        """Return a text's syllables with their spelling, and the parts that cannot be read."""
         if self.transcribe is not None:
             return self.transcribe(text)
         syllables = (
@@ -140,12 +132,7 @@ class PhoneInventory:
 
 @lru_cache
 def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
-    """Read the inventory of a language.
-
-    Parameters
-    ----------
-    language
-        One of ``BUILT_IN``, or the name of an entry point.
+    """Read the inventory of a language in ``BUILT_IN`` or of an entry point.
 
     Raises
     ------

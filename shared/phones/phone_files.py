@@ -26,18 +26,10 @@ def format_phones(
     total_s: float,
     syllables: Sequence[TimedSyllable] = (),
 ) -> str:
-    """Write phones as text.
+    """Write phones in the order of their onsets as ``table``, ``csv``, ``json`` or ``textgrid``.
 
-    Parameters
-    ----------
-    phones
-        Phones in the order of their onsets.
-    style
-        ``table``, ``csv``, ``json`` or ``textgrid``.
-    total_s
-        Length of the recording, seconds.
-    syllables
-        Syllables of a known text, which a TextGrid and JSON also contain.
+    ``total_s`` is the length of the recording. A TextGrid and JSON also contain the syllables of a
+    known text.
 
     Raises
     ------

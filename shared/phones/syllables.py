@@ -27,12 +27,7 @@ class Syllable:
 class SyllableTrack:
     """Combines phones to syllables: first the initial only, then with its vowel.
 
-    Parameters
-    ----------
-    inventory
-        The language, which spells the syllables.
-    characters
-        The spoken text, if known: matching syllables are shown as its characters.
+    Syllables that match the spoken text, if it is known, are shown as its characters.
     """
 
     def __init__(self, inventory: PhoneInventory, characters: Characters = ()) -> None:
@@ -54,7 +49,9 @@ class SyllableTrack:
             self._phones.pop(phone.index, None)
         else:
             self._phones[phone.index] = phone
-        groups = self._groups()
+        groups = group_syllables(
+            [phone for _, phone in sorted(self._phones.items())], self._inventory
+        )
         places = self._places(groups)
         if len(self._phones) > MAX_PHONES:
             oldest, place = groups.pop(0), places.pop(0)
@@ -74,21 +71,6 @@ class SyllableTrack:
         changed = [new for index, new in syllables.items() if self._syllables.get(index) != new]
         self._syllables = syllables
         return withdrawn + changed
-
-    def _groups(self) -> list[list[Phone]]:
-        """Return the phones of each syllable, in order."""
-        groups: list[list[Phone]] = []
-        for _, phone in sorted(self._phones.items()):
-            follows_initial = (
-                groups
-                and groups[-1][-1].symbol in self._inventory.initials
-                and phone.symbol in self._inventory.vowels
-            )
-            if follows_initial:
-                groups[-1].append(phone)
-            else:
-                groups.append([phone])
-        return groups
 
     def _places(self, groups: list[list[Phone]]) -> list[int | None]:
         """Return the index of each syllable's character; None: it has no character."""
@@ -117,7 +99,7 @@ class SyllableTrack:
 
 
 def group_syllables(phones: Sequence[Phone], inventory: PhoneInventory) -> list[list[Phone]]:
-    """Group phones, in order and without pauses, by syllable."""
+    """Group phones in order by syllable."""
     syllables: list[list[Phone]] = []
     for phone in phones:
         follows_initial = syllables and syllables[-1][-1].symbol in inventory.initials

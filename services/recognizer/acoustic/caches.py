@@ -69,7 +69,7 @@ class CacheMemory:
     def open(self) -> Cache:
         """Return a cache for a new session."""
         shelves = [shelf for reference in self._shelves if (shelf := reference()) is not None]
-        shelf = next((shelf for shelf in shelves if shelf.has_room), None)
+        shelf = next((shelf for shelf in shelves if None in shelf.caches), None)
         if shelf is None:
             shelf = Shelf(self._sizes)
             shelves.append(shelf)
@@ -79,11 +79,8 @@ class CacheMemory:
     def runs(self, caches: Sequence[Cache]) -> Iterator[tuple[list[int], Halves]]:
         """Yield runs for sessions with these caches, until all sessions are covered.
 
-        Yields
-        ------
-        tuple
-            Indices of the run's sessions, in the order of their rows; their keys and values,
-            (rings, sessions, heads, slots, size), valid until the next run.
+        A run has the indices of its sessions, in the order of their rows, and their keys and
+        values, (rings, sessions, heads, slots, size), valid until the next run.
         """
         numbers: dict[Shelf, list[int]] = {}
         for number, cache in enumerate(caches):
@@ -105,17 +102,12 @@ class Shelf:
         self._memory = mmap.mmap(-1, NUM_PLACES * sizes.num_bytes, flags=flags)
         shape = (sizes.rings, NUM_PLACES, sizes.heads, sizes.slots, sizes.head_size)
         self.rings: Halves = np.frombuffer(self._memory, np.float16).reshape(shape)
-        self._caches: list[weakref.ref[Cache] | None] = [None] * NUM_PLACES
-
-    @property
-    def has_room(self) -> bool:
-        """Whether a place is free."""
-        return None in self._caches
+        self.caches: list[weakref.ref[Cache] | None] = [None] * NUM_PLACES
 
     def open(self) -> Cache:
         """Return a cache in a free place."""
-        cache = Cache(self, self._caches.index(None))
-        self._caches[cache.place] = weakref.ref(cache, self._on_deleted)
+        cache = Cache(self, self.caches.index(None))
+        self.caches[cache.place] = weakref.ref(cache, self._on_deleted)
         return cache
 
     def gather(self, caches: Sequence[Cache]) -> int:
@@ -134,16 +126,16 @@ class Shelf:
 
     def _swap(self, one: int, other: int) -> None:
         self.rings[:, [one, other]] = self.rings[:, [other, one]]
-        self._caches[one], self._caches[other] = self._caches[other], self._caches[one]
+        self.caches[one], self.caches[other] = self.caches[other], self.caches[one]
         for place in (one, other):
-            if (reference := self._caches[place]) is None:
+            if (reference := self.caches[place]) is None:
                 self._free(place)
             elif (cache := reference()) is not None:
                 cache.place = place
 
     def _on_deleted(self, deleted: weakref.ref[Cache]) -> None:
-        place = self._caches.index(deleted)
-        self._caches[place] = None
+        place = self.caches.index(deleted)
+        self.caches[place] = None
         self._free(place)
 
     def _free(self, place: int) -> None:

@@ -56,13 +56,7 @@ class Archive:
 
 
 def read_archive(path: Path) -> Archive:
-    """Read a model file.
-
-    Raises
-    ------
-    UserError
-        If the file is missing or is not a model file.
-    """
+    """Read a model file; ``UserError`` if it is missing or is not one."""
     try:
         return Archive(read_arrays(path, MAX_BYTES))
     except OSError as error:

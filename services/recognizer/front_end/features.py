@@ -133,13 +133,7 @@ def cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class Differences:
-    """Streaming first and second differences.
-
-    Parameters
-    ----------
-    half_width
-        Frames on each side in the regression: 2 in the textbook; 1 halves the look-ahead.
-    """
+    """Streaming first and second differences, from ``half_width`` frames on each side."""
 
     def __init__(self, half_width: int) -> None:
         self.look_ahead_frames = 2 * half_width
@@ -204,13 +198,7 @@ def _with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[n
 
 
 class LiveMean:
-    """Subtracts a running mean of speech from features, starting from a prior.
-
-    Parameters
-    ----------
-    prior
-        Mean of the training corpus, shape (k,), log energy first.
-    """
+    """Subtracts a running mean of speech from features, starting from a prior, (k,)."""
 
     def __init__(self, prior: NDArray[np.float32]) -> None:
         self._prior = prior.astype(np.float64)

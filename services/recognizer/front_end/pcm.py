@@ -46,15 +46,7 @@ def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
 
 
 def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
-    """Cut samples at multiples of 20 ms of the stream, so that chunking does not affect results.
-
-    Parameters
-    ----------
-    samples
-        Shape (n,), 16 kHz.
-    num_before
-        Number of samples of the stream before these.
-    """
+    """Cut samples, (n,), at multiples of 20 ms of the stream, of which ``num_before`` are past."""
     begin = 0
     while begin < len(samples):
         end = begin + SLICE - (num_before + begin) % SLICE

@@ -27,11 +27,8 @@ _REPLACE_AFTER = 40
 class PitchTracker:
     """Tracks the fundamental frequency of a voice.
 
-    Parameters
-    ----------
-    num_before
-        Number of slices of the session before the first. A tracker that starts later then soon
-        gives the same results.
+    ``num_before`` slices of the session precede the first. A tracker that starts later soon gives
+    the same results.
     """
 
     def __init__(self, num_before: int = 0) -> None:

@@ -41,19 +41,12 @@ _KAISER_BETA = 8.0
 
 
 class Resampler:
-    """Streaming resampler to 16 kHz mono.
-
-    Parameters
-    ----------
-    sample_rate_hz
-        Rate of the input, 8000 to 48000.
-    num_channels
-        Channels of the input; they are averaged.
+    """Streaming resampler to 16 kHz mono; averages the channels.
 
     Raises
     ------
     UserError
-        If the rate or the number of channels is out of range.
+        If the rate (8000 to 48000 Hz) or the number of channels (1 to 8) is out of range.
     """
 
     def __init__(self, sample_rate_hz: int, num_channels: int = 1) -> None:
@@ -109,14 +102,14 @@ class Resampler:
         return out
 
     def _mono(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        expected = (
-            (len(samples),) if self._num_channels == 1 else (len(samples), self._num_channels)
-        )
-        if samples.shape not in (expected, (len(samples), self._num_channels)):
-            raise UserError(f"samples have shape {samples.shape}; expected {expected}")
+        num_channels = 1 if samples.ndim == 1 else samples.shape[1]
+        if samples.ndim > 2 or num_channels != self._num_channels:
+            raise UserError(
+                f"samples have shape {samples.shape}; expected {self._num_channels} channels"
+            )
         if not np.isfinite(samples).all():
             raise UserError("some samples are not finite; send values in [-1, 1]")
-        mono = samples.mean(axis=1) if self._num_channels > 1 else samples.reshape(-1)
+        mono = samples.mean(axis=1) if num_channels > 1 else samples.reshape(-1)
         clipped: NDArray[np.float32] = np.clip(mono, -1.0, 1.0).astype(np.float32)
         return clipped
 

@@ -135,14 +135,7 @@ class PitchTracker:
 
 
 class VocalTractNormalizer:
-    """Warps the mel bands of a low voice upwards, depending on the mean pitch so far.
-
-    Examples
-    --------
-    >>> log_mel, tracker, vtln = LogMel(), PitchTracker(), VocalTractNormalizer()
-    >>> for chunk in speech:
-    ...     warped = vtln.warp(log_mel.accept_waveform(chunk), *tracker.accept_waveform(chunk))
-    """
+    """Warps the mel bands of a low voice upwards, depending on the mean pitch so far."""
 
     def __init__(self) -> None:
         self.reset()
@@ -162,21 +155,9 @@ class VocalTractNormalizer:
 
         Returns frames like ``log_mel``, (n, 41): the log energy unchanged, the bands warped by the
         factor at their frame. A factor of 1 changes no bit.
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not match.
         """
-        num_frames = len(log_mel)
-        expected = ((num_frames, 1 + NUM_BANDS), (num_frames,), (num_frames,))
-        shapes = (log_mel.shape, pitch_hz.shape, strength.shape)
-        if shapes != expected:
-            raise ValueError(f"frames have shapes {shapes}; expected {expected}")
         frames = np.array(log_mel, dtype=np.float32, order="C")
-        voice = np.empty((num_frames, 2), dtype=np.float32)
-        voice[:, 0], voice[:, 1] = pitch_hz, strength
-        _warp(frames, voice, BAND_HZ, self._state)
+        _warp(frames, np.column_stack([pitch_hz, strength]), BAND_HZ, self._state)
         return frames
 
     def reset(self) -> None:

@@ -253,11 +253,8 @@ def _steps(
 ) -> tuple[int, int, int, int, int, float]:
     """Advance all paths by the observed frames, or as far as there is room for their records.
 
-    Returns
-    -------
-    tuple
-        Number of frames; numbers of tokens and of records; the best token and its best state; the
-        confidence.
+    Returns the numbers of frames, tokens and records; the best token, its best state, and the
+    confidence.
     """
     num_done, token, state, confidence = 0, 0, 0, 0.0
     for number in range(num_tokens):
@@ -308,11 +305,8 @@ def _start_phones(
 ) -> tuple[int, int, NDArray[np.float32], NDArray[np.int32]]:
     """Record the phones that may end before the frame, and start the phones that may follow.
 
-    Returns
-    -------
-    tuple
-        Numbers of tokens and of records; the best score that enters each token and its record,
-        (tokens,) each.
+    Returns the numbers of tokens and records; the best score that enters each token, and its
+    record, (tokens,) each.
     """
     num_phones, max_tokens = len(hmms.first_state) - 1, len(tokens.context)
     entry = np.full(max_tokens, _IMPOSSIBLE)

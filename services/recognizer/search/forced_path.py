@@ -35,16 +35,7 @@ def utterance_graph(
 ) -> UtteranceGraph:
     """Lay out the states of an utterance, with an optional pause at each syllable boundary.
 
-    Parameters
-    ----------
-    phones
-        Indices into the inventory's phones.
-    syllables
-        Number of phones in each syllable.
-    first_state
-        First state of each phone, as in ``Topology``.
-    silence
-        Index of the phone for a pause.
+    ``syllables`` are the numbers of phones; ``first_state`` is that of ``Topology``.
     """
     states: list[int] = []
     skip_from: list[int] = []
@@ -84,22 +75,10 @@ def viterbi_path(
     log_stay: NDArray[np.float32],
     log_leave: NDArray[np.float32],
 ) -> tuple[NDArray[np.int64], float]:
-    """Find the best path through a graph.
+    """Find the best path through a graph, given the scores of its nodes, (frames, nodes).
 
-    Parameters
-    ----------
-    scores
-        Log score of every node, shape (frames, nodes).
-    graph
-        The utterance.
-    log_stay, log_leave
-        Log-probabilities of the transitions of all HMM states.
-
-    Returns
-    -------
-    tuple
-        Node of every frame, shape (frames,), and the path's log-likelihood. With too few frames: an
-        empty array and minus infinity.
+    ``log_stay`` and ``log_leave`` are those of ``Topology``. Returns the node of every frame,
+    (frames,), and the path's log-likelihood. With too few frames: nothing and minus infinity.
     """
     path, log_likelihood = _viterbi(
         scores,

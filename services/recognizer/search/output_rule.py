@@ -27,12 +27,7 @@ MODEL_RULES = dict.fromkeys(("neural", "gmm"), OutputRuleConfig(1, 0.9))
 class OutputRule:
     """Decides at each frame whether to emit a phone.
 
-    Parameters
-    ----------
-    config
-        The rule's parameters.
-    last_emitted
-        Phone that counts as emitted at the start: silence before speech.
+    ``last_emitted`` is the phone that counts as emitted at the start: silence before speech.
     """
 
     def __init__(self, config: OutputRuleConfig, last_emitted: int) -> None:
