@@ -1,4 +1,4 @@
-"""Languages for tests: an installed one, and phone language models as tables, trees and graphs."""
+"""Languages for tests: an installed one, phone language models and random HMMs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import Graph, PhoneLanguageModel
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
@@ -24,7 +25,7 @@ Gram = tuple[int, ...]
 
 
 def install_language(folder: Path, name: str, package: str) -> None:
-    """Write what a package index's tools leave behind when they install a language."""
+    """Write the metadata of an installed distribution with a language."""
     distribution = folder / f"kouxing_{name}-1.0.dist-info"
     distribution.mkdir()
     (distribution / "METADATA").write_text(
@@ -44,7 +45,7 @@ class Table:
     def draw(
         cls, rng: np.random.Generator, phones: Sequence[int], *, order: int, kept: float = 1.0
     ) -> Table:
-        """Draw numbers for all single phones, and for a part of the longer n-grams of some."""
+        """Draw values for all single phones, and for some longer n-grams of ``phones``."""
         grams: list[Gram] = [(phone,) for phone in range(NUM_PHONES)]
         level: list[Gram] = [(phone,) for phone in phones]
         for _ in range(order - 1):
@@ -83,7 +84,7 @@ class Table:
         return max(map(len, self.log_prob))
 
     def after(self, before: Gram, phone: int) -> float:
-        """Log-probability of a phone after all before it: the formula itself."""
+        """Return the log-probability of a phone after all phones before it, by the formula."""
         if SIL in before:
             before = before[len(before) - 1 - before[::-1].index(SIL) :]
         return self._after(before[max(0, len(before) - self.order + 1) :], phone)
@@ -94,7 +95,7 @@ class Table:
         return self.log_backoff.get(context, 0.0) + self._after(context[1:], phone)
 
     def tree(self, inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
-        """Lay the table out as a tree."""
+        """Convert the table to a tree."""
         grams: list[Gram] = [(), *sorted(self.log_prob, key=lambda gram: (len(gram), gram))]
         num_children = Counter(gram[:-1] for gram in grams[1:])
         return PhoneLanguageModel(
@@ -107,7 +108,7 @@ class Table:
 
 
 def flat_language(inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
-    """Make every phone as likely as any other, whatever came before."""
+    """Make all phones equally likely in every context."""
     num_phones = len(inventory)
     log_probs: dict[Gram, float] = {(phone,): -math.log(num_phones) for phone in range(num_phones)}
     return Table(log_probs, {}).tree(inventory)
@@ -118,8 +119,24 @@ def random_language(rng: np.random.Generator) -> PhoneLanguageModel:
     return Table.draw(rng, [0, 21, 30, SIL], order=3).tree()
 
 
+def random_topology(
+    states_per_phone: int, rng: np.random.Generator, language: PhoneLanguageModel | None = None
+) -> Topology:
+    """Draw HMMs; without a language, all phones are equally likely."""
+    stay = rng.uniform(0.2, 0.8, NUM_PHONES * states_per_phone)
+    duration_s = np.full((NUM_POSITIONS, NUM_PHONES), 0.1, np.float32)
+    return Topology(
+        first_state=np.arange(NUM_PHONES + 1) * states_per_phone,
+        log_stay=np.log(stay).astype(np.float32),
+        log_leave=np.log(1 - stay).astype(np.float32),
+        phone_lm=language or flat_language(),
+        duration_mean_s=duration_s,
+        duration_spread_s=duration_s,
+    )
+
+
 def step(graph: Graph, context: int, phone: int) -> tuple[float, int]:
-    """Log-probability of a phone after a context, and the next context, by the graph."""
+    """Return a phone's log-probability after a context, and the next context, by the graph."""
     total = 0.0
     while True:
         arcs = slice(graph.first_arc[context], graph.first_arc[context + 1])

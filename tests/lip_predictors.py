@@ -1,4 +1,4 @@
-"""Lip predictors with random weights for the built-in network."""
+"""A lip predictor with random weights for the shipped network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS, LipPredictor
 
-WIDTH = 512  # of the built-in network
+WIDTH = 512  # of the shipped network
 NUM_FEATURES, NUM_COMPONENTS, UNITS, HISTORY = 160 + 2 * WIDTH, 6, 5, 3
 DELAYS_S = (-0.005, 0.055, 0.155)
 

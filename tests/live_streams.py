@@ -1,4 +1,4 @@
-"""One live stream for tests: every call returns the recognizer's new results."""
+"""Live streams for tests: every call returns the recognizer's new results."""
 
 from __future__ import annotations
 
@@ -11,10 +11,26 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.session import SessionFacts
+
+START = StartSession(
+    session="s",
+    epoch=1,
+    request="r",
+    token="t",
+    encoding="s16le",
+    sample_rate_hz=8000,
+    num_channels=1,
+    record=False,
+    paced=True,
+    facts=SessionFacts(language="mandarin", delay_ms=0.0),
+    endpoints={},
+)
 
 
 class LiveStream:
-    """A stream with a recognizer of its own; ``options`` are those of ``create_stream``."""
+    """A stream with a separate recognizer; ``options`` are those of ``create_stream``."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Folders of tiny speech recognisers in sherpa-onnx's formats, which hear 你好 in every sound."""
+"""Folders of tiny speech recognizers in sherpa-onnx's formats, which return 你好 for any audio."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 TOKENS = ("<blk>", "</s>", "<unk>", "你", "好", "<|zh|>", "<|NEUTRAL|>", "<|Speech|>", "<|woitn|>")
 _WORD = [TOKENS.index(character) for character in "你好"]
-_TAGS = [5, 6, 7, 8]  # that SenseVoice puts before the text
+_TAGS = [5, 6, 7, 8]  # before the text of SenseVoice
 _FEATURES = {
     "lfr_window_size": 7,
     "lfr_window_shift": 6,
@@ -119,7 +119,7 @@ def sense_voice(path: Path) -> Path:
 
 
 def transducer(path: Path) -> Path:
-    """Write a transducer whose decoder tells the next token from the last one."""
+    """Write a transducer whose decoder derives the next token from the last one."""
     size = len(TOKENS)
     _folder(path)
     _write(

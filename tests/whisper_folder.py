@@ -1,4 +1,4 @@
-"""A folder with the weights of a small Whisper, as faster-whisper has it."""
+"""Folders with the weights of a small Whisper, in the layout of faster-whisper."""
 
 import struct
 from pathlib import Path
@@ -9,7 +9,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
 
 def encoder_arrays(num_layers: int = 3, width: int = 32, inner: int = 48) -> dict[str, np.ndarray]:
-    """Weights of a small encoder, all different, by CTranslate2's names."""
+    """Return random weights of a small encoder, by CTranslate2's names."""
     sizes = {
         "conv1/weight": (width, NUM_MELS, 3),
         "conv1/bias": (width,),

@@ -1,4 +1,4 @@
-"""The recognizer's loop in one process, with real sockets: how much it does at a time."""
+"""The recognizer's loop with real sockets: how much it does at a time."""
 
 from __future__ import annotations
 
@@ -15,31 +15,19 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
-from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AudioState, Progress
+from tests.live_streams import START
 from tests.system import free_port
 
 pytestmark = pytest.mark.e2e
-RATE_HZ = 8000
-START = StartSession(
-    session="s",
-    epoch=1,
-    request="r",
-    token="t",
-    encoding="s16le",
-    sample_rate_hz=RATE_HZ,
-    num_channels=1,
-    record=False,
-    paced=False,
-    facts=SessionFacts(language="mandarin", delay_ms=0.0),
-    endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
-)
+RATE_HZ = START.sample_rate_hz
+PHONE_INPUT = {"phone_input": f"tcp://127.0.0.1:{free_port()}"}
+UNPACED = replace(START, paced=False, endpoints=PHONE_INPUT)
 
 
 class Recognizer(RecognizerService):
-    """Records warnings, and the media times of the sessions whenever a heartbeat may be sent."""
+    """Records warnings, and the sessions' media times whenever a heartbeat may be sent."""
 
     def __init__(self) -> None:
         local = "tcp://127.0.0.1:*"
@@ -70,13 +58,13 @@ class Recognizer(RecognizerService):
 
 @pytest.fixture
 def service() -> Iterator[Recognizer]:
-    made = Recognizer()
-    yield made
-    made.bus.close()
+    running = Recognizer()
+    yield running
+    running.bus.close()
 
 
 def chunk(number: int, num_bytes: int, session: str = "s") -> AudioChunk:
-    """The ``number``-th chunk of this size, from 0."""
+    """Return the ``number``-th chunk of this size, from 0."""
     return AudioChunk(
         session=session,
         token="t",
@@ -90,7 +78,7 @@ def chunk(number: int, num_bytes: int, session: str = "s") -> AudioChunk:
 def test_decodes_a_long_chunk_in_parts_with_heartbeats_between(
     service: Recognizer, paced: bool
 ) -> None:
-    service.start_session(replace(START, paced=paced))
+    service.start_session(replace(UNPACED, paced=paced))
     service.receive(chunk(0, MAX_AUDIO_BYTES))
     service.decode_all()
     steps = [after - before for before, after in pairwise(service.media_times)]
@@ -100,8 +88,8 @@ def test_decodes_a_long_chunk_in_parts_with_heartbeats_between(
 
 
 def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
-    service.start_session(START)
-    service.start_session(replace(START, session="live", paced=True))
+    service.start_session(UNPACED)
+    service.start_session(replace(UNPACED, session="live", paced=True))
     live, other = (service._sessions[name].stream for name in ("live", "s"))
     num_long, num_short = 12, 100
     with Bus() as bus:
@@ -127,7 +115,7 @@ def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
 def test_unpaced_audio_waits_at_its_sender_while_live_audio_continues(
     service: Recognizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service.start_session(START)
+    service.start_session(UNPACED)
     session = service._sessions["s"]
     monkeypatch.setattr(service._audio, "wait", lambda _timeout_s: True)
     num_sent = 0
@@ -136,12 +124,12 @@ def test_unpaced_audio_waits_at_its_sender_while_live_audio_continues(
         for _ in range(500):
             num_sent += unpaced.send(chunk(num_sent, MAX_AUDIO_BYTES))
             service.step(0.001)
-    assert num_sent < 250, "its socket accepts no more"
+    assert num_sent < 250, "the socket must be full"
     assert (session.order.last, session.stream.media_time) == (1, 0)
 
 
 def test_acknowledges_the_end_once_everything_before_it_is_decoded(service: Recognizer) -> None:
-    service.start_session(START)
+    service.start_session(UNPACED)
     session = service._sessions["s"]
     service.receive(chunk(0, 2 * RATE_HZ))
     service.receive(AudioChunk(session="s", token="t", sequence=2, last=True, acknowledge=True))
@@ -151,7 +139,7 @@ def test_acknowledges_the_end_once_everything_before_it_is_decoded(service: Reco
 
 
 def test_rejects_live_audio_far_ahead_of_the_clock(service: Recognizer) -> None:
-    service.start_session(replace(START, paced=True))
+    service.start_session(replace(UNPACED, paced=True))
     for number in range(10):  # of 4 s
         service.receive(chunk(number, 8 * RATE_HZ))
     assert {reason for reason, _ in service.warned} == {"bad-audio"}
@@ -159,7 +147,7 @@ def test_rejects_live_audio_far_ahead_of_the_clock(service: Recognizer) -> None:
 
 
 def test_reports_a_bad_mouth_profile_once_and_continues(service: Recognizer) -> None:
-    service.start_session(replace(START, mouth_profile=b"not a profile"))
+    service.start_session(replace(UNPACED, mouth_profile=b"not a profile"))
     for number in range(2):
         service.receive(chunk(number, 3200))
     service.decode_all()
@@ -185,7 +173,7 @@ def test_reports_a_stalled_client_again_after_a_flush_and_to_a_new_face(
         progress = [message for message in sent if isinstance(message, Progress)]
         return sum(message.state == AudioState.STALLED for message in progress)
 
-    start = replace(START, paced=True)
+    start = replace(UNPACED, paced=True)
     service.start_session(start)
     assert [num_reports(100), num_reports(100)] == [1, 0]
     service.flush_session("s")

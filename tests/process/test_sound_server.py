@@ -1,4 +1,4 @@
-"""What a machine plays, recorded from a real sound server: PulseAudio, with no loudspeaker."""
+"""Recordings of what a machine plays, from a real PulseAudio without a loudspeaker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kouxing.shared.sound_devices import monitor, sound_devices
 
 pytestmark = pytest.mark.process
 RATE_HZ, TONE_HZ = 16_000, 1000
-MAX_BLOCKS = 1000  # 20 s: what is played without a loudspeaker may begin late
+MAX_BLOCKS = 1000  # 20 s: playback without a loudspeaker may start late
 SERVER = (
     *"pulseaudio -n --daemonize=no --exit-idle-time=-1 --use-pid-file=no --disable-shm=yes".split(),
     *("-L", "module-null-sink sink_properties=device.description=Loudspeaker"),
@@ -28,7 +28,7 @@ PLAYER = (
 
 @pytest.fixture(scope="module", autouse=True)
 def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A sound server of the test's own, and a program that plays a tone on it."""
+    """Start a sound server and a program that plays a tone."""
     folder = tmp_path_factory.mktemp("sound")
     tone = 16384 * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(60 * RATE_HZ))
     (folder / "tone").write_bytes(tone.astype("<i2").tobytes())
@@ -38,8 +38,8 @@ def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("XDG_RUNTIME_DIR", str(folder))
         server = subprocess.Popen(SERVER, stderr=quiet)
         try:
-            ask = ["pactl", "info"]
-            wait_until(lambda: subprocess.call(ask, stdout=quiet, stderr=quiet) == 0, 30)
+            info = ["pactl", "info"]
+            wait_until(lambda: subprocess.call(info, stdout=quiet, stderr=quiet) == 0, 30)
             with (folder / "tone").open("rb") as sound:
                 player = subprocess.Popen(PLAYER, stdin=sound, stderr=quiet)
             wait_until(lambda: len(programs()) == 1, 30)
@@ -52,31 +52,31 @@ def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def programs() -> list[str]:
-    return [each.name for each in sound_devices() if each.kind == "program"]
+    return [device.name for device in sound_devices() if device.kind == "program"]
 
 
-def num_listeners() -> int:
+def num_recordings() -> int:
     return len(subprocess.check_output("pactl list short source-outputs".split()).splitlines())
 
 
 @pytest.mark.parametrize("name", ["", "loudspeaker", "player"])
-def test_what_is_played_is_heard_until_nobody_listens(name: str) -> None:
+def test_records_until_the_reader_stops(name: str) -> None:
     blocks = monitor(name).blocks
-    assert num_listeners() == 0
-    num_heard = 0
+    assert num_recordings() == 0
+    num_tones = 0
     for block in itertools.islice(blocks, MAX_BLOCKS):
         peak_hz = np.argmax(np.abs(np.fft.rfft(block[:, 0]))) * RATE_HZ / len(block)
-        num_heard += int(abs(peak_hz - TONE_HZ) < 60 and np.abs(block).max() > 0.3)
-        if num_heard == 10:
+        num_tones += int(abs(peak_hz - TONE_HZ) < 60 and np.abs(block).max() > 0.3)
+        if num_tones == 10:
             break
-    assert num_heard == 10
+    assert num_tones == 10
     assert isinstance(blocks, Generator)
     blocks.close()
-    wait_until(lambda: num_listeners() == 0, 30)
+    wait_until(lambda: num_recordings() == 0, 30)
 
 
-def test_outputs_and_programs_are_listed() -> None:
-    assert [each.name for each in sound_devices() if each.kind == "monitor"] == [
+def test_lists_outputs_and_programs() -> None:
+    assert [device.name for device in sound_devices() if device.kind == "monitor"] == [
         "Monitor of Loudspeaker"
     ]
     assert programs() == ["Player"]

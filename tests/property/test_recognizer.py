@@ -1,8 +1,7 @@
-"""Any chunking gives the same result, and the parts of the recognizer keep their promises."""
+"""Chunks and other sessions do not affect results; invariants of search and output rule."""
 
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,10 +31,10 @@ from kouxing.services.recognizer.speech_scorer import (
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Waveform
 from tests.live_streams import LiveStream
+from tests.system import DEMO
 
 pytestmark = pytest.mark.property
 
-DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
 NOISE = np.random.default_rng(0).normal(0, 0.1, 12_000).astype(np.float32)
 CUTS = st.lists(st.integers(0, 32_000), max_size=60)
@@ -138,7 +137,7 @@ def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
 def test_output_rule_matches_the_paper(
     phones: list[int], num_stable_frames: int, before: int
 ) -> None:
-    """Li 2011, eq. 4, word for word."""
+    """Compare with Li 2011, eq. 4."""
     rule = OutputRule(OutputRuleConfig(num_stable_frames, 0.0), last_emitted=before)
     last = before
     for t, phone in enumerate(phones):
@@ -179,12 +178,12 @@ def test_a_search_continues_from_the_state_of_another(
     at = data.draw(st.integers(0, num_frames - 1))
     one, before, after = (Decoder(topology) for _ in range(3))
     for row in rows[::-1]:
-        last_phone_after(after, row)  # it has searched something else
+        last_phone_after(after, row)  # an earlier, different search
     expected = [last_phone_after(one, row) for row in rows]
-    begun = [last_phone_after(before, row) for row in rows[:at]]
+    beginning = [last_phone_after(before, row) for row in rows[:at]]
     after.copy_state(before)
     for decoder in (after, before):
-        assert begun + [last_phone_after(decoder, row) for row in rows[at:]] == expected
+        assert beginning + [last_phone_after(decoder, row) for row in rows[at:]] == expected
         assert decoder.path_since(0) == one.path_since(0)
         assert decoder.final_path() == one.final_path()
 
@@ -219,7 +218,7 @@ def test_correct_provisional_scores_give_the_same_phones_earlier() -> None:
     rows = settled_rows(model)
 
     def phones(num_provisional: int) -> tuple[list[Phone], list[int]]:
-        """All phones, and the frame known when each was emitted."""
+        """Return all phones, and the newest known frame when each was emitted."""
         decoder = LiveDecoder(model.topology, MODEL_RULES["neural"])
         decoder.decode([SpeechStart(0)])
         found: list[Phone] = []

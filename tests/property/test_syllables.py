@@ -1,4 +1,4 @@
-"""Captions survive phones, revisions and withdrawals in any order."""
+"""Captions are correct after phones, revisions and withdrawals in any order."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ PHONES = st.builds(
 def test_shows_exactly_the_phones_that_are_not_withdrawn(phones: list[Phone], text: str) -> None:
     track = SyllableTrack(MANDARIN, characters_of(text, MANDARIN))
     shown: dict[int, Syllable] = {}
-    standing: set[int] = set()
+    current: set[int] = set()
     for phone in phones:
-        standing.add(phone.index)
+        current.add(phone.index)
         if phone.is_withdrawn:
-            standing.remove(phone.index)
+            current.remove(phone.index)
         for syllable in track.update(phone):
             shown[syllable.index] = syllable
             if syllable.duration_s == 0.0:
                 del shown[syllable.index]
-        assert shown.keys() <= standing
+        assert shown.keys() <= current

@@ -60,11 +60,10 @@ def test_reads_an_hour_in_little_memory(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (b"", "empty"),
-        (b"this is no sound", "cannot read audio"),
+        (b"this is not audio", "cannot read audio"),
         (VOWELS_FILE.read_bytes()[:44], "no samples"),
-        (VOWELS_FILE.read_bytes()[:20], "cannot read audio"),
     ],
-    ids=["empty", "text", "header only", "half a header"],
+    ids=["empty", "text", "header only"],
 )
 def test_rejects_a_file_without_samples(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "bad.wav").write_bytes(content)
@@ -113,11 +112,6 @@ def test_ignores_the_unknown_length_of_a_pipe(tmp_path: Path) -> None:
     source = open_audio(path)
     assert sum(len(block) for block in source.blocks) == 1600
     assert source.remarks == []
-
-
-def test_rejects_a_bad_file_name(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cannot read the file: File name too long"):
-        open_audio(tmp_path / f"{'a' * 300}.wav")
 
 
 def test_rejects_a_folder(tmp_path: Path) -> None:
@@ -171,7 +165,7 @@ def test_reading_mp3_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture
     ("name", "codec", "rate_hz"),
     [("a.m4a", "aac", 44100), ("a.webm", "libopus", 48000), ("a.mkv", "pcm_s16le", 22050)],
 )
-def test_reads_recordings_of_telephones(
+def test_reads_the_formats_of_phones_and_browsers(
     tmp_path: Path, name: str, codec: str, rate_hz: int
 ) -> None:
     sine = (0.5 * np.sin(2 * np.pi * 440 * np.arange(rate_hz) / rate_hz)).astype(np.float32)
@@ -183,13 +177,11 @@ def test_reads_recordings_of_telephones(
     assert source.duration_s == pytest.approx(1.0, abs=0.1)
     assert {len(block) for block in blocks[:-1]} == {round(0.02 * rate_hz)}
     assert len(samples) / rate_hz == pytest.approx(1.0, abs=0.1)
-    spectrum = np.abs(np.fft.rfft(samples[:rate_hz]))
-    assert np.argmax(spectrum) == pytest.approx(440, abs=10)
-    assert np.abs(samples[rate_hz // 4 : rate_hz // 2]).max() == pytest.approx(0.5, abs=0.05)
+    assert np.argmax(np.abs(np.fft.rfft(samples[:rate_hz]))) == pytest.approx(440, abs=10)
     assert source.remarks == []
 
 
-def test_rejects_media_without_audio_and_remarks_on_cut_files(tmp_path: Path) -> None:
+def test_remarks_on_media_that_is_cut_off(tmp_path: Path) -> None:
     sine = (0.5 * np.sin(np.arange(96000) / 17)).astype(np.float32)
     _write_media(tmp_path / "a.mkv", "pcm_s16le", sine, 48000)
     data = (tmp_path / "a.mkv").read_bytes()
@@ -197,6 +189,9 @@ def test_rejects_media_without_audio_and_remarks_on_cut_files(tmp_path: Path) ->
     source = open_audio(tmp_path / "a.mkv")
     assert sum(len(block) for block in source.blocks) > 0
     assert "cut off" in source.remarks[0]
+
+
+def test_rejects_media_without_audio_and_playlists(tmp_path: Path) -> None:
     with av.open(tmp_path / "mute.mp4", "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
         assert isinstance(stream, av.VideoStream)
@@ -207,6 +202,6 @@ def test_rejects_media_without_audio_and_remarks_on_cut_files(tmp_path: Path) ->
         container.mux(stream.encode(None))
     with pytest.raises(UserError, match="has no audio"):
         open_audio(tmp_path / "mute.mp4")
-    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:5,\n{tmp_path / 'a.mkv'}\n")
+    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:5,\n{VOWELS_FILE}\n")
     with pytest.raises(UserError, match="cannot read audio"):
         open_audio(tmp_path / "list.m3u8")

@@ -1,4 +1,4 @@
-"""Audio messages in the order in which the recognizer accepts them."""
+"""The order in which the recognizer accepts audio messages."""
 
 from __future__ import annotations
 

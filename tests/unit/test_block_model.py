@@ -1,4 +1,4 @@
-"""The block model: Whisper's encoder on blocks with a cached past, its file."""
+"""The block model: its scores, its chunks and its file."""
 
 from functools import cache, partial
 from pathlib import Path
@@ -19,10 +19,10 @@ from kouxing.training.blocks.export import onnx_of
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
 from kouxing.training.blocks.readout import READOUT
 from kouxing.training.neural.network import Shape
+from tests.system import DEMO
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 
-DEMO = Path(__file__).parents[2] / "shared" / "demo"
 VAD = MODELS / "silero_vad.onnx"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 FRAMES = np.resize(WhisperMel().accept_waveform(HELLO), (330, 80))  # more than a past
@@ -37,7 +37,7 @@ SCALE = np.float32(0.5)
 def networks(num_states: int = 180) -> tuple[BlockEncoder, BlockReadout]:
     torch.manual_seed(0)
     encoder = BlockEncoder(SMALL(num_states=num_states)).eval()
-    with torch.no_grad():  # trained weights differ more than new ones
+    with torch.no_grad():  # trained weights are larger than initial ones
         encoder.first.weight *= 6
         encoder.second.weight *= 6
         for name, weight in encoder.named_parameters():
@@ -64,7 +64,7 @@ def scores_of(model: BlockModel, frames: np.ndarray) -> np.ndarray:
 
 
 def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
-    """Scores of a recording's blocks, (blocks, 2 (B + R), states)."""
+    """Return the scores of a recording's blocks, (blocks, 2 (B + R), states)."""
     encoder, readout = networks()
     num_positions = (len(frames) + 1) // 2
     laid = layout(num_positions, block_length)
@@ -73,18 +73,15 @@ def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
         features = encoder(torch.from_numpy(np.concatenate([frames, repeated]))[None], laid)
         rows = readout.read(features, laid)[0].numpy()
     scores = SCALE * (rows - blocks().log_prior)
-    found: np.ndarray = scores[laid.blocks.numpy()].reshape(len(laid.blocks), -1, 180)
-    return found
-
-
-# --- scores
+    by_block: np.ndarray = scores[laid.blocks.numpy()].reshape(len(laid.blocks), -1, 180)
+    return by_block
 
 
 def test_onnxruntime_and_pytorch_agree() -> None:
     expected = torch_scores(FRAMES, BLOCK)
     stream = blocks().create_stream()
     start = 0
-    for number, scores in enumerate(expected[:-4]):  # those with a whole right context
+    for number, scores in enumerate(expected[:-4]):  # blocks with a complete right context
         end = 2 * (BLOCK * number + LENGTH) + 1
         settled = stream.score(FRAMES[start:end])
         assert len(settled) == 2 * BLOCK
@@ -98,46 +95,9 @@ def test_onnxruntime_and_pytorch_agree() -> None:
 def test_the_last_run_settles_all_positions_together(num_frames: int) -> None:
     frames = FRAMES[:num_frames]
     (expected,) = torch_scores(frames, LENGTH)
-    found = scores_of(blocks(), frames)
-    assert len(found) == num_frames
-    np.testing.assert_allclose(found, expected[:num_frames], atol=0.05)
-
-
-def test_before_the_first_whole_block_all_scores_are_provisional() -> None:
-    stream = blocks().create_stream()
-    for number in range(1, 2 * LENGTH + 1):
-        before = stream.provisional
-        assert len(stream.score(FRAMES[number - 1 : number])) == 0
-        num_positions = (number - 1) // 2
-        if number % 2 and num_positions % BLOCK == RIGHT % BLOCK:
-            (expected,) = torch_scores(FRAMES[:number], LENGTH)
-            expected = expected[: 2 * num_positions]
-            assert len(stream.provisional) == 2 * num_positions
-        else:
-            assert stream.provisional is before
-    assert len(stream.score(FRAMES[2 * LENGTH : 2 * LENGTH + 1])) == 2 * BLOCK
-
-
-def test_scores_come_within_the_look_ahead() -> None:
-    stream = blocks().create_stream()
-    assert stream.look_ahead_frames == 2 * LENGTH
-    num_settled = 0
-    for number in range(1, 100):
-        num_settled += len(stream.score(FRAMES[number - 1 : number]))
-        assert num_settled >= number - 2 * LENGTH
-        run = (number - 1) // 2 - ((number - 1) // 2 - RIGHT) % BLOCK  # positions at the last run
-        assert num_settled + len(stream.provisional) == max(0, 2 * run)
-    assert num_settled + len(stream.score(None)) == 99
-    assert len(stream.provisional) == 0
-
-
-@pytest.mark.parametrize("num_frames", [0, 1, 2, 3, 28, 29, 30, 36, 37])
-def test_settles_every_frame_once(num_frames: int) -> None:
-    stream = blocks().create_stream()
-    for _ in range(2):
-        rows = [*stream.score(FRAMES[:num_frames]), *stream.score(None)]
-        assert len(rows) == num_frames
-    assert len(stream.score(None)) == 0
+    scores = scores_of(blocks(), frames)
+    assert len(scores) == num_frames
+    np.testing.assert_allclose(scores, expected[:num_frames], atol=0.05)
 
 
 def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
@@ -149,54 +109,21 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
         expected[number] = (settled, lone.provisional)
     whole = scores_of(model, FRAMES)
     rng = np.random.default_rng(0)
-    num_streams = 18  # more than share a run
+    num_streams = 18  # more than one run has
     streams = [model.create_stream() for _ in range(num_streams)]
     rows: list[list[np.ndarray]] = [[] for _ in streams]
     at = [0] * num_streams
     while min(at) < len(FRAMES):
-        company = rng.permutation([n for n in range(num_streams) if at[n] < len(FRAMES)])
-        company = company[: rng.integers(1, num_streams + 1)]
-        ends = {n: min(at[n] + int(rng.integers(1, 40)), len(FRAMES)) for n in company}
-        work = [(streams[n], FRAMES[at[n] : ends[n]]) for n in company]
-        for n, scores in zip(company, model.score(work), strict=True):
+        ready = rng.permutation([n for n in range(num_streams) if at[n] < len(FRAMES)])
+        ready = ready[: rng.integers(1, num_streams + 1)]
+        ends = {n: min(at[n] + int(rng.integers(1, 40)), len(FRAMES)) for n in ready}
+        work = [(streams[n], FRAMES[at[n] : ends[n]]) for n in ready]
+        for n, scores in zip(ready, model.score(work), strict=True):
             rows[n].append(scores)
             at[n] = ends[n]
             np.testing.assert_array_equal(streams[n].provisional, expected[at[n]][1])
-    for stream, found in zip(streams, rows, strict=True):
-        np.testing.assert_array_equal(np.concatenate([*found, stream.score(None)]), whole)
-
-
-def test_scores_do_not_depend_on_frames_before_the_past() -> None:
-    model = blocks()
-    past, layers = model.session.sizes.past, model.session.sizes.layers
-    reach = 2 * layers * (past + LENGTH)
-    frames = np.resize(FRAMES, (reach + 60, 80))
-    frames[:4] = 0.1  # not the loudest
-    other = frames.copy()
-    other[:4] += 0.3
-    one, two = (scores_of_encoder(model, each) for each in (frames, other))
-    assert not np.array_equal(one[100], two[100])
-    np.testing.assert_array_equal(one[reach:], two[reach:])
-
-
-def scores_of_encoder(model: BlockModel, frames: np.ndarray) -> np.ndarray:
-    """Keys and values of each block: the recurrent layer remembers more than the caches."""
-    stream = model.create_stream()
-    kept = []
-    for start in range(0, len(frames), 8):
-        stream.score(frames[start : start + 8])
-        kept.append(stream.cache.rings.copy())
-    return np.stack(kept)
-
-
-def test_segments_are_independent() -> None:
-    stream = blocks().create_stream()
-    first = np.concatenate([stream.score(FRAMES), stream.score(None)])
-    stream.score(FRAMES[:77])
-    stream.reset()
-    assert len(stream.provisional) == 0
-    again = np.concatenate([stream.score(FRAMES), stream.score(None)])
-    np.testing.assert_array_equal(again, first)
+    for stream, parts in zip(streams, rows, strict=True):
+        np.testing.assert_array_equal(np.concatenate([*parts, stream.score(None)]), whole)
 
 
 def test_long_speech_restarts_the_table_with_an_empty_past(
@@ -206,28 +133,11 @@ def test_long_speech_restarts_the_table_with_an_empty_past(
     monkeypatch.setattr(blocks_module, "MAX_POSITIONS", 40)
     short = scores_of(blocks(), FRAMES)
     assert short.shape == whole.shape
-    np.testing.assert_array_equal(short[:56], whole[:56])  # with a whole right context
+    np.testing.assert_array_equal(short[:56], whole[:56])  # with a complete right context
     assert not np.array_equal(short[80:160], whole[80:160])
     later = FRAMES.copy()
-    later[:78] = later[later[:78].max(axis=1).argmax()]  # only seen before the new beginning
+    later[:78] = later[later[:78].max(axis=1).argmax()]  # frames that only precede the restart
     np.testing.assert_array_equal(scores_of(blocks(), later)[80:], short[80:])
-
-
-def test_a_speaking_session_needs_less_than_two_megabytes() -> None:
-    sizes = blocks().session.sizes
-    assert sizes.past == 125
-    whisper = blocks_module.BlockSizes(5, 15, 125, 512, 192, layers=6, heads=8, head_size=64)
-    assert whisper.cache.num_bytes < 1.6e6
-
-
-# --- the file
-
-
-def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
-    blocks().save(tmp_path / "blocks.npz")
-    again = load_model(tmp_path / "blocks.npz", look_ahead_ms=60.0)  # is ignored
-    assert isinstance(again, BlockModel)
-    np.testing.assert_array_equal(scores_of(again, FRAMES), scores_of(blocks(), FRAMES))
 
 
 def file_of(*, past: int = 125, block: int = BLOCK, states: int = 180) -> np.ndarray:
@@ -245,8 +155,8 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     changes: list[tuple[dict[str, np.ndarray], str]] = [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
         ({"network": np.frombuffer(VAD.read_bytes(), np.uint8)}, "has the inputs"),
-        ({"network": file_of(past=122)}, "has the sizes"),  # no multiple of a block
-        ({"network": file_of(past=6000)}, "has the sizes"),  # more memory than a session has
+        ({"network": file_of(past=122)}, "has the sizes"),  # not a multiple of a block
+        ({"network": file_of(past=6000)}, "has the sizes"),  # too much memory for a session
         ({"network": file_of(states=178)}, r"its network scores \(1, 30, 178\)"),
         ({"network": onnx_of(encoder, broken, BLOCK)}, "are not finite"),
         ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),

@@ -1,4 +1,4 @@
-"""Caches of sessions side by side: what is in them stays theirs, wherever they lie."""
+"""Adjacent caches of sessions: each session keeps its values in any run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LARGE = CacheSizes(rings=4, heads=8, slots=128, head_size=128)  # 1 MiB
 
 
 def marked(memory: CacheMemory, number: int) -> list[Cache]:
-    """Open caches that are full of their numbers, from 1."""
+    """Open caches and fill each with its number, from 1."""
     caches = [memory.open() for _ in range(number)]
     for mark, cache in enumerate(caches, start=1):
         cache.rings[:] = mark
@@ -26,11 +26,11 @@ def test_sessions_keep_their_caches_in_any_run() -> None:
     rng = np.random.default_rng(0)
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, NUM_PLACES)
-    del caches[::5]  # there are free places among them
+    del caches[::5]  # leaves free places between them
     marks = [int(cache.rings.flat[0]) for cache in caches]
     for _ in range(100):
         chosen = rng.permutation(len(caches))[: rng.integers(1, len(caches) + 1)]
-        ((numbers, rings),) = memory.runs([caches[each] for each in chosen])
+        ((numbers, rings),) = memory.runs([caches[number] for number in chosen])
         assert sorted(numbers) == [*range(len(chosen))]
         assert rings.shape == (4, len(chosen), 2, 64, 64)
         for row, number in enumerate(numbers):
@@ -47,38 +47,16 @@ def test_a_run_writes_to_the_caches() -> None:
     assert [int(cache.rings.flat[0]) for cache in caches] == [10, 2, 3, 4, 40]
 
 
-def test_adjacent_caches_are_not_moved() -> None:
-    memory = CacheMemory(SIZES, NUM_PLACES)
-    caches = marked(memory, 6)
-    for chosen in ([1, 2, 3], [5, 4], [3]):
-        before = [cache.place for cache in caches]
-        list(memory.runs([caches[each] for each in chosen]))
-        assert [cache.place for cache in caches] == before
-    places = [cache.place for cache in caches]
-    list(memory.runs([caches[0], caches[5]]))
-    assert sum(cache.place != before for cache, before in zip(caches, places, strict=True)) == 2
-
-
 def test_splits_many_sessions_into_runs() -> None:
     memory = CacheMemory(SIZES, NUM_PLACES)
     caches = marked(memory, 2 * NUM_PLACES + 1)
     runs = list(memory.runs(caches))
     assert [len(numbers) for numbers, _ in runs] == [NUM_PLACES, NUM_PLACES, 1]
     for numbers, rings in runs:
-        assert [int(mark) for mark in rings[0, :, 0, 0, 0]] == [each + 1 for each in numbers]
-
-
-def test_reuses_the_place_of_a_deleted_cache() -> None:
-    memory = CacheMemory(SIZES, NUM_PLACES)
-    caches = marked(memory, NUM_PLACES)
-    shelf, place = caches[3].shelf, caches[3].place
-    del caches[3]
-    again = memory.open()
-    assert (again.shelf, again.place) == (shelf, place)
+        assert [int(mark) for mark in rings[0, :, 0, 0, 0]] == [number + 1 for number in numbers]
 
 
 def test_uses_memory_only_for_written_caches() -> None:
-
     memory = CacheMemory(LARGE, NUM_PLACES)
     first = memory.open()
     before_mb = memory_mb()

@@ -21,14 +21,6 @@ def tone(hz: float, seconds: float = 0.5, level: float = 0.3) -> np.ndarray:
     return (level * np.sin(2 * np.pi * hz * time_s)).astype(np.float32)
 
 
-def test_frames_are_ready_with_their_last_sample() -> None:
-    log_mel = LogMel()
-    assert len(log_mel.accept_waveform(np.zeros(399, np.float32))) == 0
-    assert len(log_mel.accept_waveform(np.zeros(1, np.float32))) == 1
-    assert len(log_mel.accept_waveform(np.zeros(159, np.float32))) == 0
-    assert len(log_mel.accept_waveform(np.zeros(1 + 160 * 8, np.float32))) == 9
-
-
 def test_a_tone_is_loudest_in_its_band() -> None:
     low = LogMel().accept_waveform(tone(200.0))[5, 1:].argmax()
     high = LogMel().accept_waveform(tone(4000.0))[5, 1:].argmax()
@@ -82,10 +74,10 @@ def test_live_mean_adapts_from_the_prior_to_the_speaker() -> None:
     features = np.concatenate([static, rng.normal(size=(3000, 26))], axis=1).astype(np.float32)
     mean = LiveMean(np.zeros(NUM_STATIC, np.float32))
     normalized = mean.normalize(features)
-    assert normalized[0, 1:NUM_STATIC].mean() > 3  # the prior still rules
+    assert normalized[0, 1:NUM_STATIC].mean() > 3  # the prior dominates
     assert np.abs(normalized[-1000:, :NUM_STATIC].mean(axis=0)).max() < 0.6
     np.testing.assert_array_equal(normalized[:, NUM_STATIC:], features[:, NUM_STATIC:])
-    # goes on with the same speaker, starts anew after reset
+    # the mean persists until reset
     assert abs(mean.normalize(features[:50])[:, 1:NUM_STATIC].mean()) < 1
     mean.reset()
     np.testing.assert_array_equal(mean.normalize(features), normalized)

@@ -1,4 +1,4 @@
-"""Mouth profiles: the file format, what a profile changes, and learning one."""
+"""Mouth profiles: their format, their effect, and how they are learned."""
 
 from __future__ import annotations
 
@@ -78,10 +78,10 @@ def test_rejects_invalid_profiles(content: bytes, message: str) -> None:
 
 
 def test_clips_values_to_their_bounds() -> None:
-    wild = MouthProfile(
+    extreme = MouthProfile(
         scale=PROFILE.scale - 9, offset=PROFILE.offset * 1e6, residual=PROFILE.residual * 1e6
     )
-    MODEL.with_mouth_profile(wild.to_bytes(MODEL.digest))
+    MODEL.with_mouth_profile(extreme.to_bytes(MODEL.digest))
 
 
 def test_reads_only_small_files_that_start_like_a_profile(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_the_adapted_model_computes_the_formula() -> None:
 
 
 def observations(num_positions: int, profile: MouthProfile, noise: float = 20.0) -> Observations:
-    """Speech of somebody with this mouth."""
+    """Return the speech of a speaker with this profile."""
     rng = np.random.default_rng(1)
     hidden = rng.normal(size=(num_positions, SHAPE[0])).astype(np.float32)
     predicted = 100 * rng.normal(size=(num_positions, SHAPE[1], NUM_FAPS)).astype(np.float32)
@@ -126,15 +126,6 @@ def test_learns_a_profile_from_enough_speech() -> None:
     np.testing.assert_allclose(learned.scale, PROFILE.scale, atol=0.1)
     np.testing.assert_allclose(learned.offset, PROFILE.offset, atol=3)
     np.testing.assert_allclose(learned.residual, PROFILE.residual, atol=5)
-
-
-def test_learns_only_the_affine_map_if_there_is_no_residual() -> None:
-    affine = MouthProfile(
-        scale=PROFILE.scale, offset=PROFILE.offset, residual=np.zeros(SHAPE, np.float32)
-    )
-    learned = fit_profile(observations(600, affine, noise=200.0))
-    assert np.abs(learned.residual).max() < 10
-    np.testing.assert_allclose(learned.offset, PROFILE.offset, atol=30)
 
 
 def test_untracked_faps_keep_the_models_prediction() -> None:

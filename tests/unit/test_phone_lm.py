@@ -1,4 +1,4 @@
-"""Back-off n-grams as a tree, as a graph and in files, against the formula."""
+"""Back-off n-grams: the graph, compared with the formula, and the file."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,36 +8,32 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.model_file import Archive, phone_lm_arrays, phone_lm_from
-from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
+from kouxing.services.recognizer.search.phone_lm import MAX_ORDER
 from tests.languages import NUM_PHONES, SIL, START, Gram, Table, flat_language, step
 
 pytestmark = pytest.mark.unit
 
 PHONES_IN_USE = (0, 7, 21, 30, 58, SIL)
-Arrays = dict[str, NDArray[Any]]
 
 
 def table(seed: int, order: int, kept: float) -> Table:
     return Table.draw(np.random.default_rng(seed), PHONES_IN_USE, order=order, kept=kept)
 
 
-# --- the graph
-
-
 @pytest.mark.parametrize(
     ("order", "kept"), [(2, 1.0), (3, 1.0), (2, 0.5), (3, 0.3), (5, 0.6), (6, 0.4)]
 )
 def test_graph_matches_the_formula(order: int, kept: float) -> None:
-    wanted = table(order, order, kept)
-    assert wanted.order == order
-    graph = wanted.tree().graph
+    expected = table(order, order, kept)
+    assert expected.order == order
+    graph = expected.tree().graph
     rng = np.random.default_rng(0)
     for _ in range(100):
         before: tuple[int, ...] = (SIL,)
         context = START
         for phone in rng.choice(PHONES_IN_USE, 12).tolist():
             log_prob, context = step(graph, context, phone)
-            assert log_prob == pytest.approx(wanted.after(before, phone), abs=1e-4)
+            assert log_prob == pytest.approx(expected.after(before, phone), abs=1e-4)
             before += (phone,)
 
 
@@ -51,12 +47,12 @@ def test_every_phone_has_a_context(kept: float) -> None:
     assert (graph.last_phone == SIL).sum() == 1
     assert len(graph.first_arc) == len(graph.last_phone) + 1
     assert graph.first_arc[-1] == len(graph.arc_phone)
-    # shorter contexts come first, so that every chain of them ends in the empty one
+    # shorter contexts precede longer ones, so every chain ends in the empty context
     assert (graph.backoff_state[1:] < np.arange(1, len(graph.backoff_state))).all()
 
 
 def test_unknown_contexts_back_off() -> None:
-    """After 0 7 comes 21, but neither 7 21 nor 0 7 21 begins anything: the context is 21."""
+    """No n-gram starts with 7 21 or 0 7 21. So after 0 7 21, the context is 21."""
     singles: dict[Gram, float] = {(phone,): -4.0 for phone in range(NUM_PHONES)}
     known = Table(singles | {(0, 7): -1.0, (0, 7, 21): -2.0}, {(0,): -0.5, (0, 7): -0.25})
     graph = known.tree().graph
@@ -70,19 +66,8 @@ def test_unknown_contexts_back_off() -> None:
 def test_levels() -> None:
     assert flat_language().levels == [0, 1, 1 + NUM_PHONES]
     assert len(table(0, 5, 1.0).tree().levels) == 7
-    wanted = table(0, 3, 0.5)
-    assert Table.of(wanted.tree()).log_prob == pytest.approx(wanted.log_prob, abs=1e-5)
-
-
-# --- files
-
-
-def changed(change: Callable[[Arrays], None]) -> PhoneLanguageModel:
-    arrays = {
-        name: array.copy() for name, array in phone_lm_arrays(table(0, 3, 0.5).tree()).items()
-    }
-    change(arrays)
-    return phone_lm_from(Archive(arrays))
+    expected = table(0, 3, 0.5)
+    assert Table.of(expected.tree()).log_prob == pytest.approx(expected.log_prob, abs=1e-5)
 
 
 def test_arrays_round_trip() -> None:
@@ -107,121 +92,55 @@ def test_clips_unlikely_n_grams() -> None:
     np.testing.assert_allclose(again.log_backoff[1:4], [-6.35, 6.35, 0.0], rtol=1e-6)
 
 
-def root_without_a_child(arrays: Arrays) -> None:
-    arrays["lm_children"][:2] = [NUM_PHONES - 1, arrays["lm_children"][1] + 1]
+def with_values(array: NDArray[Any], values: dict[int, int]) -> NDArray[Any]:
+    array = array.astype(np.int64)
+    for index, value in values.items():
+        array[index] = value
+    return array
 
 
-def one_child_more(arrays: Arrays) -> None:
-    arrays["lm_children"][-1] += 1
-
-
-def one_child_less(arrays: Arrays) -> None:
-    arrays["lm_children"][1] -= 1
-
-
-def negative_child(arrays: Arrays) -> None:
-    children = arrays["lm_children"].astype(np.int64)
-    children[-2:] = [-1, 1]
-    arrays["lm_children"] = children
-
-
-def child_of_itself(arrays: Arrays) -> None:
-    """The numbers add up, but no level follows the first."""
-    arrays["lm_children"] = np.array([NUM_PHONES, *[0] * NUM_PHONES, 1])
-
-
-def child_before_its_parent(arrays: Arrays) -> None:
-    arrays["lm_children"] = np.array([NUM_PHONES, *[0] * NUM_PHONES, 0, 3, 0])
-
-
-def too_many_to_add_up(arrays: Arrays) -> None:
-    children = np.zeros(1 + NUM_PHONES, np.int64)
-    children[:5] = [NUM_PHONES, *[2**62] * 4]  # their sum is 60 in 64 bits
-    arrays["lm_children"] = children
-
-
-def no_list(arrays: Arrays) -> None:
-    arrays["lm_children"] = arrays["lm_children"][None]
-
-
-def too_few(arrays: Arrays) -> None:
-    arrays["lm_children"] = np.zeros(NUM_PHONES, np.uint8)
-
-
-def empty(arrays: Arrays) -> None:
-    arrays["lm_children"] = np.zeros(0, np.uint8)
-
-
-def no_counts(arrays: Arrays) -> None:
-    arrays["lm_children"] = np.array(["many"] * 100)
-
-
-def swapped_phones(arrays: Arrays) -> None:
-    arrays["lm_phone"][[3, 4]] = arrays["lm_phone"][[4, 3]]
-
-
-def phone_twice(arrays: Arrays) -> None:
-    arrays["lm_phone"][4] = arrays["lm_phone"][3]
-
-
-def phone_60(arrays: Arrays) -> None:
-    arrays["lm_phone"][NUM_PHONES] = 60
-
-
-def phone_below_none(arrays: Arrays) -> None:
-    phones = arrays["lm_phone"].astype(np.int64)
-    phones[1] = -1
-    arrays["lm_phone"] = phones
-
-
-def one_phone_less(arrays: Arrays) -> None:
-    arrays["lm_phone"] = arrays["lm_phone"][:-1]
-
-
-def one_log_prob_less(arrays: Arrays) -> None:
-    arrays["lm_log_prob"] = arrays["lm_log_prob"][:-1]
-
-
-def one_backoff_less(arrays: Arrays) -> None:
-    arrays["lm_log_backoff"] = arrays["lm_log_backoff"][:-1]
-
-
-def log_prob_that_is_not_finite(arrays: Arrays) -> None:
-    arrays["lm_log_prob"] = np.full(arrays["lm_log_prob"].shape, np.nan)
-
-
-def no_backoff(arrays: Arrays) -> None:
-    del arrays["lm_log_backoff"]
+LEAVES = [0] * NUM_PHONES
+Change = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "change", "message"),
     [
-        (root_without_a_child, "not a tree"),
-        (one_child_more, "not a tree"),
-        (one_child_less, "not a tree"),
-        (negative_child, "not a tree"),
-        (child_of_itself, "not a tree"),
-        (child_before_its_parent, "not a tree"),
-        (too_many_to_add_up, "not a tree"),
-        (no_list, r"has shape \(1, "),
-        (too_few, r"has shape \(60,\)"),
-        (empty, r"has shape \(0,\)"),
-        (no_counts, "many"),
-        (swapped_phones, "not in order"),
-        (phone_twice, "not in order"),
-        (phone_60, "not in order"),
-        (phone_below_none, "not in order"),
-        (one_phone_less, "lm_phone has shape"),
-        (one_log_prob_less, "lm_log_prob has shape"),
-        (one_backoff_less, "lm_log_backoff has shape"),
-        (log_prob_that_is_not_finite, "not finite"),
-        (no_backoff, "lm_log_backoff is missing"),
+        # the numbers of children
+        ("lm_children", lambda c: with_values(c, {0: c[0] - 1, 1: c[1] + 1}), "not a tree"),
+        ("lm_children", lambda c: with_values(c, {-1: c[-1] + 1}), "not a tree"),
+        ("lm_children", lambda c: with_values(c, {1: c[1] - 1}), "not a tree"),
+        ("lm_children", lambda c: with_values(c, {-2: -1, -1: 1}), "not a tree"),
+        # the sums are right: a node that is its own child, and a child before its parent
+        ("lm_children", lambda _: np.array([NUM_PHONES, *LEAVES, 1]), "not a tree"),
+        ("lm_children", lambda _: np.array([NUM_PHONES, *LEAVES, 0, 3, 0]), "not a tree"),
+        # a sum that overflows to the right one
+        ("lm_children", lambda _: np.array([NUM_PHONES, *[2**62] * 4, *LEAVES[4:]]), "not a tree"),
+        ("lm_children", lambda c: c[None], r"has shape \(1, "),
+        ("lm_children", lambda _: np.zeros(NUM_PHONES, np.uint8), r"has shape \(60,\)"),
+        ("lm_children", lambda _: np.zeros(0, np.uint8), r"has shape \(0,\)"),
+        ("lm_children", lambda _: np.array(["many"] * 100), "many"),
+        ("lm_phone", lambda p: with_values(p, {3: p[4], 4: p[3]}), "not in order"),
+        ("lm_phone", lambda p: with_values(p, {4: p[3]}), "not in order"),
+        ("lm_phone", lambda p: with_values(p, {NUM_PHONES: 60}), "not in order"),
+        ("lm_phone", lambda p: with_values(p, {1: -1}), "not in order"),
+        ("lm_phone", lambda p: p[:-1], "lm_phone has shape"),
+        ("lm_log_prob", lambda values: values[:-1], "lm_log_prob has shape"),
+        ("lm_log_prob", lambda values: np.full(values.shape, np.nan), "not finite"),
+        ("lm_log_backoff", lambda values: values[:-1], "lm_log_backoff has shape"),
     ],
 )
-def test_rejects_damaged_arrays(change: Callable[[Arrays], None], message: str) -> None:
+def test_rejects_damaged_arrays(name: str, change: Change, message: str) -> None:
+    arrays = phone_lm_arrays(table(0, 3, 0.5).tree())
     with pytest.raises(ValueError, match=message):
-        changed(change)
+        phone_lm_from(Archive({**arrays, name: change(arrays[name])}))
+
+
+def test_rejects_a_missing_array() -> None:
+    arrays = phone_lm_arrays(table(0, 3, 0.5).tree())
+    del arrays["lm_log_backoff"]
+    with pytest.raises(ValueError, match="lm_log_backoff is missing"):
+        phone_lm_from(Archive(arrays))
 
 
 @pytest.mark.parametrize("num_phones", [MAX_ORDER, MAX_ORDER + 1])

@@ -1,4 +1,4 @@
-"""The pitch of made-up voices."""
+"""The pitch of synthetic voices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RATE_HZ, SLICE = 16_000, 320
 
 
 def voice(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Ten harmonics of a frequency for each sample."""
+    """Return ten harmonics of a frequency, given for every sample."""
     phase = 2.0 * np.pi * np.cumsum(frequency_hz) / RATE_HZ
     tones = [np.sin(number * phase) / number for number in range(1, 11)]
     return np.asarray(0.1 * np.sum(tones, axis=0), np.float32)
@@ -22,7 +22,7 @@ def voice(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
 
 def pitches(samples: NDArray[np.float32], num_before: int = 0) -> NDArray[np.float64]:
     pitch = PitchTracker(num_before)
-    return np.array([pitch.track(each) for each in samples.reshape(-1, SLICE)])
+    return np.array([pitch.track(part) for part in samples.reshape(-1, SLICE)])
 
 
 def noise(num_samples: int) -> NDArray[np.float32]:
@@ -31,26 +31,26 @@ def noise(num_samples: int) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize("frequency_hz", [80.0, 120.0, 220.0, 330.0])
 def test_tracks_a_constant_pitch(frequency_hz: float) -> None:
-    found = pitches(voice(np.full(RATE_HZ, frequency_hz)))[10:]
-    np.testing.assert_allclose(found, frequency_hz, rtol=0.03)
+    pitch_hz = pitches(voice(np.full(RATE_HZ, frequency_hz)))[10:]
+    np.testing.assert_allclose(pitch_hz, frequency_hz, rtol=0.03)
 
 
 def test_tracks_a_rising_pitch_but_not_noise_or_silence() -> None:
     rising = voice(np.linspace(150.0, 250.0, RATE_HZ))
     silent = np.zeros(RATE_HZ // 2, np.float32)
-    found = pitches(np.concatenate([silent, rising, noise(RATE_HZ)]))
-    assert not found[:25].any()
+    pitch_hz = pitches(np.concatenate([silent, rising, noise(RATE_HZ)]))
+    assert not pitch_hz[:25].any()
     expected_hz = np.linspace(150.0, 250.0, 50)
-    np.testing.assert_allclose(found[35:73], expected_hz[10:48], rtol=0.05)
-    assert np.count_nonzero(found[80:]) < 5
+    np.testing.assert_allclose(pitch_hz[35:73], expected_hz[10:48], rtol=0.05)
+    assert np.count_nonzero(pitch_hz[80:]) < 5
 
 
 def test_tracks_a_long_voice() -> None:
     pause = noise(RATE_HZ)
     spoken = voice(np.full(11 * RATE_HZ, 200.0))
-    found = pitches(np.concatenate([spoken, pause, spoken[: 2 * RATE_HZ]]))
-    np.testing.assert_allclose(found[10:545], 200.0, rtol=0.03)
-    np.testing.assert_allclose(found[12 * 50 + 10 :], 200.0, rtol=0.03)
+    pitch_hz = pitches(np.concatenate([spoken, pause, spoken[: 2 * RATE_HZ]]))
+    np.testing.assert_allclose(pitch_hz[10:545], 200.0, rtol=0.03)
+    np.testing.assert_allclose(pitch_hz[12 * 50 + 10 :], 200.0, rtol=0.03)
 
 
 def test_a_tracker_that_starts_later_soon_agrees() -> None:

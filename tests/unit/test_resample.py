@@ -17,16 +17,16 @@ def tone(rate_hz: int, hz: float = 440.0, seconds: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("rate_hz", RATES)
 def test_keeps_a_tone(rate_hz: int) -> None:
-    heard = to_16_khz(tone(rate_hz), rate_hz)
-    assert abs(len(heard) - 16_000) <= 1
+    resampled = to_16_khz(tone(rate_hz), rate_hz)
+    assert abs(len(resampled) - 16_000) <= 1
     inner = slice(1000, 15_000)
-    np.testing.assert_allclose(heard[inner], tone(16_000)[inner], atol=2e-3)
+    np.testing.assert_allclose(resampled[inner], tone(16_000)[inner], atol=2e-3)
 
 
 def test_averages_stereo() -> None:
     left = tone(48_000)
-    heard = to_16_khz(np.stack([left, np.zeros_like(left)], axis=1), 48_000)
-    np.testing.assert_allclose(heard[1000:15_000], 0.5 * tone(16_000)[1000:15_000], atol=2e-3)
+    resampled = to_16_khz(np.stack([left, np.zeros_like(left)], axis=1), 48_000)
+    np.testing.assert_allclose(resampled[1000:15_000], 0.5 * tone(16_000)[1000:15_000], atol=2e-3)
 
 
 def test_removes_frequencies_above_8_khz() -> None:

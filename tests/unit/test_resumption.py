@@ -1,4 +1,4 @@
-"""A recognizer that continues the session of a lost one."""
+"""A recognizer that continues the session of a lost recognizer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a talking session takes in the recognizer is little, and does not grow."""
+"""The memory of a speaking session in the recognizer: small, and it does not grow."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_GROWTH_MB = 0.2  # of a session, from one round to the next
 
 
 class Sessions:
-    """Streams that speak at once; any of them are processed together, as chunks happen to come."""
+    """Streams that speak at the same time; random groups of them are decoded together."""
 
     def __init__(self, model: AcousticModel) -> None:
         self._recognizer = Recognizer(model)
@@ -65,7 +65,7 @@ class Sessions:
 
 
 def used_mb() -> float:
-    """Return what this process takes, without what the C library keeps for later."""
+    """Return the memory of this process, without the C library's free memory."""
     give_back_memory()
     return memory_mb()
 
@@ -77,15 +77,15 @@ def test_a_speaking_session_needs_less_than_4_mb() -> None:
     sessions.speak_a_round()
     gc.collect()
     sessions.remove_all()
-    assert gc.collect() == 0, "what waits for the collection of cycles is kept for long"
+    assert gc.collect() == 0, "reference cycles keep memory for long"
     before_mb = used_mb()
     sessions.add(NUM_SESSIONS)
     used = []
     for _ in range(3):
         sessions.speak_a_round()
         used.append(used_mb())
-    each_mb = [(mb - before_mb) / NUM_SESSIONS for mb in used]
-    assert max(each_mb) < MAX_MB, each_mb
-    assert each_mb[-1] - each_mb[0] < MAX_GROWTH_MB, each_mb
+    used_mb_per_session = [(mb - before_mb) / NUM_SESSIONS for mb in used]
+    assert max(used_mb_per_session) < MAX_MB, used_mb_per_session
+    assert used_mb_per_session[-1] - used_mb_per_session[0] < MAX_GROWTH_MB, used_mb_per_session
     sessions.remove_all()
     assert used_mb() - before_mb < MAX_MB

@@ -1,4 +1,4 @@
-"""What the machine plays, from a sound server that is scripted."""
+"""Recordings of what the machine plays, from a scripted sound server."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ PCM = np.full(1000, 1 << 14, "<i2").tobytes()
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of programs that answer for a sound server, and write down what they were asked."""
+    """Install programs that replace a sound server's and record their arguments."""
     (tmp_path / "sources").write_text(json.dumps(SOURCES))
     (tmp_path / "sink-inputs").write_text(json.dumps(PLAYING))
     (tmp_path / "pcm").write_bytes(PCM)
     for name, line in (
         ("pactl", f'cat "{tmp_path}/$3"'),
-        ("parec", f'echo "$@" > {tmp_path}/asked; cat {tmp_path}/pcm'),
+        ("parec", f'echo "$@" > {tmp_path}/arguments; cat {tmp_path}/pcm'),
     ):
         (tmp_path / name).write_text(f"#!/bin/sh\n{line}\n")
         (tmp_path / name).chmod(0o755)
@@ -48,14 +48,14 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_records_a_monitor_by_name(server: Path, name: str, target: str) -> None:
     source = monitor(name)
-    assert not (server / "asked").exists()  # nothing runs until somebody wants it
+    assert not (server / "arguments").exists()  # nothing runs before the first block is read
     blocks = [*source.blocks]
     np.testing.assert_array_equal(np.concatenate(blocks), np.full((1000, 1), 0.5))
-    assert target in (server / "asked").read_text().split()
+    assert target in (server / "arguments").read_text().split()
 
 
 def test_lists_devices(server: Path) -> None:
-    listed = [(each.kind, each.name) for each in sound_devices() if each.kind != "mic"]
+    listed = [(device.kind, device.name) for device in sound_devices() if device.kind != "mic"]
     assert listed == [("monitor", "HDMI"), ("program", "Firefox")]
 
 

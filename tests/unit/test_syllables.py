@@ -1,4 +1,4 @@
-"""Captions: phones become pinyin syllables as they come and are revised."""
+"""Captions: phones and their revisions become syllables of pinyin."""
 
 from __future__ import annotations
 
@@ -33,32 +33,11 @@ def test_spelling_inverts_reading_for_every_syllable() -> None:
             phones = (initial, final) if initial else (final,)
             try:
                 read = phones_of_syllable(spell(phones))
-            except UserError:  # no syllable of Mandarin
+            except UserError:  # not a syllable of Mandarin
                 continue
             if final not in ("ii", "iii") or initial:
                 num_spelled += read == phones
     assert num_spelled > 400
-
-
-@pytest.mark.parametrize(
-    ("phones", "spelling"),
-    [
-        (("sh", "iii"), "shi"),
-        (("z", "ii"), "zi"),
-        (("l", "v"), "lü"),
-        (("x", "van"), "xuan"),
-        (("l", "iou"), "liu"),
-        (("g", "uei"), "gui"),
-        (("uen",), "wen"),
-        (("iou",), "you"),
-        (("v",), "yu"),
-        (("er",), "er"),
-        (("zh",), "zh"),
-        (("sil",), "sil"),
-    ],
-)
-def test_spelling(phones: tuple[str, ...], spelling: str) -> None:
-    assert spell(phones) == spelling
 
 
 def test_shows_an_initial_at_once_and_adds_its_vowel() -> None:
@@ -77,7 +56,7 @@ def test_shows_an_initial_at_once_and_adds_its_vowel() -> None:
 def test_an_initial_is_final_once_no_vowel_can_follow() -> None:
     track = SyllableTrack(MANDARIN)
     assert not track.update(phone(0, "d"))[0].final
-    (pause,) = track.update(phone(1, "sil", final=False))  # it may prove to be a vowel
+    (pause,) = track.update(phone(1, "sil", final=False))  # a revision may make it a vowel
     assert pause.text == "sil"
     initial, _ = track.update(phone(1, "sil"))
     assert (initial.text, initial.final) == ("d", True)
@@ -90,7 +69,7 @@ def test_joins_two_syllables_after_a_revision() -> None:
     withdrawn, joined = track.update(phone(0, "m", final=False))
     assert (withdrawn.index, withdrawn.duration_s, withdrawn.final) == (1, 0.0, True)
     assert joined.text == "mou"
-    (alone,) = track.update(phone(1, "sil", duration_s=0.0))  # the vowel was none
+    (alone,) = track.update(phone(1, "sil", duration_s=0.0))  # the vowel is withdrawn
     assert alone.text == "m"
 
 
@@ -112,30 +91,26 @@ def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
     for number, (_, phones) in enumerate(text):
         symbols = ("sil", *phones) if number % 10 == 3 else phones
         if number % 10 == 5:
-            symbols = ("c", "ii")  # heard wrongly
+            symbols = ("c", "ii")  # wrong
         if number % 10 == 7:
-            continue  # missed
+            continue  # not recognized
         for symbol in symbols:
             for syllable in track.update(phone(index, symbol)):
                 texts[syllable.index] = syllable.text
             index += 1
-    shown = [each for each in texts.values() if each != "sil"]
-    expected = [each for number, (each, _) in enumerate(text) if number % 10 != 7]
+    shown = [character for character in texts.values() if character != "sil"]
+    expected = [character for number, (character, _) in enumerate(text) if number % 10 != 7]
     right = sum(a == b for a, b in zip(shown, expected, strict=True))
     assert right >= 0.9 * len(expected), shown
 
 
 def test_spells_syllables_that_are_not_in_the_text() -> None:
-    assert place_in_text([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")]) == [
-        None,
-        0,
-        1,
-    ]
-    assert place_in_text([], [("h", "ao")]) == []
+    places = place_in_text([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")])
+    assert places == [None, 0, 1]
     track = SyllableTrack(MANDARIN, characters_of("好。", MANDARIN))
     texts: dict[int, str] = {}
     for index, symbol in enumerate(("n", "i", "h", "ao")):
-        texts |= {each.index: each.text for each in track.update(phone(index, symbol))}
+        texts |= {new.index: new.text for new in track.update(phone(index, symbol))}
     assert texts == {0: "ni", 2: "好"}
 
 

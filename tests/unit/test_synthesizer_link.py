@@ -1,4 +1,4 @@
-"""What a new synthesizer receives of a session."""
+"""The messages of a session that a new synthesizer receives."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Link(SynthesizerLink):
         self.connect_to(1)
 
     def connect_to(self, epoch: int) -> list[Message]:
-        """Connect to a new synthesizer; return what it receives, now and later."""
+        """Connect to a new synthesizer; return the list of the messages that it receives."""
         self.sent: list[Message] = []
         socket = type("FakeSocket", (), {"send": lambda _, message: self.sent.append(message)})()
         self.connect(cast(Socket, socket), "s", epoch, 0.0)
@@ -57,7 +57,7 @@ def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> 
     assert resume.newest_frame == NewestFrame(sequence=40, media_time=12_800, values=FAPS)
     times = [message.media_time for message in rest]
     assert times == [to_samples(number) for number in range(3, 8)]
-    assert times[-2] - times[0] == KEPT, "acknowledged messages of 3 s, and the others"
+    assert times[-2] - times[0] == KEPT
     assert [message.sequence for message in (resume, speech, *rest)] == list(range(1, 8))
     assert {message.epoch for message in (resume, speech, *rest)} == {2}
 

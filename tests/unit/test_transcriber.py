@@ -1,4 +1,4 @@
-"""Speech to text: sherpa-onnx itself, with tiny models in its formats."""
+"""Speech to text with sherpa-onnx and tiny models in its formats."""
 
 from __future__ import annotations
 

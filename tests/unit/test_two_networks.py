@@ -1,4 +1,4 @@
-"""Two networks in one search: the causal one is early, the other one knows better."""
+"""Two networks in one search: an early causal one, and a later, better one."""
 
 from functools import cache
 from typing import cast
@@ -12,7 +12,6 @@ from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.services.recognizer.speech_scorer import FrameScores, SpeechScorer, score_streams
 from kouxing.shared.phones.events import LipFrame, Phone
 from tests.live_streams import recognize_live, recognize_together
 from tests.unit.test_block_model import FRAMES, HELLO, blocks
@@ -23,11 +22,6 @@ pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 @cache
 def two_networks() -> TwoNetworks:
     return cast(TwoNetworks, with_early_network(blocks()))
-
-
-def test_a_causal_model_is_not_combined() -> None:
-    neural = load_model()
-    assert with_early_network(neural) is neural
 
 
 def test_the_newest_frames_have_causal_scores() -> None:
@@ -61,33 +55,14 @@ def events_of(model: AcousticModel, chunk: int = 320) -> list[StreamOutput]:
 
 def test_lip_frames_come_from_the_causal_network() -> None:
     assert lip_predictor_for(blocks()) is None
-    found, expected = (
+    frames, expected = (
         [event for event in events_of(model) if isinstance(event, LipFrame)]
         for model in (two_networks(), cast(NeuralModel, load_model()))
     )
-    assert len(found) > 40
-    for one, two in zip(found, expected, strict=True):
+    assert len(frames) > 40
+    for one, two in zip(frames, expected, strict=True):
         assert (one.time_s, one.delay_s) == (two.time_s, two.delay_s)
         np.testing.assert_array_equal(one.faps, two.faps)
-
-
-@pytest.mark.parametrize("chunk", [160, 777])
-def test_chunks_do_not_affect_provisional_scores(chunk: int) -> None:
-    def scores_of(pieces: list[np.ndarray]) -> list[FrameScores]:
-        scorer = SpeechScorer(two_networks())
-        for piece in pieces:
-            scorer.accept_waveform(piece)
-            score_streams(two_networks(), [scorer])
-        scorer.input_finished()
-        score_streams(two_networks(), [scorer])
-        return [event for event in scorer.get_events() if isinstance(event, FrameScores)]
-
-    expected = scores_of([HELLO])
-    found = scores_of(np.split(HELLO, range(chunk, len(HELLO), chunk)))
-    assert len(found) > 40
-    for one, two in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.settled, two.settled)
-        np.testing.assert_array_equal(one.provisional, two.provisional)
 
 
 def test_chunks_and_other_sessions_do_not_affect_phones() -> None:

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,10 +7,10 @@ from kouxing.services.recognizer.front_end.vad import (
     VoiceState,
 )
 from kouxing.shared.audio_file import read_audio
+from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
 
-DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0].reshape(-1)
 QUIET, SPEAKING, STOPPING = VoiceState
 
@@ -48,8 +46,8 @@ def test_three_states() -> None:
 
 
 def test_detects_speech_early() -> None:
-    heard = states(HELLO)
-    assert heard[0] is QUIET
-    assert heard.count(SPEAKING) > 0.7 * len(heard)
-    # the speech begins at about 0.38 s; it is noticed within 70 ms
-    assert 0.38 < heard.index(SPEAKING) * BLOCK_SAMPLES / 16_000 < 0.45
+    detected = states(HELLO)
+    assert detected[0] is QUIET
+    assert detected.count(SPEAKING) > 0.7 * len(detected)
+    # speech starts at about 0.38 s and is detected within 70 ms
+    assert 0.38 < detected.index(SPEAKING) * BLOCK_SAMPLES / 16_000 < 0.45

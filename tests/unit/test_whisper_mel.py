@@ -1,4 +1,4 @@
-"""The neural model's front end against the textbook's definition."""
+"""The neural model's front end, compared with its definition."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ def test_frames_match_the_definition() -> None:
     for start in range(0, len(sound) - 399, 160):
         power = np.abs(np.fft.rfft(sound[start : start + 400] * window)) ** 2
         expected.append((np.log10(np.maximum(power @ mel_bands(), 1e-7)) + 4) / 4)
-    found = WhisperMel().accept_waveform(sound.astype(np.float32))
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    bands = WhisperMel().accept_waveform(sound.astype(np.float32))
+    np.testing.assert_allclose(bands, expected, atol=1e-5)
 
 
 def test_silence_is_at_the_floor() -> None:
@@ -38,12 +38,12 @@ def test_silence_is_at_the_floor() -> None:
 
 
 def test_bands_match_slaney() -> None:
-    """Below 1 kHz a mel is 66.7 Hz, above it 6.9 percent; every triangle has the area 1."""
+    """Check Slaney's mels: 66.7 Hz below 1 kHz, 6.9 % above it; every triangle has the area 1."""
     bands = mel_bands()
     assert bands.shape == (201, NUM_MELS)
-    centre_hz = bands.argmax(axis=0) * 40
-    assert centre_hz[NUM_MELS - 1] == pytest.approx(7700, abs=40)
-    assert (np.diff(centre_hz) >= 0).all()
+    center_hz = bands.argmax(axis=0) * 40
+    assert center_hz[NUM_MELS - 1] == pytest.approx(7700, abs=40)
+    assert (np.diff(center_hz) >= 0).all()
     wide = bands[:, -20:].sum(axis=0) * 40  # lines are 40 Hz apart
     np.testing.assert_allclose(wide, 1, atol=0.03)
 
