@@ -65,7 +65,7 @@ def _spoken(viseme: str) -> Float32:
     """Return the FAPs (68,) of a viseme's target with the default expressiveness."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
-    Expressiveness(SynthesizerConfig().expressiveness).scale(faps)
+    Expressiveness(SynthesizerConfig().expressiveness).apply(faps)
     return faps
 
 

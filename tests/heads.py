@@ -7,8 +7,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.driver.head.head import ASSETS, Detail, Head, neutral_faps
-from kouxing.shared.face.faps import FAPS, NUM_FAPS, Fap
+from kouxing.services.driver.head.head import ASSETS, Detail, Head
+from kouxing.shared.face.faps import FAP_NUMBER, FAPS, NUM_FAPS, Fap
 
 NAMES = sorted(path.stem for path in ASSETS.glob("*.npz"))
 AXES = {
@@ -18,6 +18,16 @@ AXES = {
     "right": (0, -1.0),
     "forward": (2, 1.0),
 }
+
+
+def neutral_faps(**values: float) -> NDArray[np.float32]:
+    """Return FAPs (68,) that are zero except for the named ones."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    for name, value in values.items():
+        faps[FAP_NUMBER[name] - 1] = value
+    return faps
+
+
 OPEN = neutral_faps(
     open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
     lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,

@@ -9,9 +9,10 @@ from typing import Any
 import glfw
 import numpy as np
 
-from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.window import Window
+from tests.heads import neutral_faps
 
 
 def shown(window: Window) -> np.ndarray:

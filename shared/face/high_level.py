@@ -21,7 +21,6 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 
 Float32 = NDArray[np.float32]
@@ -55,11 +54,7 @@ def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
     """Blend two visemes (0 for none, 1 to 14) into low-level FAPs (68,).
 
     ``blend`` goes from 0 (second viseme only) to 63 (first viseme only).
-
-    Raises ``UserError`` if a number is out of range.
     """
-    _check("viseme_select", (select1, select2), len(VISEMES) - 1)
-    _check("viseme_blend", (blend,), FULL)
     share = np.float32(blend / FULL)
     blended: Float32 = VISEMES[select1] * share + VISEMES[select2] * (1 - share)
     return blended
@@ -72,17 +67,7 @@ def expression_faps(
 
     Expressions: 1 joy, 2 sadness, 3 anger, 4 fear, 5 disgust, 6 surprise; 0 for none. Intensities
     go from 0 to 63.
-
-    Raises ``UserError`` if a number is out of range.
     """
-    _check("expression_select", (select1, select2), len(EXPRESSIONS) - 1)
-    _check("expression_intensity", (intensity1, intensity2), FULL)
     first, second = np.float32(intensity1 / FULL), np.float32(intensity2 / FULL)
     added: Float32 = EXPRESSIONS[select1] * first + EXPRESSIONS[select2] * second
     return added
-
-
-def _check(name: str, values: tuple[float, ...], highest: int) -> None:
-    for value in values:
-        if not 0 <= value <= highest:
-            raise UserError(f"{name} is {value}; give a value from 0 to {highest}")

@@ -18,13 +18,13 @@ from kouxing_client import Client
 from PIL import Image
 
 from kouxing.evaluation.system.chromium import wait_until
-from kouxing.services.driver.head.head import neutral_faps
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.mouth_profiles.landmark_file import landmark_file
 from kouxing.shared.wire.face import FaceSettings
 from tests import heads
 from tests.browser import Browser
+from tests.heads import neutral_faps
 from tests.scripted_system import Gateway, System
 from tests.system import DEMO, free_port
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kouxing.services.driver.head.head import neutral_faps
 from kouxing.services.driver.render.renderer import Renderer
 from tests import heads
+from tests.heads import neutral_faps
 
 pytestmark = pytest.mark.golden
 

@@ -12,13 +12,14 @@ import pytest
 
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.glb_head import read_glb
-from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import camera, load_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
 from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
+from tests.heads import neutral_faps
 from tests.meshes import meshes
 
 pytestmark = pytest.mark.unit

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.head.import_head import import_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import Fap
 from tests import heads
 from tests.glb_writer import write_glb
-from tests.heads import OPEN
+from tests.heads import OPEN, neutral_faps
 from tests.meshes import meshes, write_obj
 
 pytestmark = pytest.mark.unit

@@ -162,7 +162,7 @@ DEFAULT = SynthesizerConfig().expressiveness
 
 def expressed(faps: NDArray[np.float32], amount: float) -> NDArray[np.float32]:
     changed = faps.copy()
-    Expressiveness(amount).scale(changed)
+    Expressiveness(amount).apply(changed)
     return changed
 
 

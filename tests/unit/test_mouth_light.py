@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kouxing.services.driver.head.mouth_light import mouth_light
+from kouxing.services.driver.render.renderer import mouth_light
 
 pytestmark = pytest.mark.unit
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.head import Head
-from kouxing.services.driver.render.camera import Camera
-from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.renderer import Camera, Renderer
 from kouxing.services.driver.render.scene import camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
@@ -29,7 +28,7 @@ MIN_CHANGE = 0.13  # each by this share of the region's mean brightness
 def spoken(viseme: str) -> NDArray[np.float32]:
     """FAPs (68,) of a viseme's target as the services send it by default."""
     faps = viseme_faps(viseme)
-    Expressiveness(SynthesizerConfig().expressiveness).scale(faps)
+    Expressiveness(SynthesizerConfig().expressiveness).apply(faps)
     return faps
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from kouxing.services.driver.config import Framing
-from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render import renderer as render
 from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
 from kouxing.services.driver.render.scene import background, camera, load_head
 from kouxing.services.driver.render.window import Window
 from kouxing.shared.errors import UserError
+from tests.heads import neutral_faps
 
 pytestmark = pytest.mark.unit
 

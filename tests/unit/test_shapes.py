@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from kouxing.services.driver.head.head import neutral_faps
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.high_level import EXPRESSIONS, VISEMES
 from kouxing.shared.face.idle_motion import LOWER_LID, UPPER_LID
 from kouxing.shared.face.shapes import ARKIT, OCULUS, SHAPE_SETS, VRM, ShapeSet
 from tests import heads
+from tests.heads import neutral_faps
 
 pytestmark = pytest.mark.unit
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
+from tests.heads import neutral_faps
 
 pytestmark = pytest.mark.unit
 

@@ -116,8 +116,7 @@ def export_glb(
     matrices = document.accessor(identity, "MAT4", target=None)
     joints = [nodes["body"], nodes["head"]]
     document.add(
-        "skins",
-        {"joints": joints, "skeleton": nodes["body"], "inverseBindMatrices": matrices},
+        "skins", {"joints": joints, "skeleton": nodes["body"], "inverseBindMatrices": matrices}
     )
     if len(motion):
         _add_animation(document, nodes, motion, as_arkit=as_arkit)
@@ -210,11 +209,7 @@ def _parent(name: str, children: list[int]) -> dict[str, Any]:
 
 
 def _part_node(
-    document: GlbDocument,
-    head: Head,
-    part: Part,
-    textures: dict[str, int],
-    morphs: Sequence[Morph],
+    document: GlbDocument, head: Head, part: Part, textures: dict[str, int], morphs: Sequence[Morph]
 ) -> int:
     vertices = head.vertices[part.vertices]
     node: dict[str, Any] = {"name": part.name}

@@ -35,7 +35,7 @@ from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.head.shading import Shading
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"
@@ -286,21 +286,3 @@ def _basis(
     if not np.isfinite(basis.data).all():
         raise ValueError("a displacement is not finite")
     return basis
-
-
-def neutral_faps(**values: float) -> Float32:
-    """Return FAPs (68,) that are zero except for the named ones.
-
-    Raises ``UserError`` if a name is not a FAP.
-
-    Examples
-    --------
-    >>> float(neutral_faps(open_jaw=100.0)[2])
-    100.0
-    """
-    faps = np.zeros(NUM_FAPS, dtype=np.float32)
-    for fap_name, value in values.items():
-        if fap_name not in FAP_NUMBER:
-            raise UserError(f"{fap_name!r} is not a FAP; shared/face/faps.tsv lists the names")
-        faps[FAP_NUMBER[fap_name] - 1] = value
-    return faps

@@ -12,12 +12,10 @@ Index = NDArray[np.int64]
 
 
 def edges_of(quads: Index) -> tuple[Index, Index]:
-    """Return the undirected edges of quads (F, 4) or triangles (F, 3).
+    """Return the undirected edges (E, 2) of quads (F, 4) or triangles (F, 3).
 
-    Returns
-    -------
-    Edges (E, 2), smaller vertex number first, and the number of the edge after each corner, in the
-    shape of ``quads``.
+    The smaller vertex number comes first. The second result is the number of the edge after each
+    corner, in the shape of ``quads``.
     """
     pairs = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
     edges, which = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import sys
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import moderngl
@@ -13,9 +14,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.head import Head, Part
-from kouxing.services.driver.head.mouth_light import mouth_light
 from kouxing.services.driver.render import shaders
-from kouxing.services.driver.render.camera import Camera
 from kouxing.shared.errors import UserError
 
 UInt8 = NDArray[np.uint8]
@@ -24,7 +23,39 @@ Float32 = NDArray[np.float32]
 Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB of center and edge
 
 BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))
+_MIN_ASPECT = 0.7  # narrower pictures show more above and below so that the face still fits
+_TEETH_DEPTH = 500.0  # of the teeth behind the lips at rest, FAP units (MNS / 1024)
+_LIGHT_SPREAD = 0.25
+_LIGHT_FLOOR = 0.08
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Camera position and lens; lengths in m, in the head's axes."""
+
+    position: tuple[float, float, float] = (0.0, 0.030, 1.015)
+    target: tuple[float, float, float] = (0.0, 0.018, 0.0)
+    field_of_view_deg: float = 15.0  # vertical
+
+    def view_projection(self, width_px: int, height_px: int) -> Float32:
+        """Return the matrix (4, 4) from the head's axes to clip space."""
+        eye = np.array(self.position)
+        ahead = np.array(self.target) - eye
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(right, ahead), -ahead])
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = axes, -axes @ eye
+        near, far = 0.1, 5.0
+        scale = 1.0 / np.tan(np.radians(self.field_of_view_deg) / 2)
+        scale *= min(1.0, width_px / height_px / _MIN_ASPECT)
+        projection = np.zeros((4, 4))
+        projection[0, 0], projection[1, 1] = scale * height_px / width_px, scale
+        projection[2, 2:] = (far + near) / (near - far), 2 * far * near / (near - far)
+        projection[3, 2] = -1.0
+        return np.asarray(projection @ view, dtype=np.float32)
 
 
 def standalone_context() -> moderngl.Context:
@@ -258,3 +289,16 @@ def _unmixed(pixels: UInt8) -> UInt8:
     pure = mixed[:, :3] * (255 / mixed[:, 3:])
     out[row, column, :3] = np.minimum(np.round(pure), 255).astype(np.uint8)
     return out
+
+
+def mouth_light(faps: Float32) -> float:
+    """Return the share of the light on teeth and tongue, 0 to 1, for FAPs (68,).
+
+    Little light passes a small mouth or protruding lips. The light passes the gap between the lips,
+    of height ``h``, onto teeth at a depth ``d``. It increases with ``h`` and decreases with ``d``;
+    the formula was chosen by eye. ``services/gateway/page/mouth-light.js`` is the same function.
+    """
+    height = max(-float(faps[3] + faps[4]), 0.0)
+    depth = max(_TEETH_DEPTH + float(faps[15] + faps[16]) / 2, 0.0)
+    through = height / (height + _LIGHT_SPREAD * depth**2 / _TEETH_DEPTH + 1e-6)
+    return min(1.0, _LIGHT_FLOOR + through)

@@ -10,8 +10,7 @@ import numpy as np
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import DEFAULT_HEAD, Detail, Head
-from kouxing.services.driver.render.camera import Camera
-from kouxing.services.driver.render.renderer import BACKGROUND, Background
+from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera
 from kouxing.shared.errors import UserError
 
 COLORS = {

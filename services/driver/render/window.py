@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import Head
-from kouxing.services.driver.render.camera import Camera
-from kouxing.services.driver.render.renderer import BACKGROUND, Background, Renderer
+from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera, Renderer
 from kouxing.shared.errors import UserError
 
 Float32 = NDArray[np.float32]

@@ -37,8 +37,6 @@ from kouxing.shared.errors import UserError
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
-AAC_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
-OPUS_RATES_HZ = (8000, 12000, 16000, 24000, 48000)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".webp")
 _NUMBER = re.compile(r"%0?\d?d")  # in the file name of a picture sequence
 
@@ -59,7 +57,6 @@ class _Format:
     opaque: _Codec
     transparent: _Codec | None
     sound: str | None  # codec
-    sample_rates_hz: tuple[int, ...]
     options: dict[str, str] = field(default_factory=dict)  # of the container
 
 
@@ -74,10 +71,10 @@ _WEBP = _Codec("libwebp_anim", "bgra", {"quality": "80"})
 _INDEX_FIRST = {"movflags": "faststart"}
 _LOOP_FOREVER = {"loop": "0"}
 _FORMATS = {
-    ".mp4": _Format(_H264, None, "aac", AAC_RATES_HZ, _INDEX_FIRST),
-    ".mov": _Format(_H264, _PRORES, "aac", AAC_RATES_HZ, _INDEX_FIRST),
-    ".webm": _Format(_VP9, _VP9_ALPHA, "libopus", OPUS_RATES_HZ),
-    ".webp": _Format(_WEBP, _WEBP, None, (), _LOOP_FOREVER),
+    ".mp4": _Format(_H264, None, "aac", _INDEX_FIRST),
+    ".mov": _Format(_H264, _PRORES, "aac", _INDEX_FIRST),
+    ".webm": _Format(_VP9, _VP9_ALPHA, "libopus"),
+    ".webp": _Format(_WEBP, _WEBP, None, _LOOP_FOREVER),
 }
 
 
@@ -129,8 +126,8 @@ def is_sequence(path: Path) -> bool:
 class VideoWriter:
     """A video that appears under its name when it is complete.
 
-    Width and height are even, the frame rate is 1 to 1000 Hz. ``sample_rate_hz`` is one that the
-    codec supports, or None for no sound; ``.webp`` never has sound. Pictures are ``transparent`` if
+    Width and height are even, the frame rate is 1 to 1000 Hz. ``sample_rate_hz`` is that of
+    the sound, or None for no sound; ``.webp`` never has sound. Pictures are ``transparent`` if
     they have an alpha channel. Unless ``overwrite`` is set, ``close`` adds a number to the name of
     an existing file.
 
@@ -163,11 +160,6 @@ class VideoWriter:
         if not 1 <= frame_rate_hz <= 1000:
             raise UserError(f"the frame rate {frame_rate_hz} Hz is not between 1 and 1000")
         sound_codec = None if sample_rate_hz is None else form.sound
-        if sound_codec is not None and sample_rate_hz not in form.sample_rates_hz:
-            rates = ", ".join(str(rate) for rate in form.sample_rates_hz)
-            raise UserError(
-                f"{sound_codec} does not support {sample_rate_hz} Hz; give one of {rates}"
-            )
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz
         # Another process may be writing a video of the same name.

@@ -1,4 +1,4 @@
-// Light on teeth and tongue, computed as in services/driver/head/mouth_light.py.
+// Light on teeth and tongue, computed as in services/driver/render/renderer.py.
 
 const DEPTH = 500; // of the teeth behind the lips at rest, FAP units (MNS / 1024)
 const SPREAD = 0.25;

@@ -49,11 +49,7 @@ class Expressiveness:
     def __init__(self, amount: float) -> None:
         self.amount = amount
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
-        """Change a frame, FAPs (68,), in place."""
-        self.scale(faps)
-
-    def scale(self, faps: NDArray[np.float32]) -> None:
+    def apply(self, faps: NDArray[np.float32], context: FrameContext | None = None) -> None:
         """Scale the mouth of FAPs (68,), in place."""
         if self.amount == 1.0:
             return

@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    VisemeParameters,
-    columns,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     REST,
