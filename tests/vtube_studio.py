@@ -77,7 +77,7 @@ class VTubeStudioStub:
             return _error(8, "This request requires authentication")
         if kind == "InputParameterListRequest":
             listed = [{"name": name, "value": 0.0, "min": 0, "max": 1} for name in PARAMETERS]
-            answer = {"defaultParameters": listed, "customParameters": []}
+            answer: dict[str, object] = {"defaultParameters": listed, "customParameters": []}
             return "InputParameterListResponse", answer
         if kind == "InjectParameterDataRequest":
             return self._inject(data)

@@ -39,22 +39,18 @@ JAVASCRIPT_CLIENT = ROOT / "clients" / "javascript"
 PYTHON_CLIENT = ROOT / "clients" / "python"
 
 
-def pip(*arguments: object) -> None:
-    command = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*command, *map(str, arguments)], check=True)
-
-
-def run_example(command: list[object], **environment: str) -> list[str]:
-    """Run an example of a README on a sentence; return the lines that it prints."""
+def run(*command: object, cwd: Path | None = None, **environment: str) -> list[str]:
+    """Run a program that must succeed; return the lines that it prints."""
     result = subprocess.run(
         list(map(str, command)),
+        cwd=cwd,
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=110,
         check=False,
     )
-    assert result.returncode == 0, result.stderr
+    assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout.splitlines()
 
 
@@ -82,35 +78,24 @@ def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path
     (tmp_path / "plain.py").write_text(plain, encoding="utf-8")
     (tmp_path / "awaited.py").write_text(awaited, encoding="utf-8")
     control = system.control.partition(" ")[0]
-    jaw = run_example([python, "-I", tmp_path / "plain.py", SPEECH], KOUXING_CONTROL=control)
+    jaw = run(python, "-I", tmp_path / "plain.py", SPEECH, KOUXING_CONTROL=control)
     assert len(jaw) > 100
     assert max(float(line.split()[-1]) for line in jaw) > 200
-    phones = run_example([python, "-I", tmp_path / "awaited.py", SPEECH], KOUXING_CONTROL=control)
+    phones = run(python, "-I", tmp_path / "awaited.py", SPEECH, KOUXING_CONTROL=control)
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
 
 
-def test_what_is_tested_of_the_python_package_holds_for_the_built_one(
-    wheel: Path, tmp_path: Path
-) -> None:
+def test_the_built_python_package_passes_its_tests(wheel: Path, tmp_path: Path) -> None:
     pip("install", "--no-deps", "--target", tmp_path, wheel)
     # in place of the source, which pytest's configuration names
-    own = ("--override-ini", f"pythonpath={tmp_path}", "-p", "no:cacheprovider", "--quiet")
+    options = ("--override-ini", f"pythonpath={tmp_path}", "-p", "no:cacheprovider", "--quiet")
     find = "import kouxing_client, sys; sys.exit(kouxing_client.__path__[0] != sys.argv[1])"
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    for command in (
-        ["-c", find, str(tmp_path / "kouxing_client")],
-        ["-m", "pytest", *own, "tests/process/test_client.py", "tests/unit/test_client_core.py"],
+    tests = ("tests/process/test_client.py", "tests/unit/test_client_core.py")
+    for arguments in (
+        ["-c", find, tmp_path / "kouxing_client"],
+        ["-m", "pytest", *options, *tests],
     ):
-        result = subprocess.run(
-            [sys.executable, *command],
-            cwd=ROOT,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=110,
-            check=False,
-        )
-        assert result.returncode == 0, result.stdout + result.stderr
+        run(sys.executable, *arguments, cwd=ROOT, PYTHONPATH=str(tmp_path))
 
 
 def test_the_python_package_brings_its_types_and_needs_two_packages(python: Path) -> None:
@@ -140,14 +125,14 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return project
 
 
+def pip(*arguments: object) -> None:
+    run(sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments)
+
+
 def npm(folder: Path, *arguments: object) -> None:
     quietly = ("--no-audit", "--no-fund", "--loglevel=error")
-    subprocess.run(
-        [NODE.with_name("npm"), *quietly, *map(str, arguments)],
-        cwd=folder,
-        env={**os.environ, "PATH": f"{NODE.parent}:{os.environ['PATH']}"},
-        check=True,
-    )
+    path = f"{NODE.parent}:{os.environ['PATH']}"
+    run(NODE.with_name("npm"), *quietly, *arguments, cwd=folder, PATH=path)
 
 
 @pytest.fixture(scope="module")
@@ -170,29 +155,21 @@ def site(project: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def gateway(system: System, site: str) -> Iterator[Gateway]:
     gateway = Gateway(system.control, free_port(), allowed_origins=site)
-    system.wait_until(lambda report: "gateway" in {each.service for each in report.services})
+    system.wait_until(lambda report: "gateway" in {state.service for state in report.services})
     yield gateway
     gateway.stop()
 
 
 def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -> None:
     shutil.copy(JAVASCRIPT_CLIENT / "tests" / "client.test.js", project / "client.test.mjs")
-    result = subprocess.run(
-        [NODE, "--test", project / "client.test.mjs"],
-        env={**os.environ, "GATEWAY": gateway.page, "SPEECH": str(SPEECH)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout
+    run(NODE, "--test", project / "client.test.mjs", GATEWAY=gateway.page, SPEECH=str(SPEECH))
     (example,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "js")
     (project / "example.mjs").write_text(example, encoding="utf-8")
     wav = project / "two-seconds.wav"  # it is spoken in real time
     with wave.open(str(SPEECH)) as whole, wave.open(str(wav), "wb") as part:
         part.setparams(whole.getparams())
         part.writeframes(whole.readframes(2 * whole.getframerate()))
-    lines = run_example([NODE, project / "example.mjs", wav], GATEWAY=gateway.page)
+    lines = run(NODE, project / "example.mjs", wav, GATEWAY=gateway.page)
     assert max(float(line.split()[-1]) for line in lines if "jaw" in line) > 200
     assert [line.split()[-1] for line in lines if "phone" in line][:4] == ["n", "i", "h", "ao"]
 
@@ -201,15 +178,7 @@ def test_the_javascript_package_has_the_types_of_its_api(project: Path) -> None:
     shutil.copy(JAVASCRIPT_CLIENT / "tests" / "types.ts", project / "types.mts")
     compiler = JAVASCRIPT_CLIENT / "node_modules" / "typescript" / "bin" / "tsc"
     options = "--noEmit --strict --module nodenext --target es2023 --lib es2023,dom".split()
-    result = subprocess.run(
-        [NODE, compiler, *options, "types.mts"],
-        cwd=project,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout
+    run(NODE, compiler, *options, "types.mts", cwd=project)
 
 
 LIPS = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
@@ -236,11 +205,7 @@ VRM_0 = {
     "humanoid": {"humanBones": [{"bone": name, "node": node} for node, name in enumerate(BONES)]},
     "blendShapeMaster": {
         "blendShapeGroups": [
-            {
-                "name": "A",
-                "presetName": "a",
-                "binds": [{"mesh": 0, "index": 0, "weight": 100.0}],
-            }
+            {"name": "A", "presetName": "a", "binds": [{"mesh": 0, "index": 0, "weight": 100.0}]}
         ]
     },
 }
@@ -279,15 +244,10 @@ def write_faces(folder: Path) -> None:
 
 def write_recording(path: Path, shapes: str, name: str) -> None:
     """Write a face that takes on a shape, and at its end has no other."""
+    rest = dict.fromkeys(SHAPE_SETS[shapes].names, 0.0)
     lines = [
-        {
-            "time_s": number / 50,
-            "sequence": number,
-            shapes: {
-                each: number / 10 if each == name else 0.0 for each in SHAPE_SETS[shapes].names
-            },
-        }
-        for number in range(11)
+        {"time_s": n / 50, "sequence": n, shapes: rest | ({name: n / 10} if name else {})}
+        for n in range(11)
     ]
     path.write_text("\n".join(map(json.dumps, lines)), encoding="utf-8")
 
@@ -311,8 +271,8 @@ def faces(
     }
     elements = "".join(
         f"<kouxing-face id={name} onerror='this.failure = event.message'"
-        f" style='width: 80px' {each}></kouxing-face>"
-        for name, each in attributes.items()
+        f" style='width: 80px' {values}></kouxing-face>"
+        for name, values in attributes.items()
     )
     page = re.sub(r"<kouxing-face.*</kouxing-face>", elements, page)
     (project / "index.html").write_text(
@@ -429,4 +389,4 @@ def test_the_web_component_shows_a_session_and_keeps_its_sound_in_step(
         faces.wait_for("live.set === 'faps' && live.shown?.length === 68")
         faces.wait_for("live.shown[2] > 100")
     driver = "GL Driver Message"  # the processor draws
-    assert [each for each in faces.complaints if driver not in each] == []
+    assert [text for text in faces.complaints if driver not in text] == []

@@ -107,7 +107,7 @@ def test_reports_a_missing_receiver_and_finds_it_later(
     senders.start(parse_target(missing))
     senders.start(parse_target(there))
     wait_until(lambda: "no program listens" in problem(senders, missing))
-    assert receiver.recv(2000)  # others go on
+    assert receiver.recv(2000)  # other targets are not affected
     assert problem(senders, there) == ""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:
         late.bind(("127.0.0.1", port))

@@ -53,13 +53,13 @@ def make_face(lips: str) -> FaceAnimator:
     return face
 
 
-def tell(face: FaceAnimator, told: Sequence[SoundEvent]) -> list[Frame]:
-    return [frame for event in told for frame in face.process(event)]
+def process_all(face: FaceAnimator, received: Sequence[SoundEvent]) -> list[Frame]:
+    return [frame for event in received for frame in face.process(event)]
 
 
 @lru_cache
 def undisturbed(lips: str) -> list[Frame]:
-    return tell(make_face(lips), events())
+    return process_all(make_face(lips), events())
 
 
 def time_of(event: SoundEvent) -> float:
@@ -69,26 +69,26 @@ def time_of(event: SoundEvent) -> float:
 def with_another_synthesizer(lips: str, cut: int) -> list[Frame]:
     """Resume on a new face: last frame, recent events, then new events."""
     before, after = events()[:cut], events()[cut:]
-    frames = tell(make_face(lips), before)
+    frames = process_all(make_face(lips), before)
     kept_from_s = time_of(before[-1]) - KEPT_S
     changes = [event for event in before if isinstance(event, SpeechChange)]
     older = [event for event in changes if event.time_s < kept_from_s][-1:]
     face = make_face(lips)
     face.resume(frames[-1][0], len(frames), frames[-1][1])
     kept = [event for event in before if time_of(event) >= kept_from_s]
-    return frames + tell(face, [*older, *kept, *after])
+    return frames + process_all(face, [*older, *kept, *after])
 
 
 def with_another_recognizer(lips: str, cut: int) -> list[Frame]:
     """Continue with another recognizer that repeats events that may not be final."""
     before = events()[:cut]
     face = make_face(lips)
-    frames = tell(face, before)
+    frames = process_all(face, before)
     final_s = max(map(final_until, before))
     again = [event for event in events() if middle_of(event) > final_s]
     first = min((event.index for event in again if isinstance(event, Phone)), default=0)
     face.change_recognizer()
-    return frames + tell(
+    return frames + process_all(
         face,
         [
             replace(event, index=event.index - first) if isinstance(event, Phone) else event
