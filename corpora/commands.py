@@ -11,13 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import (
-    CONSOLE,
-    JsonFile,
-    check_output,
-    print_message,
-    write_json,
-)
+from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
 if TYPE_CHECKING:
     from kouxing.services.mouth_profiles.learning import FilmedSpeech
@@ -55,7 +49,6 @@ def adapt(
 
 
 def _read(source: Path) -> FilmedSpeech:
-    """Read a clip or a landmark file."""
     from kouxing.corpora.lip_clips import read_clip
     from kouxing.services.mouth_profiles.landmark_file import SUFFIX, parse_landmark_file
 

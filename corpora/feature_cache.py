@@ -118,7 +118,6 @@ def _write(
     empty: NDArray[Any],
     block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
 ) -> None:
-    """Write all blocks in sequence, and the row where each ends."""
     ends = []
     num_rows = 0
     with rows.open("wb") as file:

@@ -62,11 +62,7 @@ class PhoneDurations:
         positions = positions_of(phones, self._silence)
         for position, segment in zip(positions, aligned, strict=True):
             frames = segment.end - segment.start
-            self._sums[:, position, segment.phone] += (
-                weight,
-                weight * frames,
-                weight * frames**2,
-            )
+            self._sums[:, position, segment.phone] += (weight, weight * frames, weight * frames**2)
 
     def mean_and_spread_s(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Compute mean and standard deviation of the durations, (3, num_phones) each, seconds."""

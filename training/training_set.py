@@ -115,7 +115,6 @@ def load_examples(
 
 
 def _shippable(rows: Sequence[Utterance], errors: RowErrors) -> list[Utterance]:
-    """Drop the rows whose license does not allow distributing the model."""
     for row in rows:
         if not may_ship(row.license):
             errors.add(
@@ -126,7 +125,6 @@ def _shippable(rows: Sequence[Utterance], errors: RowErrors) -> list[Utterance]:
 
 
 def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[float]:
-    """Compute the weights with the formula above."""
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60

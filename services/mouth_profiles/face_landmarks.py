@@ -124,7 +124,6 @@ def _at(point: int) -> int:
 
 
 def _align_head(landmarks: Array) -> Array:
-    """Align each frame with the canonical face, cm."""
     points = landmarks * (1, -1, -1)  # y up, z out of the face
     steady = points[:, [_at(point) for point in _STEADY]]
     canonical = np.array(list(_STEADY.values()))

@@ -67,9 +67,7 @@ def landmark_file(
     )
 
 
-def _parse(
-    content: bytes,
-) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Return times, landmarks and the audio at 16 kHz; ValueError if the content is invalid."""
     if len(content) > MAX_BYTES:
         raise ValueError(f"it is larger than {MAX_BYTES >> 20} MiB")

@@ -215,7 +215,6 @@ def _is_known(observations: Observations) -> NDArray[np.bool_]:
 
 
 def _fit(observations: Observations, strength: float) -> MouthProfile:
-    """Fit a profile to known positions."""
     faps = _is_tracked(observations)
     predicted = observations.predicted[..., faps].astype(np.float64)
     tracked = observations.tracked[..., faps]
@@ -248,7 +247,6 @@ def _fit(observations: Observations, strength: float) -> MouthProfile:
 
 
 def _error(profile: MouthProfile, observations: Observations) -> float:
-    """Sum the squared errors over positions, relative to each FAP's variance."""
     faps = _is_tracked(observations)
     tracked = observations.tracked[..., faps]
     squares = (apply_profile(profile, observations)[..., faps] - tracked) ** 2

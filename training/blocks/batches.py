@@ -158,7 +158,6 @@ def _hurry(frames: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np
 def _add_babble(
     sound: Samples, recordings: Sequence[Recording], rng: np.random.Generator
 ) -> Samples:
-    """Add background speech, at random."""
     if rng.random() >= _BABBLE_PROB:
         return sound
     babble = np.zeros_like(sound)

@@ -208,7 +208,6 @@ class _BlockGraph(Graph):
         return self.node("Reshape", [context, self.integers("both", -1, 2 * width)])
 
     def _recurrent_weights(self) -> list[str]:
-        """Store the recurrent layer's weights and biases."""
 
         def gates(kind: str) -> Floats:
             ends = ("", "_reverse")

@@ -138,7 +138,6 @@ class BlockReadout(Readout):
         return self.log_posteriors(context, inner).view(*features.shape[:2], 2, -1)
 
     def _forward_states(self, inner: Tensor, of_blocks: Tensor, laid: Layout) -> Tensor:
-        """Run over the recording, and from each block's end over its right context."""
         outputs = self._run(inner, inner.new_zeros(len(inner), self.gru.hidden_size))
         last = laid.blocks[:, : laid.block_length].amax(dim=1)
         right = of_blocks[:, :, laid.block_length :]

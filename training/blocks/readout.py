@@ -168,7 +168,6 @@ def _batch(step: int) -> int:
 
 
 def _length(rng: np.random.Generator) -> int:
-    """Draw a window's length, feature frames, even."""
     draw = rng.random()
     if draw < _WHOLE_PROB:
         return MAX_WINDOW_FRAMES

@@ -118,5 +118,4 @@ def _least_squares(weights: Array, height: Array, start: Array) -> Array:
         np.concatenate([height, ridge * start]),
         (0.0, MAX_OPENING),
     )
-    solution: Array = np.clip(result.x, 0.0, MAX_OPENING)
-    return solution
+    return np.clip(result.x, 0.0, MAX_OPENING)

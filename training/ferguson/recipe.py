@@ -31,12 +31,7 @@ _MAX_OF_SPEAKER = 60  # recordings
 
 
 def train_ferguson(
-    clips: Path,
-    corpora: Sequence[Path],
-    output: Path,
-    report: Report,
-    *,
-    any_license: bool = False,
+    clips: Path, corpora: Sequence[Path], output: Path, report: Report, *, any_license: bool = False
 ) -> None:
     """Learn the table from the training clips and recordings.
 

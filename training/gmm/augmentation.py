@@ -92,8 +92,7 @@ class Augmentation:
         if self.narrow:
             outside = (_NARROW_HZ[0] > BAND_HZ) | (_NARROW_HZ[1] < BAND_HZ)
             out[:, 1:][:, outside] -= _NARROW_LOSS
-        floored: NDArray[np.float32] = np.maximum(out, LOG_FLOOR).astype(np.float32)
-        return floored
+        return np.maximum(out, LOG_FLOOR).astype(np.float32)
 
     def _noise(self, power: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw a noise relative to the recording's level, energies of shape (frames, 41)."""
@@ -110,5 +109,4 @@ class Augmentation:
         at = np.clip(np.interp(source, BAND_MEL, np.arange(NUM_BANDS)), 0, NUM_BANDS - 1)
         low = np.minimum(at.astype(int), NUM_BANDS - 2)
         fraction = (at - low).astype(np.float32)
-        warped: NDArray[np.float32] = (1 - fraction) * bands[:, low] + fraction * bands[:, low + 1]
-        return warped
+        return (1 - fraction) * bands[:, low] + fraction * bands[:, low + 1]

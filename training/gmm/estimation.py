@@ -56,8 +56,7 @@ def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> Hmm:
 
 def variance_floor(frames: FrameSet) -> NDArray[np.float32]:
     """Lowest variance of a component, shape (39,)."""
-    floor: NDArray[np.float32] = _VARIANCE_FLOOR * frames.features.var(axis=0)
-    return floor
+    return _VARIANCE_FLOOR * frames.features.var(axis=0)
 
 
 def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
@@ -108,7 +107,6 @@ def _component_sums(
 
 
 def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Estimate the log transition probabilities from the paths."""
     occupied = np.full(hmm.num_states, 2.0)
     left = np.full(hmm.num_states, 1.0)
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):

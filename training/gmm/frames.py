@@ -75,7 +75,6 @@ def flat_path(graph: UtteranceGraph, log_energy: NDArray[np.float32]) -> NDArray
 
 
 def _spread(nodes: NDArray[np.int64], num_frames: int) -> NDArray[np.int64]:
-    """Give each node the same number of frames."""
     return nodes[(np.arange(num_frames) * len(nodes)) // max(1, num_frames)]
 
 

@@ -30,13 +30,7 @@ from kouxing.training.heads.measures import (
 from kouxing.training.heads.occlusion import shade
 from kouxing.training.heads.people import REFERENCE, Person, Shape
 from kouxing.training.heads.texture import encode
-from kouxing.training.heads.zones import (
-    FaceFields,
-    Fields,
-    Skin,
-    close_lips,
-    subdivided,
-)
+from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivided
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -85,11 +79,9 @@ class Builder:
         for name, amount in face_units:
             vertices += amount * self._source.face_unit(name)
         joint = np.unique(self._mesh.quads[self._mesh.group("joint-head")])
-        shaped: Float = vertices - vertices[joint].mean(axis=0) + PIVOT
-        return shaped
+        return vertices - vertices[joint].mean(axis=0) + PIVOT
 
     def _skin(self, vertices: Float) -> Skin:
-        """Make the skin with room for hair and mouth, and close the lips."""
         skin = subdivided(vertices, self._face)
         x, y, z = self._layout.T
         top = np.clip((y - 6.48) / 0.15, 0, 1)
@@ -119,7 +111,6 @@ class Builder:
         write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
 
     def _face_fields(self, fapu: dict[str, float]) -> Fields:
-        """Compute the fields of the skin."""
         blink, squint = (
             (self._carried(unit + "Left"), self._carried(unit + "Right"))
             for unit in ("eyeBlink", "eyeSquint")
@@ -137,8 +128,7 @@ class Builder:
 
         def visible(quads: Index) -> Index:
             triangles = subdivision.triangles_of(quads)
-            uncovered: Index = triangles[~covered[triangles].all(axis=1)]
-            return uncovered
+            return triangles[~covered[triangles].all(axis=1)]
 
         part = parts.Part(
             skin.vertices, visible(skin.quads), paint.skin_uv(layout), np.ones_like(layout)
@@ -188,7 +178,6 @@ class Builder:
         return Piece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
 
     def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], raised: float) -> list[Piece]:
-        """Make teeth and tongue, and place them behind the lips."""
         lips = ("2.2", "2.3")
         middle, target = (
             one.vertices[one.points(*lips)].mean(axis=0) for one in (self.reference, skin)
@@ -203,7 +192,6 @@ class Builder:
         return pieces
 
     def _hair(self, skin: Skin, person: Person) -> list[Piece]:
-        """Make the hair, and warp it with the skin under it."""
         layout = self.reference.vertices
         outer = np.flatnonzero((layout[:, 1] > 4.7) & ~self._cavity)[::5]
         warp = interpolate.RBFInterpolator(
@@ -221,7 +209,6 @@ class Builder:
         return pieces
 
     def _lashes(self, skin: Skin, fields: Fields, length: float) -> Piece:
-        """Make two ribbons of lashes along the edges of the upper eyelids."""
         columns, rows = 25, 4
         layout = self.reference.vertices[: len(skin.base)]
         pieces = []
@@ -280,7 +267,6 @@ class Builder:
         return Piece("lashes", part, "lashes", 0.9, np.ones(2 * count), both)
 
     def _face_map(self) -> paint.FaceMap:
-        """Lay out the texture of the skin on the reference head."""
         skin = self.reference
         uv = paint.skin_uv(skin.vertices)
         normals = subdivision.vertex_normals(skin.vertices, subdivision.triangles_of(skin.quads))

@@ -135,8 +135,7 @@ def _bezier(points: Float, t: Float) -> Float:
     """Evaluate quadratic curves with control points (3, A, 3) at (T,) as (A, T, 3)."""
     first, middle, last = points[:, :, None, :]
     s = t[None, :, None]
-    curve: Float = (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
-    return curve
+    return (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +240,6 @@ class Crop:
 
 
 def _bun(radius: float, rng: np.random.Generator) -> Part:
-    """Make a bun, a bumpy ball behind the whorl."""
     rows, columns = 41, 24
     turn = np.linspace(0, 2 * np.pi, rows)[:, None]
     polar = np.linspace(0.02, np.pi - 0.02, columns)[None, :]
@@ -268,8 +266,7 @@ def _direction(azimuth: Float, polar: Float) -> Float:
     side = np.array([1.0, 0.0, 0.0])
     front = np.cross(side, up)
     level = np.cos(azimuth)[:, None] * front + np.sin(azimuth)[:, None] * side
-    direction: Float = np.cos(polar)[:, None] * up + np.sin(polar)[:, None] * level
-    return direction
+    return np.cos(polar)[:, None] * up + np.sin(polar)[:, None] * level
 
 
 def _about_crown(points: Float) -> tuple[Float, Float]:
@@ -291,8 +288,7 @@ def _radius(scalp: Float, direction: Float) -> Float:
     surface = interpolate.RBFInterpolator(
         away / length[:, None], length, neighbors=24, smoothing=1e-3, kernel="linear"
     )
-    radius: Float = surface(direction)
-    return radius
+    return surface(direction)
 
 
 Hair = Bob | Crop

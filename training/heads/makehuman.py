@@ -90,8 +90,7 @@ class MakeHuman:
 
     def _rig(self) -> dict[str, list[list[float]]]:
         text = self._archive.read(_DATA + "rigs/standard/weights.default.json")
-        weights: dict[str, list[list[float]]] = json.loads(text)["weights"]
-        return weights
+        return json.loads(text)["weights"]
 
     def bones(self) -> list[str]:
         """Return the names of the default rig's bones."""

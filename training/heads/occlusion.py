@@ -155,5 +155,4 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
 def _into_mouth(z: Float) -> Float:
     """Return the fraction (V, 1) of the light at a depth behind the lips."""
     inside = np.clip((z[:, None] - 0.75) / 0.5, 0, 1)
-    share: Float = 0.02 + 0.98 * inside**2
-    return share
+    return 0.02 + 0.98 * inside**2

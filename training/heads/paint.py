@@ -29,8 +29,7 @@ def skin_uv(vertices: Float) -> Float:
     angle = np.abs(np.arctan2(np.abs(vertices[:, 0]), vertices[:, 2] - AXIS_Z))
     u = np.interp(angle, _ANGLES, _COLUMNS)
     v = (TOP_Y - vertices[:, 1]) / (TOP_Y - BOTTOM_Y)
-    uv: Float = np.clip(np.stack([u, v], axis=1), 0.0, 1.0)
-    return uv
+    return np.clip(np.stack([u, v], axis=1), 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +68,7 @@ def _spot(
 ) -> Float:
     """Make a soft spot (H, W) at a place of the face, up to the angle ``until``."""
     spot = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
-    front: Float = spot * np.clip((until - face.angle) / 0.25, 0, 1)
-    return front
+    return spot * np.clip((until - face.angle) / 0.25, 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +165,6 @@ _WRINKLES = (
 
 
 def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
-    """Draw wrinkles, dark grooves with a light rim below, and brown spots."""
     texels = np.stack([face.x, face.y], axis=-1)
     waver = 0.004 * noise(face.x.shape, 9, 22)
     for points, depth in _WRINKLES:
@@ -193,7 +190,6 @@ def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
 
 
 def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
-    """Tint the area between the lip outlines."""
     upper, lower = (np.interp(face.x, lips[:, 0], lips[:, column]) for column in (1, 2))
     upper = upper - 0.012 * np.exp(-((face.x / 0.024) ** 2))  # Cupid's bow
     edge = 0.0065
@@ -206,12 +202,10 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     color = np.array(look.lip) * (1 + 0.022 * lines[..., None])
     image = image + (color - image) * (look.lip_strength * inside)[..., None]
     below = _spot(face, 0.0, 5.005, 0.15, 0.024) * (1 - inside)
-    shaded: Float = image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33])
-    return shaded
+    return image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33])
 
 
 def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, width: float) -> Float:
-    """Darken the edges of the lids and the upper lid's fold."""
     edge = np.interp(face.x, lid[:, 0], lid[:, 1])
     inside = 1 / (1 + np.exp(-(face.x - lid[0, 0] - 0.01) / 0.008))
     inside *= 1 / (1 + np.exp((face.x - lid[-1, 0] - 0.02) / 0.012))
@@ -241,7 +235,6 @@ _BROW = np.array(
 
 
 def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
-    """Draw a brow hair by hair over a soft ground."""
     nose, temple = brow[0, 0] - 0.012, brow[-1, 0] + 0.015
     line = interpolate.PchipInterpolator(_BROW[:, 0], _BROW[:, 1:])
     near = (face.x > nose - 0.05) & (face.x < temple + 0.08) & (face.angle < 1.4)
@@ -275,7 +268,6 @@ def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
 
 
 def _paint_roots(image: Float, face: FaceMap, look: Look, hair: Hair) -> Float:
-    """Paint the roots of the hair on the skin."""
     shape = face.x.shape
     ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
     inside = hair.roots(face.x, face.y, face.z) + ragged

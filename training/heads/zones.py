@@ -54,8 +54,7 @@ class Skin:
 
     def carry(self, target: Float) -> Float:
         """Transfer displacements (19158, 3) of the base mesh to the fine vertices."""
-        transferred: Float = self.matrix @ target[self.base]
-        return transferred
+        return self.matrix @ target[self.base]
 
     def point(self, name: str) -> int:
         """Find the vertex of a feature point."""
@@ -151,8 +150,7 @@ class FaceFields:
         self.fields[fap] = _along(fap, weight) * self.fapu[FAPS[fap - 1].fapu]
 
     def _far(self, names: tuple[str, ...], reach: float) -> NDArray[np.bool_]:
-        far: NDArray[np.bool_] = self._geodesics.distance(self.skin.points(*names)) > reach
-        return far
+        return self._geodesics.distance(self.skin.points(*names)) > reach
 
     def _lips(self) -> None:
         skin = self.skin
@@ -269,19 +267,13 @@ class FaceFields:
             self._zone(fap, names, 0.05, 0.22, nose)
 
     def _bump(self, name: str, reach: float) -> Float:
-        """Swell a cheek smoothly between lips, nose and eyelids."""
         _, y, _ = self.skin.vertices.T
         lids = ("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
         fixed = self._far((name,), reach) | self.cavity | (y > 5.80)
-        for others, margin in (
-            (INNER + OUTER, 0.07),
-            (("9.1", "9.2", "9.15"), 0.10),
-            (lids, 0.07),
-        ):
+        for others, margin in ((INNER + OUTER, 0.07), (("9.1", "9.2", "9.15"), 0.10), (lids, 0.07)):
             fixed |= ~self._far(others, margin)
         top = np.flatnonzero(~self._far((name,), 0.08))
-        bump: Float = smoothest(self.skin, [top], np.flatnonzero(fixed))[:, 0]
-        return bump
+        return smoothest(self.skin, [top], np.flatnonzero(fixed))[:, 0]
 
     def _zone(
         self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index

@@ -33,10 +33,7 @@ class Trained:
 
 
 def write_card(
-    output: Path,
-    trained: Trained,
-    clips: Sequence[LipClip],
-    speech: Mapping[str, Sequence[Speech]],
+    output: Path, trained: Trained, clips: Sequence[LipClip], speech: Mapping[str, Sequence[Speech]]
 ) -> None:
     """Write the card of the model in ``output``, with the suffix ``.md``.
 

@@ -63,7 +63,6 @@ def speech_of(
 
 
 def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
-    """Return the samples of a clip or of its copy, and the copy's speed."""
     if not copy:
         return clip.samples, 1.0
     rng = np.random.default_rng([copy, zlib.crc32(clip.name.encode())])
@@ -72,7 +71,6 @@ def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
 
 
 def _positions(model: NeuralModel, sounds: Sequence[Floats]) -> list[dict[str, NDArray[Any]]]:
-    """Compute or load features and times of all positions, and the starts of stretches."""
     of_model = hashlib.sha256(_FORMAT.encode())
     of_model.update(model.network.tobytes())
     paths = [_cache_path(of_model, samples) for samples in sounds]

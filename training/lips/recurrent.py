@@ -138,7 +138,6 @@ def train_network(
 
 
 def _cut(examples: Sequence[Example]) -> list[Example]:
-    """Cut stretches into pieces, and drop very short ones."""
     return [
         Example(whole.components[start:end], whole.targets[start:end], whole.speaker)
         for whole in examples

@@ -56,5 +56,4 @@ def _solve(histories: Floats, targets: Floats) -> Array:
     ridge[-1] = _TINY
     products = (histories.T @ histories).astype(np.float64)
     with_targets = (histories.T @ targets).astype(np.float64)
-    weights: Array = np.linalg.solve(products + np.diag(ridge), with_targets).astype(np.float64)
-    return weights
+    return np.linalg.solve(products + np.diag(ridge), with_targets).astype(np.float64)

@@ -128,7 +128,6 @@ def count_closures(
 
 
 def _closures(frame_s: Array, height: Array, limits: Touch) -> Array:
-    """Return the times at which tracked lips close, seconds."""
     times = []
     for frame in range(1, len(height) - 1):
         before, now, after = height[frame - 1 : frame + 2]
@@ -140,7 +139,6 @@ def _closures(frame_s: Array, height: Array, limits: Touch) -> Array:
 
 
 def _runs(time_s: Array, is_closed: NDArray[np.bool_]) -> list[Array]:
-    """Return the times of each run of closed positions that does not reach a stretch's end."""
     edges = np.flatnonzero(np.diff(is_closed)) + 1
     return [time_s[start:end] for start, end in pairwise(edges) if is_closed[start]]
 

@@ -45,8 +45,7 @@ class Touch:
 def opening(clip: LipClip) -> Array:
     """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
     upper, lower = (MOUTH_FAPS.index(fap) for fap in (4, 5))
-    height: Array = -clip.faps[:, upper] - clip.faps[:, lower]
-    return height
+    return -clip.faps[:, upper] - clip.faps[:, lower]
 
 
 def touches(clips: Sequence[LipClip]) -> dict[str, Touch]:

@@ -99,8 +99,7 @@ def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
 def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.int64]:
     """Return the source frame of each frame after a change of speed, (num_frames,)."""
     at = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
-    nearest: NDArray[np.int64] = np.clip(np.rint(at), 0, num_source - 1).astype(np.int64)
-    return nearest
+    return np.clip(np.rint(at), 0, num_source - 1).astype(np.int64)
 
 
 def change_tempo(
@@ -156,14 +155,12 @@ def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
         knocks = (rng.random(num_pieces) < _KNOCK_RATE) * rng.uniform(1.0, 6.0, num_pieces)
         noise *= 1 + np.repeat(knocks, _KNOCK_SAMPLES)[:num_samples]
     below_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
-    scaled: NDArray[np.float64] = noise * (
+    return noise * (
         np.sqrt(np.mean(np.square(samples)) / (np.mean(noise**2) + _TINY)) * 10 ** (-below_db / 20)
     )
-    return scaled
 
 
 def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
-    """Filter some recordings like a telephone or a codec."""
     line = rng.random()
     if line < _TELEPHONE_PROB:
         band = [rng.uniform(200, 400), rng.uniform(3000, 3900)]
@@ -173,12 +170,10 @@ def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
         filters = butter(order, highest_hz, "low", fs=SAMPLE_RATE_HZ, output="sos")
     else:
         return samples
-    filtered: Sound = sosfilt(filters, samples)
-    return filtered
+    return sosfilt(filters, samples)
 
 
 def _color(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Filter a recording like another microphone."""
     frequency = np.fft.rfftfreq(len(samples), 1 / SAMPLE_RATE_HZ)
     color = _random_curve(frequency, 7, (0.1, 0.5), rng)
     return np.fft.irfft(np.fft.rfft(samples) * color, len(samples))
@@ -193,5 +188,4 @@ def _random_curve(
     """Draw amplitudes over frequency; the spread of their logarithm is also drawn."""
     knots = rng.normal(0.0, rng.uniform(*spread), num_knots)
     at = np.linspace(0.0, _HALF_RATE_HZ, num_knots)
-    curve: NDArray[np.float64] = np.exp(np.interp(frequency, at, knots))
-    return curve
+    return np.exp(np.interp(frequency, at, knots))

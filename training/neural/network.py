@@ -73,8 +73,7 @@ class Layer(nn.Module):
         attended = attended.transpose(1, 2).reshape(batch, num_positions, width)
         hidden = hidden + self.dropout(self.attended(attended))
         inner = gelu(self.inner(self.inner_norm(hidden)))
-        out: Tensor = hidden + self.dropout(self.outer(inner))
-        return out
+        return hidden + self.dropout(self.outer(inner))
 
 
 class Encoder(nn.Module):
@@ -127,8 +126,7 @@ class Network(Encoder):
         may_attend = (back >= 0) & (back < WINDOW)
         for layer in self.layers:
             hidden = layer(hidden, may_attend)
-        out: Tensor = self.norm(hidden)
-        return out
+        return self.norm(hidden)
 
     def log_posteriors(self, hidden: Tensor, output: int) -> Tensor:
         """Run an output layer: (batch, positions, width) to (batch, positions, 2, states)."""

@@ -151,11 +151,7 @@ class Graph:
         )
 
     def layer(
-        self,
-        hidden: str,
-        parameters: Mapping[str, Floats],
-        name: str,
-        attend: Callable[[str], str],
+        self, hidden: str, parameters: Mapping[str, Floats], name: str, attend: Callable[[str], str]
     ) -> str:
         """Run a transformer layer; ``attend`` maps query, key and value to the attended values."""
         normed = self.norm(hidden, parameters, f"{name}.attention_norm")

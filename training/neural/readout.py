@@ -77,8 +77,7 @@ class Readout(nn.Module):
         standard = standard.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
         if self.training:
             standard = self._add_noise(standard)
-        inner: Tensor = self.dropout(gelu(self.inner(standard)))
-        return inner
+        return self.dropout(gelu(self.inner(standard)))
 
     def log_posteriors(self, context: Tensor, inner: Tensor) -> Tensor:
         """Compute the output: (batch, positions, ...) to (batch, 2 positions, states)."""

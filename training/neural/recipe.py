@@ -247,7 +247,6 @@ def _label(
     sounds: Sequence[NDArray[np.int16]],
     report: Report,
 ) -> TeacherLabels:
-    """Let the teacher label all recordings."""
     recordings = [*map(samples_of, examples), *sounds]
     targets = process_all(teacher.targets_of, recordings, "labeled by the teacher", report)
     untranscribed = targets[len(examples) :]
@@ -273,7 +272,6 @@ def _teacher_details(labels: TeacherLabels) -> str:
 
 
 def _recordings(aligned: Sequence[AlignedExample], labels: TeacherLabels) -> list[Recording]:
-    """Combine samples, targets and weights."""
     recordings = []
     for one, weight in zip(aligned, _weights(aligned), strict=True):
         targets = Targets.hard(one.states)

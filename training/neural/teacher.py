@@ -126,11 +126,7 @@ class Teacher:
 
 
 def train_teacher(
-    encoder: WholeEncoder,
-    recordings: Sequence[Recording],
-    *,
-    seed: int,
-    report: Report,
+    encoder: WholeEncoder, recordings: Sequence[Recording], *, seed: int, report: Report
 ) -> Teacher:
     """Train a readout on recordings whose targets are the states of an alignment.
 

@@ -59,12 +59,7 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        network: Network,
-        recordings: Sequence[Recording],
-        *,
-        main_output: int,
-        seed: int,
+        self, network: Network, recordings: Sequence[Recording], *, main_output: int, seed: int
     ) -> None:
         self.network = network
         self.main_output = main_output
@@ -130,7 +125,6 @@ class Trainer:
         return main_loss
 
     def _loss(self, hidden: Tensor, states: Tensor, probs: Tensor, output: int) -> Tensor:
-        """Mean cross-entropy of an output layer, nats a frame."""
         look_ahead = self.network.shape.look_aheads[output]
         shifted = shift_targets(states, probs, hidden.shape[1], look_ahead)
         return cross_entropy(self.network.log_posteriors(hidden, output), *shifted)

@@ -46,10 +46,7 @@ _BRAIN_FLOAT = 5
 _KINDS: dict[int, type[np.generic]] = {
     0: np.float32, 1: np.int8, 2: np.int16, 3: np.int32, 4: np.float16, _BRAIN_FLOAT: np.uint16,
 }  # fmt: skip
-_OF_NETWORK = {
-    "first": "conv1",
-    "second": "conv2",
-}
+_OF_NETWORK = {"first": "conv1", "second": "conv2"}
 _OF_LAYER = {
     "attention_norm": "self_attention/layer_norm",
     "query_key_value": "self_attention/linear_0",
@@ -95,7 +92,6 @@ def load_whisper(network: Encoder, folder: Path) -> None:
 
 
 def _names(num_layers: int) -> dict[str, str]:
-    """Map the names of the network's parameters to those in the file."""
     parts = {ours: f"encoder/{theirs}" for ours, theirs in _OF_NETWORK.items()} | {
         f"layers.{layer}.{ours}": f"encoder/layer_{layer}/{theirs}"
         for layer in range(num_layers)

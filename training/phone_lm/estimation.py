@@ -114,8 +114,7 @@ def _smooth(
     """Estimate probabilities of single phones, all above 0."""
     smooth = np.full(num_phones, _UNSEEN_COUNT)
     smooth[phones] += counts
-    probs: NDArray[np.float64] = smooth / smooth.sum()
-    return probs
+    return smooth / smooth.sum()
 
 
 def _prune(
@@ -175,7 +174,6 @@ class _Tree:
         )
 
     def _prob(self, wanted: NDArray[np.int64], n: int, backoffs: _Probs) -> NDArray[np.float64]:
-        """Return probabilities of n-grams, backing off for those that were pruned."""
         num_phones = len(self.inventory)
         at = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
         probs = self.probs[n][at]
@@ -192,12 +190,10 @@ class _Tree:
 
 def _remainder(total: NDArray[Any]) -> NDArray[np.float64]:
     """Return what a sum of probabilities leaves of 1, at least a little."""
-    left: NDArray[np.float64] = np.maximum(1 - total, _MIN_REMAINDER)
-    return left
+    return np.maximum(1 - total, _MIN_REMAINDER)
 
 
 def _logs(values: _Probs) -> NDArray[np.float32]:
     """Return the logarithms of all levels in order, the root's (0) first."""
     logs = np.log(np.concatenate([[1.0], *(values[n] for n in range(1, len(values) + 1))]))
-    single: NDArray[np.float32] = logs.astype(np.float32)
-    return single
+    return logs.astype(np.float32)

@@ -54,8 +54,7 @@ class _Level:
     def has(self, code: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which n-grams are counted."""
         at = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
-        is_counted: NDArray[np.bool_] = self.code[at] == code
-        return is_counted
+        return self.code[at] == code
 
 
 def draw_phones(
@@ -83,7 +82,6 @@ def draw_phones(
 
 
 def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory) -> Stream:
-    """Replace words by their phones, and merge adjacent pauses."""
     silence = inventory.index[inventory.silence]
     phones = [_phones_of(word, inventory) or (silence,) for word in words]
     lengths = np.array([len(one) for one in phones])
@@ -93,8 +91,7 @@ def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInve
     all_phones = np.concatenate([np.array(one, np.uint8) for one in phones])
     stream = all_phones[np.arange(ends[-1]) - shift]
     repeated = (stream[1:] == silence) & (stream[:-1] == silence)
-    merged: Stream = stream[np.concatenate([[True], ~repeated])]
-    return merged
+    return stream[np.concatenate([[True], ~repeated])]
 
 
 def _phones_of(word: str, inventory: PhoneInventory) -> tuple[int, ...]:
@@ -119,7 +116,6 @@ def _next_words(
 
 
 def _levels(path: Path) -> list[_Level]:
-    """Read words, pairs and triples with their negative log-probabilities."""
     rows: list[list[tuple[int, float]]] = []
     try:
         with path.open(encoding="ascii") as lines:
@@ -145,7 +141,6 @@ def _levels(path: Path) -> list[_Level]:
 
 
 def _words(path: Path) -> list[str]:
-    """Read the words in the order of their numbers."""
     try:
         content = path.read_bytes()
         (start,) = struct.unpack("<I", content[_WORDS_OFFSET])

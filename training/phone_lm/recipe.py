@@ -95,7 +95,6 @@ def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
 
 
 def _sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
-    """Read the sentences of a file that can be pronounced."""
     try:
         lines = text.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

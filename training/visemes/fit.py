@@ -45,10 +45,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import
     CONSONANTS,
     initial_parameters,
 )
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    VisemeParameters,
-    columns,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     LIP_HEIGHT_FAPS,

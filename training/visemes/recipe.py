@@ -53,8 +53,7 @@ def usual_levels(
                 if quieter_db > -_SPOKEN_DB:  # a lower one is a pause
                     total[viseme] += quieter_db
                     count[viseme] += 1.0
-    levels: Array = total / count
-    return levels
+    return total / count
 
 
 def closure_reach(
