@@ -10,8 +10,9 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import soundfile
@@ -22,7 +23,7 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 
-_FORMAT = "3"  # increase it when the front end's log-mel stage changes
+_FORMAT = "4"  # increase it when the front end's log-mel stage changes
 _FULL_SCALE = 32768.0
 
 
@@ -100,54 +101,20 @@ def _cached(
         state = utterance.path.stat()
         key.update(f"{utterance.path}|{state.st_size}|{state.st_mtime_ns}\n".encode())
     stem = cache_folder() / f"{kind}_{key.hexdigest()[:20]}"
-    rows, bounds = stem.with_suffix(".npy"), stem.with_suffix(".bounds.npy")
+    rows, bounds = stem.with_suffix(".rows"), stem.with_suffix(".bounds.npy")
     if not (rows.is_file() and bounds.is_file()):
-        _write(rows, bounds, utterances, empty, block_of)
+        num_rows = []
+        with rows.open("wb") as file:
+            for utterance in track(utterances, description=kind):
+                block = empty
+                with suppress(ValueError):
+                    block = block_of(read_audio(utterance.path))
+                file.write(np.ascontiguousarray(block).tobytes())
+                num_rows.append(len(block))
+        np.save(bounds, np.cumsum(num_rows))
     ends = np.load(bounds, allow_pickle=False)
-    starts = np.concatenate([[0], ends[:-1]])
     if not ends[-1]:
         return [empty] * len(ends)
-    blocks = np.load(rows, mmap_mode="r", allow_pickle=False)
+    blocks = np.memmap(rows, empty.dtype, "r").reshape(-1, *empty.shape[1:])
+    starts = [0, *ends[:-1]]
     return [blocks[start:end] for start, end in zip(starts, ends, strict=True)]
-
-
-def _write(
-    rows: Path,
-    bounds: Path,
-    utterances: Sequence[Utterance],
-    empty: NDArray[Any],
-    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
-) -> None:
-    ends = []
-    num_rows = 0
-    with rows.open("wb") as file:
-        _write_header(file, empty, 0)  # numpy pads it for any number of rows
-        for utterance in track(utterances, description=rows.stem.rpartition("_")[0]):
-            block = _compute(utterance, empty, block_of)
-            file.write(np.ascontiguousarray(block).tobytes())
-            num_rows += len(block)
-            ends.append(num_rows)
-        file.seek(0)
-        _write_header(file, empty, num_rows)
-    np.save(bounds, np.array(ends, dtype=np.int64))
-
-
-def _write_header(file: BinaryIO, empty: NDArray[Any], num_rows: int) -> None:
-    header = {
-        "descr": np.lib.format.dtype_to_descr(empty.dtype),
-        "fortran_order": False,
-        "shape": (num_rows, *empty.shape[1:]),
-    }
-    np.lib.format.write_array_header_1_0(file, header)
-
-
-def _compute(
-    utterance: Utterance,
-    empty: NDArray[Any],
-    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
-) -> NDArray[Any]:
-    try:
-        samples = read_audio(utterance.path)
-    except ValueError:
-        return empty
-    return block_of(samples)

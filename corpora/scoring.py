@@ -41,17 +41,8 @@ def matched_pairs(
     """Align two strings with the fewest errors (Levenshtein 1966).
 
     Of several best alignments, this one prefers substitutions from the end. rapidfuzz prefers
-    deletions, which would change published figures.
-
-    Returns
-    -------
-    list of tuple
-        Pairs of indices. An insertion has no first index, a deletion no second one: they are None.
-
-    Examples
-    --------
-    >>> matched_pairs(["n", "i"], ["n", "i", "h"])
-    [(0, 0), (1, 1), (None, 2)]
+    deletions, which would change published figures. Returns pairs of indices; the first is None
+    for an insertion, the second for a deletion.
     """
     rows, columns = len(reference) + 1, len(recognized) + 1
     cost = np.zeros((rows, columns), dtype=np.int64)
@@ -101,12 +92,7 @@ def is_emitted(phone: Phone, after: StreamOutput | None) -> bool:
 def first_hypothesis(events: Sequence[StreamOutput], known: set[int]) -> list[Phone]:
     """Return each phone as first emitted, by the rule or along with the next one.
 
-    Parameters
-    ----------
-    events
-        Output of a live recognizer.
-    known
-        Indices of the phones emitted before. Those of ``events`` are added.
+    ``known`` are indices of the phones emitted before; those of ``events`` are added.
     """
     first = []
     for event, after in zip_longest(events, events[1:]):

@@ -10,6 +10,13 @@ The files in the folder determine the layout:
 
 The inventory of the corpus's language converts text to phones. Bad rows are reported, counted and
 skipped, because large corpora always contain some.
+
+Natural recordings are held out from all training, to measure recognizers on them.
+``conversation.tsv`` is a manifest (:mod:`kouxing.corpora.speech_corpus`) of those with a text:
+podcasts, a talk, a web seminar and a prompt, with eight voices. The publishers of ``MOSS-TTSD`` and
+``Step-Audio-EditX`` provide the texts. Other texts are the output of one large recognizer
+(``RapidASR``) or the majority of several (``vad_example``), so they contain errors. Long recordings
+are cut into pieces that overlap by 0.48 s, and so are their texts.
 """
 
 from __future__ import annotations
@@ -101,23 +108,9 @@ def read_corpus(
 ) -> list[Utterance]:
     """Read a corpus folder, or a manifest, in any of the three layouts.
 
-    Parameters
-    ----------
-    folder
-        The corpus, or its manifest.
-    errors
-        Receives a message for every row that cannot be used.
-    inventory
-        The corpus's language.
-    split
-        Split to read; None reads all.
-    audio
-        Base folder of a manifest's paths; by default the manifest's folder.
-
-    Raises
-    ------
-    UserError
-        If the layout is unknown, or a list is missing or not UTF-8 text.
+    ``errors`` receives a message for every row that cannot be used. Without ``split`` all splits
+    are read. ``audio`` is the base folder of a manifest's paths, by default the manifest's folder.
+    Raises UserError if the layout is unknown, or a list is missing or not UTF-8 text.
     """
     if folder.suffix == ".tsv" and folder.is_file():
         rows = _manifest_rows(folder, audio)
@@ -261,3 +254,22 @@ def _pairs(path: Path) -> Iterator[tuple[str, str]]:
         key, _, value = line.strip().partition(" ")
         if key:
             yield key, value.strip()
+
+
+CONVERSATION = Path(__file__).parent / "conversation.tsv"
+_PREFIXES = (  # of file names; they cover whole recordings and all recordings of a speaker
+    "MOSS-TTSD_",
+    "MOSS-TTS_reference_zh_3",
+    "MiMo-Audio_aa7ed1",
+    "RapidASR_",
+    "Step-Audio-EditX_",
+    "alibabacloud-bailian-speech-demo_",
+    "paraformer-python_P9",
+    "paraformer-python_vad",
+    "websdk-java-demo_16K",
+)
+
+
+def is_held_out(recording: Path) -> bool:
+    """Return whether a recording is held out, by the name of its file."""
+    return recording.name.startswith(_PREFIXES)

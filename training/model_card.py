@@ -23,9 +23,8 @@ def write_card(
 ) -> None:
     """Write the card of the model in ``output``, with the suffix ``.md``.
 
-    ``details`` describe the training as part of a sentence. The card lists the training examples by
-    license and counts the skipped rows. ``chosen`` are the search weights, if they were chosen on
-    development data, and ``measure`` names their error rate.
+    ``details`` describe the training as part of a sentence. ``chosen`` are the search weights, if
+    they were chosen on development data, and ``measure`` names their error rate.
     """
     by_license: dict[str, list[Example]] = defaultdict(list)
     for example in examples:

@@ -20,8 +20,7 @@ from kouxing.services.recognizer.front_end.vtln import without_pitch
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.progress import Report
-from kouxing.training.training_set import Example, load_examples
+from kouxing.training.training_set import Example, Report, load_examples
 
 M = TypeVar("M", GmmModel, NeuralModel)
 # Computes the error rate of recordings from their scaled scores, (frames, states) each.
@@ -74,20 +73,8 @@ def choose_search_weights(
 ) -> SearchWeights | None:
     """Choose the weights with the lowest error rate on the split ``dev``; None if it is empty.
 
-    Parameters
-    ----------
-    model
-        A model with an acoustic scale of 1.
-    corpora
-        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads.
-    scales
-        Acoustic scales to try.
-    shipping
-        Exclude rows whose license does not allow distributing the model.
-    with_samples
-        Compute the features with the model's front end instead of from cached log-mel features.
-    rate
-        Error rate to minimize.
+    ``model`` has an acoustic scale of 1. ``with_samples`` computes the features with the model's
+    front end instead of from cached log-mel features. ``rate`` is minimized.
     """
     dev = load_dev(corpora, model.inventory, shipping=shipping, with_samples=with_samples)
     if not dev:

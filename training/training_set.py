@@ -1,4 +1,4 @@
-"""The training set: recordings with features, phones and weights.
+"""The training set: recordings with features, phones and weights; and lines of progress.
 
 Corpora are unbalanced. One speaker reads words for three hours, thirty others read one sentence
 each, and a synthesizer makes any amount. The weight of a recording is
@@ -8,20 +8,22 @@ each, and a synthesizer makes any amount. The weight of a recording is
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import log_mel_of, samples_of
-from kouxing.corpora.held_out import is_held_out
 from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
     audio_files,
+    is_held_out,
     is_synthetic,
     may_ship,
     read_corpus,
@@ -187,3 +189,16 @@ def _samples_of(span: slice, num_frames: int) -> slice:
     """Return the range of samples behind the first ``num_frames`` frames of a span."""
     first = HOP_SAMPLES * span.start
     return slice(first, first + HOP_SAMPLES * (num_frames - 1) + WINDOW_SAMPLES)
+
+
+Report = Callable[[str], None]
+T = TypeVar("T")
+
+
+def with_progress(items: Sequence[T], what: str, report: Report) -> Iterator[T]:
+    """Yield the items, and report after each tenth of them."""
+    step = math.ceil(len(items) / 10)
+    for number, item in enumerate(items, start=1):
+        yield item
+        if number % step == 0 or number == len(items):
+            report(f"{number} of {len(items)} recordings {what}")

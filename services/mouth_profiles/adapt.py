@@ -50,13 +50,7 @@ class LearnedProfile:
 
 
 def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
-    """Learn a mouth profile from one speaker's recordings.
-
-    Raises
-    ------
-    UserError
-        If there is too little speech with lips in view.
-    """
+    """Learn a mouth profile; UserError if there is too little speech with lips in view."""
     model = load_model()
     lips = lip_predictor_for(model)
     if lips is None or not isinstance(model, NeuralModel):

@@ -84,24 +84,11 @@ _MIN_NEUTRAL = 5  # frames
 
 
 def mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
-    """Compute the FAPs of a mouth relative to its own neutral face.
+    """Compute the FAPs of a mouth relative to its own neutral face, FAP units, (n, 28).
 
-    Parameters
-    ----------
-    landmarks
-        ``LANDMARKS`` of each frame, pixels, shape (n, 43, 3).
-    level_db
-        Audio level at each frame, dB, shape (n,).
-
-    Returns
-    -------
-    NDArray
-        Mouth FAPs of each frame, FAP units, shape (n, 28); NaN for FAPs without a landmark.
-
-    Raises
-    ------
-    UserError
-        If the landmarks do not form an upright face.
+    ``landmarks`` are ``LANDMARKS`` of each frame, pixels, (n, 43, 3). ``level_db`` are the audio
+    levels, (n,). FAPs without a landmark are NaN. Raises UserError if the landmarks do not form an
+    upright face.
     """
     points = _align_head(landmarks.astype(np.float64))
     height = points[:, _at(_UPPER_LIP), _Y] - points[:, _at(_LOWER_LIP), _Y]

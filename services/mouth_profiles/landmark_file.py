@@ -35,13 +35,7 @@ _MAX_PIXEL = 1e5
 
 
 def parse_landmark_file(content: bytes) -> FilmedSpeech:
-    """Parse the content of a landmark file.
-
-    Raises
-    ------
-    UserError
-        If it is not a landmark file, or does not show a face.
-    """
+    """Parse a landmark file; UserError if it is not one, or does not show a face."""
     try:
         time_s, landmarks, samples = _parse(content)
     except ValueError as error:

@@ -147,10 +147,7 @@ def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> flo
 def fit_profile(observations: Observations) -> MouthProfile:
     """Fit a profile; cross-validation chooses the strength of the ridge.
 
-    Raises
-    ------
-    UserError
-        If there is too little speech with tracked lips.
+    Raises UserError if there is too little speech with tracked lips.
     """
     usable = observations[_is_known(observations)]
     speech_s = len(usable) * POSITION_S
@@ -172,13 +169,7 @@ def fit_profile(observations: Observations) -> MouthProfile:
 
 
 def measure_gain(lips: LipPredictor, observations: Observations) -> ProfileGain:
-    """Fit a profile to all but the last quarter, and measure it there.
-
-    Raises
-    ------
-    UserError
-        As ``fit_profile``.
-    """
+    """Fit a profile to all but the last quarter, and measure it there; UserError as there."""
     first_held_out = round((1 - _HELD_OUT) * len(observations))
     profile = fit_profile(observations[:first_held_out])
     held_out = observations[first_held_out:]

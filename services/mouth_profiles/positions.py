@@ -25,22 +25,12 @@ POSITION_S = FRAMES_PER_POSITION * HOP_S
 
 
 class LipPositions:
-    """The lip model's inputs over one recording.
-
-    Attributes
-    ----------
-    starts : list of int
-        First position of each stretch of speech.
-    known_s : list of float
-        Media time up to which the audio is known at each position.
-    features : list of NDArray
-        Input of ``LipPredictor`` at each position, (features,).
-    """
+    """The lip model's inputs over one recording."""
 
     def __init__(self) -> None:
-        self.starts: list[int] = []
-        self.known_s: list[float] = []
-        self.features: list[NDArray[np.float16]] = []
+        self.starts: list[int] = []  # first position of each stretch of speech
+        self.known_s: list[float] = []  # media time up to which the audio is known
+        self.features: list[NDArray[np.float16]] = []  # of each position, (features,)
 
     def process_position(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
         """Store the network's values at a position."""

@@ -19,10 +19,7 @@ _THREAD_LIMITS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 def learn_from_landmarks(recording: bytes) -> tuple[bytes, dict[str, object]]:
     """Learn from the content of a landmark file; return the mouth profile and its figures.
 
-    Raises
-    ------
-    UserError
-        If the content is invalid or has too little speech with lips in view.
+    Raises UserError if the content is invalid or has too little speech with lips in view.
     """
     # Imported here, so that the gateway itself does not load the models.
     from kouxing.services.mouth_profiles.adapt import learn_mouth_profile  # noqa: PLC0415

@@ -36,7 +36,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
-from kouxing.training.visemes.parameters_file import save_parameters
+from kouxing.training.visemes.recipe import save_parameters
 from tests.lips import INVENTORY, phone
 
 pytestmark = pytest.mark.unit

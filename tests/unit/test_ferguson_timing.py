@@ -18,7 +18,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Progress
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.ferguson.table_file import format_table
+from kouxing.training.ferguson.recipe import format_table
 from tests.lips import phone
 from tests.live_streams import LiveStream
 from tests.system import DEMO

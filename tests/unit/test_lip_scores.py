@@ -41,7 +41,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
-from kouxing.training.visemes.parameters_file import save_parameters
+from kouxing.training.visemes.recipe import save_parameters
 from tests.lips import INVENTORY, clip_of, utterance
 from tests.system import VOWELS_FILE
 

@@ -23,20 +23,21 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.training.lips import recipe, recurrent
-from kouxing.training.lips.card import predict
+from kouxing.training.lips.card import Prediction, correlations, count_closures, predict
 from kouxing.training.lips.positions import Speech
 from kouxing.training.lips.recipe import (
     DELAYS_S,
+    HISTORY,
     Units,
     basis_of,
     examples_of,
     fit,
+    fit_ridge,
+    history_of,
     joined,
     train_lips,
 )
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
-from kouxing.training.lips.ridge import HISTORY, fit_ridge, history_of
-from kouxing.training.lips.scores import Prediction, correlations, count_closures
 from kouxing.training.lips.targets import Touch, targets_at, touches
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import WholeEncoder

@@ -20,6 +20,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperM
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.neural import augmentation, batches, teacher, trainer
+from kouxing.training.neural.alignment import log_posteriors_of
 from kouxing.training.neural.augmentation import (
     augment_samples,
     change_tempo,
@@ -28,12 +29,11 @@ from kouxing.training.neural.augmentation import (
 )
 from kouxing.training.neural.batches import Recording, Targets, augment
 from kouxing.training.neural.export import network_of, onnx_of
+from kouxing.training.neural.initial_network import load_whisper
 from kouxing.training.neural.network import Network, Shape, output_frames
 from kouxing.training.neural.optimizer import cross_entropy
 from kouxing.training.neural.recipe import train_neural
-from kouxing.training.neural.scoring import log_posteriors_of
 from kouxing.training.neural.trainer import Trainer, shift_targets
-from kouxing.training.neural.whisper_weights import load_whisper
 from kouxing.training.training_set import load_examples, load_untranscribed
 from tests.languages import MANDARIN
 from tests.tones import burst, tones
@@ -357,9 +357,7 @@ def trained(
         network.first.weight *= 6
         network.second.weight *= 6
     learner = Trainer(network, recordings, main_output=main_output, seed=seed)
-    losses: list[float] = []
-    learner.train(num_steps, lambda _, loss: losses.append(loss))
-    return learner, losses
+    return learner, [loss for _, loss in learner.train(num_steps)]
 
 
 @pytest.mark.parametrize("main_output", [0, 1])

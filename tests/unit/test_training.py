@@ -10,8 +10,13 @@ import pytest
 import soundfile
 
 from kouxing.corpora import feature_cache
-from kouxing.corpora.held_out import CONVERSATION, is_held_out
-from kouxing.corpora.speech_corpus import RowErrors, may_ship, read_corpus
+from kouxing.corpora.speech_corpus import (
+    CONVERSATION,
+    RowErrors,
+    is_held_out,
+    may_ship,
+    read_corpus,
+)
 from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text
@@ -24,8 +29,7 @@ from kouxing.services.recognizer.search.forced_path import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations, positions_of
-from kouxing.training.gmm.decorrelation import decorrelate
-from kouxing.training.gmm.estimation import estimate, first_estimate, split
+from kouxing.training.gmm.estimation import decorrelate, estimate, first_estimate, split
 from kouxing.training.gmm.frames import Copy, FrameSet
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm

@@ -36,7 +36,7 @@ from kouxing.training.neural.network import mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, rise_and_fall
 from kouxing.training.neural.readout import Readout, ReadoutShape
 from kouxing.training.neural.teacher import WholeEncoder
-from kouxing.training.progress import Report
+from kouxing.training.training_set import Report
 
 MAX_WINDOW_FRAMES = 250
 READOUT = ReadoutShape(inner=320, gru=192, dropout=0.2, noise=0.15)
@@ -49,12 +49,8 @@ _WINDOWS_OF_RECORDING = 4  # in a batch
 _FROM_START_PROB = 0.3  # of a window shorter than the longest
 _MIN_FRAMES = 10
 _READ_FRAMES, _EARLIER_WEIGHT = 40, 0.25
-_RATE = 2e-3
-_WEIGHT_DECAY = 0.02
 _WARM_UP_STEPS = 30
 _FALLING = 0.6  # fraction of the steps, at the end, over which the rate falls to 0
-_MAX_GRADIENT_NORM = 2.0
-_MEAN_EXPONENT = 8  # of the running mean of the weights
 _SAVE_EVERY = 25  # steps
 
 Floats = NDArray[np.float32]
@@ -79,13 +75,8 @@ def train_readout(
     some = torch.cat([batches.get(number)[0].flatten(0, 1) for number in range(_NUM_CACHED)])
     readout = Readout(some.shape[-1], num_states, READOUT)
     readout.standardize(some)
-    optimizer = Optimizer(
-        readout,
-        [{"params": list(readout.parameters()), "lr": _RATE}],
-        weight_decay=_WEIGHT_DECAY,
-        max_gradient_norm=_MAX_GRADIENT_NORM,
-        mean_exponent=_MEAN_EXPONENT,
-    )
+    groups = [{"params": list(readout.parameters()), "lr": 2e-3}]
+    optimizer = Optimizer(readout, groups, weight_decay=0.02, max_norm=2.0, mean_exponent=8)
     first_step = optimizer.load(checkpoint)
     if first_step:
         report(f"resuming after step {first_step}")

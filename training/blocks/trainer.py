@@ -36,14 +36,11 @@ from kouxing.training.neural.network import mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy
 from kouxing.training.neural.readout import MAX_DEVIATIONS
 from kouxing.training.neural.teacher import WholeEncoder
-from kouxing.training.progress import Report
+from kouxing.training.training_set import Report
 
 _RATE, _READOUT_RATE = 1e-4, 6e-4  # of the last layer, of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above
 _WARM_UP_STEPS = 60
-_WEIGHT_DECAY = 0.01
-_MAX_GRADIENT_NORM = 2.0
-_MEAN_EXPONENT = 3  # of the running mean of the weights
 _HIDDEN_WEIGHT, _RIGHT_WEIGHT = 0.5, 0.5  # of a loss
 _SAVE_EVERY = 25  # steps
 
@@ -72,13 +69,8 @@ def train_network(
     ``network`` has Whisper's weights and a trained readout, ``teacher`` is Whisper's encoder.
     Training saves its state in ``checkpoint``, and resumes from it if the file exists.
     """
-    optimizer = Optimizer(
-        network,
-        _groups(network),
-        weight_decay=_WEIGHT_DECAY,
-        max_gradient_norm=_MAX_GRADIENT_NORM,
-        mean_exponent=_MEAN_EXPONENT,
-    )
+    groups = _groups(network)
+    optimizer = Optimizer(network, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=3)
     first_step = optimizer.load(checkpoint)
     if first_step:
         report(f"resuming after step {first_step}")

@@ -16,15 +16,14 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
-from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.table import COLUMNS, PhoneTable
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.ferguson.lengths import AlignedSpeech, usual_times
 from kouxing.training.ferguson.openings import fit_openings, travel_of
-from kouxing.training.ferguson.table_file import format_table
-from kouxing.training.progress import Report
+from kouxing.training.training_set import Report
 
 _MIN_SYLLABLES = 3  # isolated words are slower than connected speech
 _MAX_OF_SPEAKER = 60  # recordings
@@ -114,3 +113,20 @@ def aligned_speech(
             errors.add(row.utterance_id, str(error))
             continue
         yield AlignedSpeech(progress_of(samples), syllables, spoken(phones, model.inventory))
+
+
+def format_table(table: PhoneTable, inventory: PhoneInventory, about: list[str]) -> str:
+    """Return a table as text, after comment lines about its origin."""
+    rows = [
+        (
+            phone,
+            f"{table.opening[phone]:.2f}",
+            f"{table.duration_s[phone]:.3f}",
+            f"{table.crossings[phone]:.2f}",
+            str(table.level.get(phone, "")),
+            f"{table.influence[phone]:.2f}" if phone in table.influence else "",
+        )
+        for phone in inventory.phones
+    ]
+    lines = [*(f"# {line}" for line in about), *("\t".join(row) for row in (COLUMNS, *rows))]
+    return "\n".join(lines) + "\n"

@@ -15,14 +15,18 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training import SYNTHETIC_WEIGHT
 from kouxing.training.gmm.augmentation import Augmentation
-from kouxing.training.gmm.decorrelation import decorrelate
-from kouxing.training.gmm.estimation import estimate, first_estimate, split, topology_of
+from kouxing.training.gmm.estimation import (
+    decorrelate,
+    estimate,
+    first_estimate,
+    split,
+    topology_of,
+)
 from kouxing.training.gmm.frames import Copy, FrameSet, Hmm
 from kouxing.training.model_card import write_card
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
-from kouxing.training.progress import Report
 from kouxing.training.search_weights import SearchWeights, choose_search_weights
-from kouxing.training.training_set import Example, load_examples
+from kouxing.training.training_set import Example, Report, load_examples
 
 _STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # of the differences, frames
@@ -51,9 +55,8 @@ def train_gmm(
 ) -> None:
     """Train the Gaussian mixture recognizer, and write the model with its card.
 
-    The arguments are the options of ``kouxing train gmm``; ``shipping`` excludes rows whose license
-    does not allow distributing the model. Raises UserError if there is nothing to train on, or the
-    number of mixtures is not a power of two.
+    The arguments are the options of ``kouxing train gmm``. Raises UserError if there is nothing to
+    train on, or the number of mixtures is not a power of two.
     """
     if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
         raise UserError(f"{num_mixtures} mixtures is not a power of two; give 1, 2, 4, 8, 16...")

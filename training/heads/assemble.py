@@ -13,12 +13,9 @@ from numpy.typing import NDArray
 from scipy import interpolate
 
 from kouxing.training.heads import paint, paint_parts, parts, subdivision
-from kouxing.training.heads.asset import Piece, write
-from kouxing.training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
-from kouxing.training.heads.feature_points import FEATURE_POINTS
-from kouxing.training.heads.hair import coarse_locks
+from kouxing.training.heads.hair import coarse_locks, join
 from kouxing.training.heads.hair_styles import Crop
-from kouxing.training.heads.makehuman import PIVOT, MakeHuman
+from kouxing.training.heads.makehuman import FEATURE_POINTS, PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
     eye_sockets,
     head_weight,
@@ -28,8 +25,9 @@ from kouxing.training.heads.measures import (
     neckline_height,
 )
 from kouxing.training.heads.occlusion import shade
+from kouxing.training.heads.paint_parts import encode
+from kouxing.training.heads.parts import Piece, eye_pieces, teeth_pieces, tongue_piece, write
 from kouxing.training.heads.people import REFERENCE, Person, Shape
-from kouxing.training.heads.texture import encode
 from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivided
 
 Float = NDArray[np.float64]
@@ -50,6 +48,9 @@ LEFT_LID = (6886, 6844, 6841, 6838, 6785, 6784, 6790, 6793, 6796, 6799)
 LEFT_LOWER_LID = (
     6886, 6850, 6853, 6856, 6837, 11695, 6834, 6831, 6828, 6825, 6820, 6817, 6814, 6808
 )  # fmt: skip
+
+
+_SIDES = ("Left", "Right")
 
 
 class Builder:
@@ -97,7 +98,11 @@ class Builder:
         vertices = self._shaped(person.targets, person.face_units)
         skin = self._skin(vertices)
         fapu = measure_fapu(skin, vertices, self._mesh)
-        face = self._face_fields(fapu)
+        blink, squint = (
+            [self.reference.carry(self._source.face_unit(unit + side)) for side in _SIDES]
+            for unit in ("eyeBlink", "eyeSquint")
+        )
+        face = FaceFields(self.reference, self._cavity, blink, squint, fapu).fields
         pieces = [
             self._skin_piece(skin, person, face),
             self._garment(vertices),
@@ -109,17 +114,6 @@ class Builder:
         shade(pieces, self.reference.vertices, self._cavity, person.hair)
         output.parent.mkdir(parents=True, exist_ok=True)
         write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
-
-    def _face_fields(self, fapu: dict[str, float]) -> Fields:
-        blink, squint = (
-            (self._carried(unit + "Left"), self._carried(unit + "Right"))
-            for unit in ("eyeBlink", "eyeSquint")
-        )
-        return FaceFields(self.reference, self._cavity, blink, squint, fapu).fields
-
-    def _carried(self, unit: str) -> Float:
-        """Return the displacements (V, 3) of the skin by a face unit."""
-        return self.reference.carry(self._source.face_unit(unit))
 
     def _skin_piece(self, skin: Skin, person: Person, fields: Fields) -> Piece:
         layout = self.reference.vertices
@@ -209,10 +203,11 @@ class Builder:
         return pieces
 
     def _lashes(self, skin: Skin, fields: Fields, length: float) -> Piece:
+        """Make two ribbons of lashes along the edges of the upper eyelids."""
         columns, rows = 25, 4
         layout = self.reference.vertices[: len(skin.base)]
-        pieces = []
-        fields_of_sides: list[Fields] = []
+        ribbons: list[parts.Part] = []
+        shifts: dict[int, list[Float]] = {fap: [] for fap in fields}
         for side in (1.0, -1.0):
             lid = skin.number[np.array(LEFT_LID)]
             if side < 0:
@@ -227,44 +222,23 @@ class Builder:
             sideways = (np.linspace(-0.55, 1.0, columns) * side)[:, None] * [1.0, 0, 0]
             out = np.array([0.0, 0.0, 1.0]) + 0.75 * sideways
             grow = np.sin(np.pi * np.linspace(0.12, 0.80, columns))[:, None] * 0.060 * length
-            ribbon = [
+            points = np.concatenate([
                 root
                 + grow * (t * out * 0.85 + np.array([0.0, 1.0, 0.0]) * (0.75 * t**2 - 0.10 * t))
                 for t in np.linspace(0, 1, rows)
-            ]
-            points = np.concatenate(ribbon)
-            uv = np.stack(
-                [
-                    np.tile(np.linspace(0, 1, columns), rows),
-                    np.repeat(np.linspace(1, 0, rows), columns),
-                ],
-                axis=1,
-            )
+            ])  # fmt: skip
+            u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(1, 0, rows))
+            uv = np.stack([u.ravel(), v.ravel()], axis=1)
             triangles = parts.grid_triangles(rows, columns)
-            pieces.append(parts.Part(points, triangles, uv, np.ones_like(points)))
-            fields_of_sides.append(
-                {
-                    fap: np.tile(
-                        interpolate.make_interp_spline(length_along, shift[lid], 3)(at), (rows, 1)
-                    )
-                    for fap, shift in fields.items()
-                    if np.abs(shift[lid]).max() > 1e-6
-                }
-            )
-        left, right = pieces
-        count = len(left.vertices)
-        part = parts.Part(
-            np.concatenate([left.vertices, right.vertices]),
-            np.concatenate([left.triangles, right.triangles + count]),
-            np.concatenate([left.uv, right.uv]),
-            np.ones((2 * count, 3)),
-        )
-        both: Fields = {}
-        for half, side_fields in enumerate(fields_of_sides):
-            for fap, shift in side_fields.items():
-                whole = both.setdefault(fap, np.zeros((2 * count, 3)))
-                whole[half * count : (half + 1) * count] = shift
-        return Piece("lashes", part, "lashes", 0.9, np.ones(2 * count), both)
+            ribbons.append(parts.Part(points, triangles, uv, np.ones_like(points)))
+            for fap, shift in fields.items():
+                moved = np.zeros((columns, 3))
+                if np.abs(shift[lid]).max() > 1e-6:
+                    moved = interpolate.make_interp_spline(length_along, shift[lid], 3)(at)
+                shifts[fap].append(np.tile(moved, (rows, 1)))
+        both = {fap: np.concatenate(halves) for fap, halves in shifts.items() if np.any(halves)}
+        part = join(ribbons)
+        return Piece("lashes", part, "lashes", 0.9, np.ones(len(part.vertices)), both)
 
     def _face_map(self) -> paint.FaceMap:
         skin = self.reference

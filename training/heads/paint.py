@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
 from kouxing.training.heads.hair_styles import Hair
-from kouxing.training.heads.texture import Color, mix, noise
+from kouxing.training.heads.paint_parts import Color, mix, noise
 
 Float = NDArray[np.float64]
 

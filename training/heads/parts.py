@@ -1,15 +1,25 @@
-"""Eyeballs and teeth, which MakeHuman's base mesh lacks or has too coarse.
+"""The pieces of a head, and the file that ``services.driver.head.head`` reads.
+
+Eyeballs and teeth are made here, because MakeHuman's base mesh lacks them or has them too coarse.
 
 All lengths are MakeHuman decimeters, y up, z toward the viewer, x to the subject's left.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from kouxing.services.driver.head.head import FORMAT
+from kouxing.training.heads import subdivision
+from kouxing.training.heads.makehuman import FEATURE_POINTS, METERS_PER_UNIT, PIVOT, BaseMesh
+from kouxing.training.heads.measures import eye_centers, eye_radius
+from kouxing.training.heads.zones import Fields, Skin, jaw_fields, tongue_fields
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -144,3 +154,168 @@ def middle_of_teeth(row: Part) -> tuple[int, int]:
     columns = len(row.vertices) // len(_PROFILE)
     edge = int(np.argmin(np.abs(_PROFILE[:, 1])))
     return edge * columns + columns // 2, columns // 2
+
+
+TRANSPARENT = ("hair_tips", "lashes")
+
+
+@dataclass(slots=True)
+class Piece:
+    """A part with its material and motion."""
+
+    name: str
+    part: Part
+    texture: str
+    roughness: float
+    head_weight: Float  # (V,)
+    fields: Fields = field(default_factory=dict)  # FAP -> (V, 3), dm at 1 FAPU or 1 rad
+    coarse_vertices: int = 0  # 0: there is only one level of detail
+    coarse_triangles: Index | None = None
+
+
+def write(
+    output: Path,
+    pieces: list[Piece],
+    textures: dict[str, bytes],
+    skin: Skin,
+    tongue: Skin,
+    fapu: dict[str, float],
+    *,
+    cel: bool,
+) -> None:
+    """Write a head, converting dm to m; ``cel`` as in ``Head``."""
+
+    def meters(points: Float) -> NDArray[np.float32]:
+        return np.asarray((points - PIVOT) * METERS_PER_UNIT, dtype=np.float32)
+
+    first = np.cumsum([0] + [len(p.part.vertices) for p in pieces])
+    start = {p.name: int(at) for p, at in zip(pieces, first, strict=False)}
+    part_vertices, part_triangles, triangles = [], [], []
+    count = 0
+    for piece in pieces:
+        at, size = start[piece.name], len(piece.part.vertices)
+        part_vertices.append((at, at + (piece.coarse_vertices or size), at + size))
+        triangles.append(piece.part.triangles + at)
+        fine = (count, count + len(triangles[-1]))
+        count = fine[1]
+        coarse = fine
+        if piece.coarse_triangles is not None:
+            triangles.append(piece.coarse_triangles + at)
+            coarse = (count, count + len(triangles[-1]))
+            count = coarse[1]
+        part_triangles.append((*fine, *coarse))
+
+    eyes = [p.part for p in pieces if p.name.startswith("eye")]
+    points = {
+        name: start["skin"] + int(skin.number[vertex])
+        for name, vertex in FEATURE_POINTS.items()
+        if skin.number[vertex] >= 0
+    }
+    points |= {
+        name: start["tongue"] + int(tongue.number[vertex])
+        for name, vertex in FEATURE_POINTS.items()
+        if tongue.number[vertex] >= 0
+    }
+    points |= {"3.5": start["eye_left"], "3.6": start["eye_right"]}
+    for piece, edge, root in ((pieces[4], "9.10", "9.8"), (pieces[5], "9.11", "9.9")):
+        at_edge, at_root = middle_of_teeth(piece.part)
+        points |= {edge: start[piece.name] + at_edge, root: start[piece.name] + at_root}
+    vertices = np.concatenate([p.part.vertices for p in pieces])
+    fapu = {name: value * METERS_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
+
+    faps, units, bounds, moved, shifts = [], [], [0], [], []
+    for fap in sorted({fap for piece in pieces for fap in piece.fields}):
+        for piece in pieces:
+            if fap in piece.fields:
+                shift = piece.fields[fap] * METERS_PER_UNIT
+                rows = np.flatnonzero(np.abs(shift).max(axis=1) > 2e-6)
+                moved.append(rows + start[piece.name])
+                shifts.append(shift[rows])
+        faps.append(fap)
+        units.append(1e5 if fap == 47 else 1024.0)
+        bounds.append(sum(len(rows) for rows in moved))
+    centers = meters(np.stack([(e.vertices.max(0) + e.vertices.min(0)) / 2 for e in eyes]))
+    arrays: dict[str, Any] = {
+        "format": np.array(FORMAT),
+        "cel": np.array(cel),
+        "vertices": meters(vertices),
+        "uv": np.round(np.concatenate([p.part.uv for p in pieces]) * 65535).astype(np.uint16),
+        "colors": np.round(
+            np.sqrt(np.clip(np.concatenate([p.part.colors for p in pieces]), 0, 1)) * 255
+        ).astype(np.uint8),
+        "head_weight": np.round(np.concatenate([p.head_weight for p in pieces]) * 255).astype(
+            np.uint8
+        ),
+        "triangles": np.concatenate(triangles).astype(np.uint16),
+        "part_names": np.array([p.name for p in pieces]),
+        "part_textures": np.array([p.texture for p in pieces]),
+        "part_roughness": np.array([p.roughness for p in pieces]),
+        "part_transparent": np.array([p.name in TRANSPARENT for p in pieces]),
+        "part_double_sided": np.array([p.texture in ("hair", "lashes") for p in pieces]),
+        "part_vertices": np.array(part_vertices),
+        "part_triangles": np.array(part_triangles),
+        "fapu_names": np.array(list(fapu)),
+        "fapu": np.array(list(fapu.values())),
+        "feature_point_names": np.array(list(points)),
+        "feature_points": np.array(list(points.values())),
+        "eye_centres": centers,
+        "field_faps": np.array(faps, dtype=np.int64),
+        "field_units": np.array(units),
+        "field_bounds": np.array(bounds),
+        "field_vertices": np.concatenate([*moved, np.zeros(0, int)]).astype(np.uint16),
+        "field_shifts": np.concatenate([*shifts, np.zeros((0, 3))]).astype(np.float16),
+    }
+    for name, data in textures.items():
+        arrays[f"texture_{name}"] = np.frombuffer(data, np.uint8)
+    np.savez_compressed(output, allow_pickle=False, **arrays)
+
+
+def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[Piece]:
+    """Make the eyeballs; they can move forward, and their pupils can grow."""
+    pieces = []
+    for row, name in enumerate(("eye_left", "eye_right")):
+        center = eye_centers(vertices, mesh)[row]
+        part = eyeball(center, eye_radius(vertices, mesh))
+        count = len(part.vertices)
+        fields = {
+            27 + row: np.tile([0.0, 0.0, fapu["ES"]], (count, 1)),
+            29 + row: pupil_growth(part, center) * fapu["IRISD"] / 2,
+        }
+        pieces.append(Piece(name, part, "eye", 0.12, np.ones(count), fields))
+    return pieces
+
+
+def teeth_pieces(fapu: dict[str, float]) -> list[Piece]:
+    """Make the upper and the lower teeth; the lower teeth move with the jaw."""
+    pieces = []
+    for name, widths, edge, front, up in (
+        ("teeth_upper", UPPER_TEETH, 5.144, 1.238, 1.0),
+        ("teeth_lower", LOWER_TEETH, 5.146, 1.206, -1.0),
+    ):
+        part = tooth_row(widths, edge, front, up)
+        still = np.ones(len(part.vertices))
+        fields = jaw_fields(part.vertices, still, fapu) if up < 0 else {}
+        pieces.append(Piece(name, part, name, 0.35, still, fields))
+    return pieces
+
+
+def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
+    """Make the tongue: wide, flat behind the lower teeth, grooved along its middle."""
+    x, y, z = tongue.vertices.T
+    top = np.clip((y - 5.15) / 0.05, 0, 1)
+    to_tip = np.clip((z - 0.56) / 0.59, 0, 1)
+    groove = 0.014 * np.exp(-((x / 0.045) ** 2)) * top * np.clip(3 * (1 - to_tip), 0, 1)
+    sunk = 0.110 - 0.052 * to_tip**2 + groove + 0.02 * np.abs(x) / 0.19
+    points = np.stack([1.28 * x, y - sunk, z - 0.03], axis=1)
+    uv = np.clip(points[:, [0, 2]] * [1.8, 1.4] + [0.5, -0.65], 0, 1)
+    part = Part(points, subdivision.triangles_of(tongue.quads), uv, np.ones_like(points))
+    return Piece(
+        "tongue",
+        part,
+        "tongue",
+        0.4,
+        np.ones(len(points)),
+        tongue_fields(tongue, fapu),
+        coarse_vertices=len(tongue.base),
+        coarse_triangles=subdivision.triangles_of(tongue.coarse_quads),
+    )

@@ -15,8 +15,8 @@ from kouxing.services.driver.head.surface import Float, Index, edges_of
 def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, Index]:
     """Subdivide once.
 
-    Returns ------- The matrix (V + E + F, V) from the old to the new vertices (moved old vertices,
-    edge points, face points), and the new quads (4 F, 4).
+    Returns the matrix (V + E + F, V) from the old to the new vertices (moved old vertices, edge
+    points, face points), and the new quads (4 F, 4).
     """
     num_faces = len(quads)
     edges, edge_of_corner = edges_of(quads)
@@ -88,21 +88,10 @@ def vertex_normals(vertices: Float, triangles: Index) -> Float:
 
 
 def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, Index]:
-    """Remove everything above height 0.
+    """Remove everything above ``height`` (V,) 0; ``values`` (V, D) are interpolated at the cut.
 
-    Parameters
-    ----------
-    height
-        Height of every vertex (V,).
-    triangles
-        Vertex numbers (F, 3).
-    values
-        Values to interpolate at the cut (V, D).
-
-    Returns
-    -------
-    Values (W, D) of old and new vertices, triangles (G, 3), and the edges (E, 2) of the cut in the
-    direction of their triangles.
+    Returns values (W, D) of old and new vertices, triangles (G, 3), and the edges (E, 2) of the cut
+    in the direction of their triangles.
     """
     above = height[triangles] > 0
     kept = triangles[~above.any(axis=1)].tolist()

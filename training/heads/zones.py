@@ -26,7 +26,7 @@ from kouxing.services.driver.head import surface
 from kouxing.services.driver.head.import_fields import AXES, CORNER_SLOPE, INNER, OUTER
 from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import subdivision
-from kouxing.training.heads.feature_points import FEATURE_POINTS
+from kouxing.training.heads.makehuman import FEATURE_POINTS
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -131,8 +131,8 @@ class FaceFields:
         self,
         skin: Skin,
         cavity: NDArray[np.bool_],
-        blink: tuple[Float, Float],
-        squint: tuple[Float, Float],
+        blink: list[Float],
+        squint: list[Float],
         fapu: dict[str, float],
     ) -> None:
         self.skin = skin
@@ -212,7 +212,7 @@ class FaceFields:
                     left = left - 0.5 * left[skin.point(name)] * self.lip_y[name]
             self._add(fap, left)
 
-    def _eyes(self, blink: tuple[Float, Float], squint: tuple[Float, Float]) -> None:
+    def _eyes(self, blink: list[Float], squint: list[Float]) -> None:
         for units, pairs in (
             (blink, ((19, "3.1"), (20, "3.2"))),
             (squint, ((21, "3.3"), (22, "3.4"))),

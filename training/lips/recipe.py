@@ -7,6 +7,8 @@
 The recipe trains on every clip that is not held out and whose license allows it. These clips do not
 determine any setting. Each clip is used once as it is, and once augmented. A teacher may label
 further speech without video (:mod:`kouxing.training.lips.teacher`).
+
+Source: Hoerl and Kennard 1970, "Ridge regression: biased estimation for nonorthogonal problems".
 """
 
 from __future__ import annotations
@@ -33,10 +35,9 @@ from kouxing.services.recognizer.lip_predictor import (
     LipPredictor,
 )
 from kouxing.shared.errors import UserError
-from kouxing.training.lips.card import Trained, write_card
+from kouxing.training.lips.card import write_card
 from kouxing.training.lips.positions import Speech, components_of, features_of, speech_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
-from kouxing.training.lips.ridge import HISTORY, fit_ridge, history_of
 from kouxing.training.lips.targets import Touch, targets_at, touches
 from kouxing.training.lips.teacher import (
     draw_recordings,
@@ -47,6 +48,52 @@ from kouxing.training.lips.teacher import (
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
+
+HISTORY = 8  # positions: 160 ms
+RIDGE = 0.5  # weight of zero, fraction of the positions
+_TINY = 1e-9
+
+
+def history_of(components: NDArray[np.floating]) -> Floats:
+    """Return the last components of each position, oldest first, and a 1.
+
+    The shape changes from (positions, components) to (positions, HISTORY * components + 1).
+    """
+    num_positions = len(components)
+    padded = np.pad(components.astype(np.float32, copy=False), ((HISTORY - 1, 0), (0, 0)))
+    shifted = [padded[delay : delay + num_positions] for delay in range(HISTORY)]
+    return np.concatenate([*shifted, np.ones((num_positions, 1), np.float32)], axis=1)
+
+
+def fit_ridge(histories: Sequence[Floats], targets: Sequence[Floats]) -> Array:
+    """Fit targets, (positions, delays, outputs), to histories, (positions, n), of stretches.
+
+    Targets may be NaN. A position counts for an output if its targets are known for all delays.
+    Returns the weights, (n, delays, outputs).
+    """
+    history, target = np.concatenate(list(histories)), np.concatenate(list(targets))
+    known = ~np.isnan(target).any(axis=1)  # (positions, outputs)
+    weights = np.zeros((history.shape[1], *target.shape[1:]))
+    by_rows: dict[bytes, list[int]] = {}  # outputs that are known at the same positions
+    for output in range(known.shape[1]):
+        by_rows.setdefault(known[:, output].tobytes(), []).append(output)
+    for outputs in by_rows.values():
+        rows = known[:, outputs[0]]
+        if rows.any():
+            columns = target[rows][:, :, outputs].reshape(rows.sum(), -1)
+            solved = _solve(history[rows], columns)
+            weights[:, :, outputs] = solved.reshape(len(weights), -1, len(outputs))
+    return weights
+
+
+def _solve(histories: Floats, targets: Floats) -> Array:
+    """Solve one ridge regression; the weight of the constant, the last column, is free."""
+    ridge = np.full(histories.shape[1], RIDGE * len(histories))
+    ridge[-1] = _TINY
+    products = (histories.T @ histories).astype(np.float64)
+    with_targets = (histories.T @ targets).astype(np.float64)
+    return np.linalg.solve(products + np.diag(ridge), with_targets).astype(np.float64)
+
 
 # For faces with delays of 0, 20, 50, 60, 100 or 160 ms: the audio of a position ends 5 ms before
 # a frame of the face is due.
@@ -93,13 +140,9 @@ def train_lips(
 ) -> None:
     """Train the lip model, and write it with its card.
 
-    The arguments are the options of ``kouxing train lips``.
-
-    Raises
-    ------
-    UserError
-        If no clip may be used, there is no teacher for ``speech``, the shipped acoustic model is
-        not neural, or a file cannot be read.
+    The arguments are the options of ``kouxing train lips``. Raises UserError if no clip may be
+    used, there is no teacher for ``speech``, the shipped acoustic model is not neural, or a file
+    cannot be read.
     """
     if speech and whisper is None:
         raise UserError("speech without video needs a teacher; also give --whisper")
@@ -147,7 +190,9 @@ def train_lips(
         )
     lips, losses = fit(examples, labeled, basis, seed)
     lips.save(output)
-    write_card(output, Trained(lips, losses, used, labeled, seed), clips, positions)
+    write_card(
+        output, lips, clips, positions, trained_on=used, labeled=labeled, losses=losses, seed=seed
+    )
 
 
 def _targets(model: NeuralModel, speech: Sequence[Speech], touch: dict[str, Touch]) -> list[Floats]:

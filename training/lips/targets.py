@@ -72,23 +72,11 @@ def targets_at(
     known_s: Array,
     delays_s: Sequence[float],
 ) -> NDArray[np.float32]:
-    """Compute the targets of some positions.
+    """Compute the targets of positions whose audio is known up to ``known_s``, (n,), in the clip.
 
-    Parameters
-    ----------
-    clip, phones
-        The clip and its phones; None if the recognizer does not support its language.
-    touch
-        Limits of its speaker.
-    known_s
-        Time in the clip up to which the audio is known at each position, (n,).
-    delays_s
-        Delays, seconds.
-
-    Returns
-    -------
-    NDArray
-        FAPs in FAP units, closure and lip to teeth (0 or 1), (n, delays, 17); NaN if unknown.
+    ``phones`` are None if the recognizer does not support the clip's language. ``touch`` has the
+    limits of its speaker. Returns FAPs in FAP units, closure and lip to teeth (0 or 1),
+    (n, delays, 17); NaN if unknown.
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
     faps = [interpolate_track(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]

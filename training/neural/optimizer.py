@@ -25,16 +25,8 @@ N = TypeVar("N", bound=nn.Module)
 class Optimizer(Generic[N]):
     """Trains a network in place.
 
-    Parameters
-    ----------
-    network
-        The network.
-    groups
-        Parameter groups with their learning rates, as for ``torch.optim``.
-    weight_decay, max_gradient_norm
-        Settings of each step.
-    mean_exponent
-        e of the running mean.
+    ``groups`` are parameter groups with their learning rates, as for ``torch.optim``.
+    ``mean_exponent`` is the e of the running mean.
     """
 
     def __init__(
@@ -43,7 +35,7 @@ class Optimizer(Generic[N]):
         groups: Sequence[dict[str, Any]],
         *,
         weight_decay: float,
-        max_gradient_norm: float,
+        max_norm: float,
         mean_exponent: int,
     ) -> None:
         self._network = network
@@ -51,7 +43,7 @@ class Optimizer(Generic[N]):
         self._averaged.eval()
         self._adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
         self._rates = [group["lr"] for group in self._adam.param_groups]
-        self._max_gradient_norm = max_gradient_norm
+        self._max_norm = max_norm
 
     @property
     def mean(self) -> N:
@@ -64,7 +56,7 @@ class Optimizer(Generic[N]):
             group["lr"] = rate_factor * rate
         self._adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self._network.parameters(), self._max_gradient_norm)
+        nn.utils.clip_grad_norm_(self._network.parameters(), self._max_norm)
         self._adam.step()
         self._averaged.update_parameters(self._network)
 

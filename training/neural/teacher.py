@@ -46,7 +46,7 @@ from kouxing.training.neural.batches import Recording, Sample, Targets, batches_
 from kouxing.training.neural.network import Encoder, Shape, mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, rise_and_fall
 from kouxing.training.neural.readout import Readout, ReadoutShape
-from kouxing.training.progress import Report, with_progress
+from kouxing.training.training_set import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder
 _NUM_STEPS = 300  # batches of 70 s of sound
@@ -64,12 +64,8 @@ _NUM_STANDARDIZED = 250  # recordings that mean and deviation are computed from
 
 _BATCH_POSITIONS = 3500
 _CROP_POSITIONS = 250
-_RATE = 2e-3
-_WEIGHT_DECAY = 0.02
 _WARM_UP_STEPS = 30
 _FALLING = 0.5  # fraction of the steps, at the end, over which the rate falls to 0
-_MAX_GRADIENT_NORM = 2.0
-_MEAN_EXPONENT = 8  # of the running mean of the weights
 
 T = TypeVar("T")
 
@@ -149,13 +145,8 @@ def train_teacher(
     readout = Readout(features[0].shape[1], encoder.shape.num_states, READOUT)
     drawn = rng.choice(len(sampling), size=_NUM_STANDARDIZED, p=sampling)
     readout.standardize(torch.cat([torch.from_numpy(features[one]).float() for one in drawn]))
-    optimizer = Optimizer(
-        readout,
-        [{"params": list(readout.parameters()), "lr": _RATE}],
-        weight_decay=_WEIGHT_DECAY,
-        max_gradient_norm=_MAX_GRADIENT_NORM,
-        mean_exponent=_MEAN_EXPONENT,
-    )
+    groups = [{"params": list(readout.parameters()), "lr": 2e-3}]
+    optimizer = Optimizer(readout, groups, weight_decay=0.02, max_norm=2.0, mean_exponent=8)
     batches = batches_of(draw, _BATCH_POSITIONS, rng)
     for step in range(_NUM_STEPS):
         inputs, states, probs = next(batches)

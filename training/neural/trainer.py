@@ -26,7 +26,7 @@ H        mean cross-entropy of an output layer, nats a frame           1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from torch import Tensor, nn
@@ -43,11 +43,8 @@ _RATE = 2e-4  # of the pretrained layers
 _NEW_RATE = 1.2e-3  # of the last norm and the output layers
 _NEW = ("norm.", "outputs.")
 _FROZEN = ("first.", "second.")
-_WEIGHT_DECAY = 0.01
 _WARM_UP_STEPS = 60
 _MAX_WARM_UP = 0.2  # fraction of the steps
-_MAX_GRADIENT_NORM = 1.0
-_MEAN_EXPONENT = 2  # of the running mean of the weights
 _OTHER_OUTPUT_WEIGHT = 0.5  # of the loss of the other output layer
 
 
@@ -75,9 +72,9 @@ class Trainer:
         self._optimizer = Optimizer(
             network,
             [{"params": pretrained, "lr": _RATE}, {"params": new, "lr": _NEW_RATE}],
-            weight_decay=_WEIGHT_DECAY,
-            max_gradient_norm=_MAX_GRADIENT_NORM,
-            mean_exponent=_MEAN_EXPONENT,
+            weight_decay=0.01,
+            max_norm=1.0,
+            mean_exponent=2,
         )
 
     @property
@@ -97,16 +94,11 @@ class Trainer:
 
         self._batches = batches_of(draw, _BATCH_FRAMES, self._rng)
 
-    def train(self, num_steps: int, watch: Callable[[int, float], None]) -> None:
-        """Take steps.
-
-        After each step, ``watch`` is called with the number of steps taken and the loss of the main
-        output layer in nats a frame.
-        """
+    def train(self, num_steps: int) -> Iterator[tuple[int, float]]:
+        """Yield the number of steps taken and the loss of the main output layer after each."""
         warm_up_steps = min(_WARM_UP_STEPS, _MAX_WARM_UP * num_steps)
         for step in range(num_steps):
-            rate_factor = min(1.0, (step + 1) / warm_up_steps)
-            watch(step + 1, self._step(step, rate_factor))
+            yield step + 1, self._step(step, min(1.0, (step + 1) / warm_up_steps))
 
     def _step(self, number: int, rate_factor: float) -> float:
         """Train on one batch; return the mean cross-entropy of the main output layer."""

@@ -55,19 +55,11 @@ def estimate_phone_lm(
     order: int = 6,
     max_ngrams: int = 1_000_000,
 ) -> PhoneLanguageModel:
-    """Estimate a phone language model.
+    """Estimate a phone language model of about ``max_ngrams`` n-grams.
 
-    Parameters
-    ----------
-    streams
-        Texts as indices of phones, with a pause between sentences or where a reader would pause.
-        A text counts once for each stream that contains it.
-    inventory
-        The texts' language.
-    order
-        Phones in the longest n-grams, 2 or more. UserError if it is too high for 64-bit codes.
-    max_ngrams
-        Approximate number of n-grams to keep.
+    ``streams`` are texts as indices of phones, with a pause between sentences or where a reader
+    would pause. A text counts once for each stream that contains it. ``order`` is the number of
+    phones in the longest n-grams, 2 or more. UserError if it is too high for 64-bit codes.
     """
     num_phones = len(inventory)
     if num_phones**order > _MAX_CODE:

@@ -19,8 +19,7 @@ from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
-from kouxing.training.progress import Report
-from kouxing.training.training_set import MAX_WORD_PHONES, Example
+from kouxing.training.training_set import MAX_WORD_PHONES, Example, Report
 
 _CORPUS_WEIGHT = 0.012  # corpus phones per phone of other texts
 
@@ -39,9 +38,8 @@ def train_phone_lm(
     """Estimate a phone language model, and write it to a file.
 
     Texts are counted, and with about a hundredth of their weight the natural sentences of the
-    corpora's split ``train``. ``drawn`` are phones from ``open_gram.draw_phones``; ``order`` and
-    ``max_ngrams`` are explained in ``estimation.estimate_phone_lm``. Raises UserError if a file
-    cannot be read, or there is nothing to count.
+    corpora's split ``train``. ``drawn`` are phones from ``open_gram.draw_phones``. Raises UserError
+    if a file cannot be read, or there is nothing to count.
     """
     errors = RowErrors()
     streams = [stream_of(_sentences(text, inventory), inventory) for text in texts]
