@@ -80,12 +80,12 @@ class LipClip:
     """A recording with the motion of its speaker's mouth."""
 
     name: str
-    speaker: str
-    license: str
-    language: str  # "zh", "en", ...
-    part: str  # "train", "choice" or "held"
-    is_in_sync: bool  # otherwise only shapes can be compared, not times
-    transcript: str  # empty if unknown
+    speaker: str = ""
+    license: str = ""
+    language: str = ""  # "zh", "en", ...
+    part: str = "train"  # "train", "choice" or "held"
+    is_in_sync: bool = True  # otherwise only shapes can be compared, not times
+    transcript: str = ""  # empty if unknown
     time_s: Array  # (num_frames,)
     faps: Array  # (num_frames, num_mouth_faps), FAP units, NaN if not measured
     samples: NDArray[np.float32]  # 16 kHz mono

@@ -50,13 +50,12 @@ class Utterance:
 
     utterance_id: str
     path: Path
-    speaker: str
-    source: str
-    license: str
-    split: str
-    seconds: float
-    phones: tuple[int, ...]  # indices into the inventory's phones
-    syllables: tuple[int, ...]  # number of phones in each syllable
+    speaker: str = ""
+    license: str = ""
+    split: str = ""
+    seconds: float = 0.0
+    phones: tuple[int, ...] = ()  # indices into the inventory's phones
+    syllables: tuple[int, ...] = ()  # number of phones in each syllable
 
 
 def syllables_of(utterance: Utterance, inventory: PhoneInventory) -> list[Syllable]:
@@ -171,7 +170,6 @@ def _utterance(
         utterance_id=row["utt_id"],
         path=path,
         speaker=row.get("speaker") or row["utt_id"],
-        source=row.get("source", ""),
         license=row.get("licence", ""),
         split=_split_of(row),
         seconds=seconds,
@@ -238,7 +236,6 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
                     "utt_id": utterance_id,
                     "path": str(path),
                     "speaker": path.parent.name,
-                    "source": "AISHELL-1",
                     "licence": "Apache-2.0",
                     # The split of a missing file is unknown; it is reported once, under train.
                     "split": path.relative_to(folder / "wav").parts[0]

@@ -110,8 +110,6 @@ def clip_of(time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> LipClip:
         license="CC0",
         language="zh",
         part="held",
-        is_in_sync=True,
-        transcript="",
         time_s=time_s,
         faps=faps,
         samples=np.zeros(0, dtype=np.float32),

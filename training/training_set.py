@@ -146,7 +146,11 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
     """
     pieces = []
     for folder in folders:
-        files = [_file_without_text(path) for path in audio_files(folder) if not is_held_out(path)]
+        files = [
+            Utterance(utterance_id=str(path), path=path)
+            for path in audio_files(folder)
+            if not is_held_out(path)
+        ]
         sounds = samples_of(files)
         for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
             if log_mel is None:
@@ -161,20 +165,6 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
     if not pieces:
         raise errors.nothing_left(f"in {', '.join(map(str, folders))}")
     return pieces
-
-
-def _file_without_text(path: Path) -> Utterance:
-    return Utterance(
-        utterance_id=str(path),
-        path=path,
-        speaker="",
-        source="",
-        license="",
-        split="",
-        seconds=0.0,
-        phones=(),
-        syllables=(),
-    )
 
 
 def speech_span(log_mel: NDArray[np.float16]) -> slice:

@@ -85,10 +85,8 @@ def _clip(model: AcousticModel, path: Path, name: str, speaker: str, text: str =
     return LipClip(
         name=name,
         speaker=speaker,
-        license="",
         language=model.inventory.code,
         part="held",
-        is_in_sync=True,
         transcript=text,
         time_s=np.zeros(0),
         faps=np.zeros((0, len(MOUTH_FAPS))),

@@ -18,7 +18,7 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.ferguson.lengths import AlignedSpeech, influence_levels, usual_times
 from kouxing.training.ferguson.openings import fit_openings, relative_openings, travel_of
 from kouxing.training.ferguson.recipe import train_ferguson
-from tests.lips import clip_of, utterance
+from tests.lips import clip_of, phone, utterance
 
 pytestmark = pytest.mark.unit
 
@@ -36,9 +36,9 @@ def test_recovers_openings() -> None:
     scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5
     np.testing.assert_allclose(relative, np.minimum(scale * opening, 5.0), atol=0.01)
     found = fit_openings([clip], [phones], INVENTORY)
-    for phone in ("a", "i", "u", "d", "b", "sh"):
-        expected = min(scale * true.opening[phone], 5.0)
-        assert found[phone] == pytest.approx(expected, abs=0.3)
+    for symbol in ("a", "i", "u", "d", "b", "sh"):
+        expected = min(scale * true.opening[symbol], 5.0)
+        assert found[symbol] == pytest.approx(expected, abs=0.3)
     assert found["sil"] == found["b"] == 0.0
     # a phone without data follows its visemes
     assert found["ang"] == pytest.approx(found["a"], abs=0.3)
@@ -50,16 +50,7 @@ def test_recovers_openings() -> None:
 def aligned(lengths_s: list[tuple[str, float]]) -> list[Phone]:
     phones, onset_s = [], 0.0
     for index, (symbol, length_s) in enumerate(lengths_s):
-        phones.append(
-            Phone(
-                index=index,
-                symbol=symbol,
-                onset_s=onset_s,
-                duration_s=length_s,
-                confidence=1.0,
-                final=True,
-            )
-        )
+        phones.append(phone(index, symbol, onset_s, length_s))
         onset_s += length_s
     return phones
 

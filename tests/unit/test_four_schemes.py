@@ -160,8 +160,6 @@ def utterance(name: str, speaker: str, seconds: float) -> Utterance:
         utterance_id=name,
         path=Path(name),
         speaker=speaker,
-        source="",
-        license="",
         split="test",
         seconds=seconds,
         phones=(0,),

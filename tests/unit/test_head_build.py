@@ -47,16 +47,6 @@ def test_zone_is_a_raised_cosine() -> None:
     np.testing.assert_allclose(zone[9:18], 0.5 + 0.5 * np.cos(np.pi * row / 8), atol=1e-12)
 
 
-def test_zones_follow_the_surface() -> None:
-    """Two strips that are near in space but not joined: the distance runs along the surface."""
-    vertices, quads = sheet(2, 5)
-    both = np.concatenate([vertices, vertices + np.array([0, 0, 0.01])])
-    geodesics = surface.Geodesics(both, np.concatenate([quads, quads + len(vertices)]))
-    zone = geodesics.zone(np.array([0]), np.array([4]))
-    assert zone[:5].max() == 1
-    assert zone[len(vertices) :].max() == 0
-
-
 def test_the_smoothest_field_is_1_at_its_points() -> None:
     vertices, quads = sheet(9, 9)
     skin = zones.subdivided(vertices, quads)
@@ -70,14 +60,18 @@ def test_the_smoothest_field_is_1_at_its_points() -> None:
     assert np.abs(fields).max() < 1.5
 
 
+def ball() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the center of a skull and points of its skin."""
+    away = np.random.default_rng(1).standard_normal((1500, 3))
+    middle = np.array([0.0, 5.93, 0.42])
+    return middle, middle + 0.8 * away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
 @pytest.mark.parametrize("name", ["man", "elder", "child", "leo", "mika"])
 def test_short_hair_lies_over_the_scalp(name: str) -> None:
     style = people.PEOPLE[name].hair
-    rng = np.random.default_rng(1)
-    away = rng.standard_normal((1500, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    middle = np.array([0.0, 5.93, 0.42])
-    made = style.parts(middle + 0.8 * away)
+    middle, scalp = ball()
+    made = style.parts(scalp)
     assert list(made) == ["hair", "hair_tips"]
     for part in made.values():
         reach = np.linalg.norm(part.vertices - middle, axis=1)
@@ -105,11 +99,8 @@ def test_locks_thin_out_but_not_the_body() -> None:
 @pytest.mark.parametrize("name", people.PEOPLE)
 def test_hair_faces_outward(name: str) -> None:
     """Occlusion is judged, and light is worked out, along the normals."""
-    rng = np.random.default_rng(1)
-    away = rng.standard_normal((1500, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    middle = np.array([0.0, 5.93, 0.42])
-    for part in people.PEOPLE[name].hair.parts(middle + 0.8 * away).values():
+    middle, scalp = ball()
+    for part in people.PEOPLE[name].hair.parts(scalp).values():
         a, b, c = (part.vertices[part.triangles[:, corner]] for corner in range(3))
         centre = (a + b + c) / 3
         axis = np.where(centre[:, 1:2] > middle[1], middle, centre * [0, 1, 0] + [0, 0, 0.2])

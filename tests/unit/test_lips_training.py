@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from kouxing.services.recognizer.lip_predictor import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
-from kouxing.training.lips import recipe, recurrent
+from kouxing.training.lips import recipe
 from kouxing.training.lips.card import Prediction, correlations, count_closures, predict
 from kouxing.training.lips.positions import Speech
 from kouxing.training.lips.recipe import (
@@ -37,7 +36,7 @@ from kouxing.training.lips.recipe import (
     joined,
     train_lips,
 )
-from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.lips.recurrent import LipNetwork
 from kouxing.training.lips.targets import Touch, targets_at, touches
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import WholeEncoder
@@ -131,37 +130,7 @@ def test_learns_lips_in_each_speakers_units() -> None:
         assert not made[:, LIP_FAPS.index(16)].any()  # nobody tracked it
 
 
-@pytest.mark.usefixtures("one_thread")
-def test_epochs_use_all_examples_and_changing_labeled_ones(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    heard: list[float] = []
-    batch_of = recurrent._batch
-
-    def counted(pieces: Sequence[Example]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        heard.extend(float(piece.components[0, 0]) for piece in pieces)
-        return batch_of(pieces)
-
-    monkeypatch.setattr(recurrent, "_batch", counted)
-    targets = np.zeros((20, 1, NUM_OUTPUTS), np.float32)
-    examples = [Example(np.full((20, 3), k, np.float32), targets, 0) for k in range(32)]
-    train_network(examples[:2], examples[2:], num_epochs=5, seed=0)
-    assert sorted(heard) == sorted([*([0.0, 1.0] * 5), *range(2, 32)])
-
-
-def test_predicts_a_closure_from_a_probability_of_a_third() -> None:
-    torch.manual_seed(0)
-    network = LipNetwork(3, len(DELAYS_S), 1)
-    linear = np.zeros((3 * HISTORY + 1, len(DELAYS_S), len(LIP_FAPS)))
-    units = Units(np.zeros(len(LIP_FAPS), np.float32), np.ones(len(LIP_FAPS), np.float32))
-    model = joined(np.zeros(9, np.float32), np.ones((9, 3), np.float32), network, linear, units)
-    bias = network.output.bias.detach().numpy().reshape(-1, NUM_OUTPUTS)
-    even = 1 / (1 + np.exp(model.output_bias[:, CLOSURE] - bias[:, CLOSURE]))
-    np.testing.assert_allclose(even, 1 / 3, rtol=1e-5)
-    np.testing.assert_allclose(model.output_bias[:, CLOSURE + 1], bias[:, CLOSURE + 1])
-
-
-def test_widens_the_width_around_its_mean() -> None:
+def test_widens_the_width_and_predicts_closures_from_a_third() -> None:
     torch.manual_seed(0)
     network = LipNetwork(3, len(DELAYS_S), 1)
     linear = np.zeros((3 * HISTORY + 1, len(DELAYS_S), len(LIP_FAPS)))
@@ -173,6 +142,9 @@ def test_widens_the_width_around_its_mean() -> None:
         column = LIP_FAPS.index(fap)
         made = model.output_bias[:, column] - mean[column]
         np.testing.assert_allclose(made, gain * bias[:, column], rtol=1e-4, atol=1e-5)
+    even = 1 / (1 + np.exp(model.output_bias[:, CLOSURE] - bias[:, CLOSURE]))
+    np.testing.assert_allclose(even, 1 / 3, rtol=1e-5)
+    np.testing.assert_allclose(model.output_bias[:, CLOSURE + 1], bias[:, CLOSURE + 1])
 
 
 def exact_prediction(clip: LipClip, delay_s: float, log_odds: np.ndarray) -> Prediction:

@@ -141,13 +141,3 @@ def test_the_teacher_learns_tones(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.mean(targets.states[:, 0] == unseen.targets.states[:, 0]) > 0.97
     assert "12 of 12 recordings encoded for the teacher" in lines
     assert lines[-1].startswith("teacher, step 100: ")
-
-
-def test_the_same_seed_gives_the_same_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples = tones(100).samples
-    first, second = (taught(3, monkeypatch)[0].targets_of(samples) for _ in range(2))
-    np.testing.assert_array_equal(first.states, second.states)
-    np.testing.assert_array_equal(first.probs, second.probs)
-
-
-# --- many recordings

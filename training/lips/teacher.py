@@ -100,12 +100,6 @@ def _read_recording(path: Path) -> LipClip:
         raise _unreadable(error) from error
     return LipClip(
         name=path.name,
-        speaker="",
-        license="",
-        language="",
-        part="train",
-        is_in_sync=True,
-        transcript="",
         time_s=np.empty(0),
         faps=np.empty((0, len(MOUTH_FAPS))),
         samples=samples,

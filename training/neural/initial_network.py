@@ -54,7 +54,6 @@ _BRAIN_FLOAT = 5
 _KINDS: dict[int, type[np.generic]] = {
     0: np.float32, 1: np.int8, 2: np.int16, 3: np.int32, 4: np.float16, _BRAIN_FLOAT: np.uint16,
 }  # fmt: skip
-_OF_NETWORK = {"first": "conv1", "second": "conv2"}
 _OF_LAYER = {
     "attention_norm": "self_attention/layer_norm",
     "query_key_value": "self_attention/linear_0",
@@ -83,7 +82,7 @@ def load_whisper(network: Encoder, folder: Path) -> None:
             f"cannot read {path}: {error.strerror or error}; give the folder of a Whisper model "
             "for faster-whisper"
         ) from error
-    except ValueError as error:
+    except (ValueError, struct.error) as error:
         raise UserError(
             f"{path} is not a Whisper model in CTranslate2's format: {error}; give the folder of a "
             "model for faster-whisper"
@@ -100,7 +99,7 @@ def load_whisper(network: Encoder, folder: Path) -> None:
 
 
 def _names(num_layers: int) -> dict[str, str]:
-    parts = {ours: f"encoder/{theirs}" for ours, theirs in _OF_NETWORK.items()} | {
+    parts = {"first": "encoder/conv1", "second": "encoder/conv2"} | {
         f"layers.{layer}.{ours}": f"encoder/layer_{layer}/{theirs}"
         for layer in range(num_layers)
         for ours, theirs in _OF_LAYER.items()
@@ -130,70 +129,52 @@ def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.flo
 
 
 def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Map the encoder's arrays into memory; ValueError if the file is invalid."""
+    """Read the encoder's arrays; ValueError if the file is invalid."""
     with path.open("rb") as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)  # ValueError if it is empty
-    reader = _Reader(content)
-    version = reader.number("<I")
+    version = _number(content, "<I")
     if version < _MIN_VERSION:
         raise ValueError(f"its version {version} is too old")
-    name = reader.string()
+    name = _string(content)
     if name != "WhisperSpec":
         raise ValueError(f"it contains a {name[:40]!r}")
-    reader.number("<I")  # revision
+    _number(content, "<I")  # revision
     arrays = {}
-    for _ in range(reader.number("<I")):
-        name, array = reader.array()
+    for _ in range(_number(content, "<I")):
+        name, array = _array(content)
         if name.startswith("encoder/"):
             arrays[name] = array
     return arrays
 
 
-class _Reader:
-    """Reads the file's fields in order; ValueError if the file ends within one."""
+def _number(content: mmap.mmap, form: str) -> int:
+    """Read the next number; struct.error at the end of the file."""
+    (value,) = struct.unpack(form, content.read(struct.calcsize(form)))
+    return int(value)
 
-    def __init__(self, content: mmap.mmap) -> None:
-        self._content = content
-        self._at = 0
 
-    def _skip(self, size: int) -> int:
-        """Return the start of the next ``size`` bytes and move past them."""
-        begin = self._at
-        if size > len(self._content) - begin:
-            raise ValueError(f"it ends after {len(self._content)} bytes, within a field")
-        self._at = begin + size
-        return begin
+def _string(content: mmap.mmap) -> str:
+    return content.read(_number(content, "<H")).rstrip(b"\0").decode()
 
-    def number(self, form: str) -> int:
-        """Read a whole number."""
-        (value,) = struct.unpack_from(form, self._content, self._skip(struct.calcsize(form)))
-        return int(value)
 
-    def string(self) -> str:
-        """Read a string."""
-        size = self.number("<H")
-        begin = self._skip(size)
-        return self._content[begin : begin + size].rstrip(b"\0").decode()
-
-    def array(self) -> tuple[str, NDArray[np.generic]]:
-        """Read the next array and its name."""
-        name = self.string()
-        rank = self.number("<B")
-        if rank > _MAX_RANK:
-            raise ValueError(f"{name[:80]!r} has {rank} dimensions")
-        shape = tuple(self.number("<I") for _ in range(rank))
-        kind = self.number("<B")
-        if kind not in _KINDS:
-            raise ValueError(f"{name[:80]!r} is of the kind {kind}")
-        element = np.dtype(_KINDS[kind]).newbyteorder("<")
-        num_bytes = self.number("<I")
-        if num_bytes != math.prod(shape) * element.itemsize:
-            raise ValueError(f"{name[:80]!r} has {num_bytes} bytes for the sizes {shape}")
-        begin = self._skip(num_bytes)
-        array = np.frombuffer(self._content, element, math.prod(shape), begin).reshape(shape)
-        if kind == _BRAIN_FLOAT:  # the upper half of a 32-bit float
-            array = (array.astype(np.uint32) << 16).view(np.float32)
-        return name, array
+def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
+    """Read the next array and its name."""
+    name = _string(content)
+    rank = _number(content, "<B")
+    if rank > _MAX_RANK:
+        raise ValueError(f"{name[:80]!r} has {rank} dimensions")
+    shape = tuple(_number(content, "<I") for _ in range(rank))
+    kind = _number(content, "<B")
+    if kind not in _KINDS:
+        raise ValueError(f"{name[:80]!r} is of the kind {kind}")
+    element = np.dtype(_KINDS[kind]).newbyteorder("<")
+    num_bytes = _number(content, "<I")
+    if num_bytes != math.prod(shape) * element.itemsize:
+        raise ValueError(f"{name[:80]!r} has {num_bytes} bytes for the sizes {shape}")
+    array = np.frombuffer(content.read(num_bytes), element, math.prod(shape)).reshape(shape)
+    if kind == _BRAIN_FLOAT:  # the upper half of a 32-bit float
+        array = (array.astype(np.uint32) << 16).view(np.float32)
+    return name, array
 
 
 LOOK_AHEADS_MS = (10, 30, 60, 100, 200)  # of the output layers besides the main one
