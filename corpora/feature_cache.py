@@ -53,9 +53,13 @@ def log_mel_of(
     """
     out: list[NDArray[np.float16] | None] = []
     empty = np.empty((0, 1 + NUM_BANDS), dtype=np.float16)
-    for utterance, block in zip(
-        utterances, _cached(utterances, "log_mel", empty, _log_mel), strict=True
-    ):
+    blocks = _cached(
+        utterances,
+        "log_mel",
+        empty,
+        lambda samples: LogMel().accept_waveform(samples).astype(np.float16),
+    )
+    for utterance, block in zip(utterances, blocks, strict=True):
         if len(block) == 0:
             errors.add(utterance.utterance_id, f"no audio in {utterance.path}")
         out.append(block if len(block) else None)
@@ -70,10 +74,6 @@ def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
 def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
     """Convert cached samples to floats in [-1, 1]."""
     return samples.astype(np.float32) / np.float32(_FULL_SCALE)
-
-
-def _log_mel(samples: NDArray[np.float32]) -> NDArray[np.float16]:
-    return LogMel().accept_waveform(samples).astype(np.float16)
 
 
 def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:

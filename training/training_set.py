@@ -83,8 +83,12 @@ def load_examples(
     sounds: list[NDArray[np.int16] | None] = []
     for corpus in corpora:
         rows = read_corpus(corpus, errors, inventory, split=split)
-        if shipping:
-            rows = _shippable(rows, errors)
+        for row in rows:
+            if shipping and not may_ship(row.license):
+                license_name = row.license or "none"
+                problem = f"its license ({license_name}) does not allow distributing a model"
+                errors.add(row.utterance_id, problem)
+        rows = [row for row in rows if not shipping or may_ship(row.license)]
         utterances += rows
         log_mels += log_mel_of(rows, errors)
         sounds += samples_of(rows) if with_samples else [None] * len(rows)
@@ -114,16 +118,6 @@ def load_examples(
     if not examples:
         raise errors.nothing_left(f"of split {split!r} in {', '.join(map(str, corpora))}")
     return examples
-
-
-def _shippable(rows: Sequence[Utterance], errors: RowErrors) -> list[Utterance]:
-    for row in rows:
-        if not may_ship(row.license):
-            errors.add(
-                row.utterance_id,
-                f"its license ({row.license or 'none'}) does not allow distributing a model",
-            )
-    return [row for row in rows if may_ship(row.license)]
 
 
 def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[float]:

@@ -15,7 +15,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.ferguson.lengths import AlignedSpeech, influence_levels, usual_times
+from kouxing.training.ferguson.lengths import AlignedSpeech, influence_levels, phone_table
 from kouxing.training.ferguson.openings import fit_openings, relative_openings, travel_of
 from kouxing.training.ferguson.recipe import train_ferguson
 from tests.lips import clip_of, phone, utterance
@@ -64,7 +64,7 @@ def test_computes_durations_crossings_and_influence() -> None:
         for number in range(1, 601)
     ]
     speech = AlignedSpeech(slices, [("s", "a"), ("m", "i")] * 30, phones)
-    usual = usual_times([speech], INVENTORY)
+    usual = phone_table({}, [speech], INVENTORY)
     assert usual.duration_s["s"] == pytest.approx(0.1, abs=0.01)
     assert usual.duration_s["m"] == pytest.approx(0.04, abs=0.01)
     assert usual.crossings["s"] > usual.crossings["m"]

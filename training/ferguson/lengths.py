@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, islice, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
 from kouxing.services.synthesizer.lips.ferguson.timing import Hiss
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
@@ -34,26 +35,18 @@ class AlignedSpeech:
     phones: Sequence[Phone]  # without silence
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UsualTimes:
-    """Usual values of each phone."""
-
-    duration_s: dict[str, float]
-    crossings: dict[str, float]
-    level: dict[str, int]
-    influence: dict[str, float]
-
-
-def usual_times(speech: Iterable[AlignedSpeech], inventory: PhoneInventory) -> UsualTimes:
-    """Compute durations, zero crossings and influence."""
+def phone_table(
+    opening: dict[str, float], speech: Iterable[AlignedSpeech], inventory: PhoneInventory
+) -> PhoneTable:
+    """Add durations, zero crossings and influence to the openings of the phones."""
     durations: dict[str, list[float]] = defaultdict(list)
     crossings: dict[str, list[float]] = defaultdict(list)
     shares: dict[str, list[float]] = defaultdict(list)
     for recording in speech:
         hiss = Hiss(recording.slices)
-        firsts = _first_phones(recording.syllables)
-        for first, syllable in zip(firsts, recording.syllables, strict=True):
-            phones = recording.phones[first : first + len(syllable)]
+        remaining = iter(recording.phones)
+        for syllable in recording.syllables:
+            phones = list(islice(remaining, len(syllable)))
             for phone in phones:
                 durations[phone.symbol].append(phone.duration_s)
             crossings[syllable[0]].append(float(hiss.at(np.array([phones[0].onset_s]))[0]))
@@ -64,7 +57,8 @@ def usual_times(speech: Iterable[AlignedSpeech], inventory: PhoneInventory) -> U
     share = _means(shares, sorted(inventory.vowels), lambda _: "vowel")
     counts = {phone: len(shares[phone]) + _RIDGE for phone in share}
     level, influence = influence_levels(share, counts)
-    return UsualTimes(
+    return PhoneTable(
+        opening=opening,
         duration_s=_means(durations, inventory.phones, kind.__getitem__),
         crossings=_means(crossings, inventory.phones, kind.__getitem__),
         level=level,
@@ -99,10 +93,6 @@ def influence_levels(
     level = {final: row for row, group in enumerate(best, start=1) for final in finals[group]}
     factors = [factor(group) for group in best]
     return level, {final: factors[level[final] - 1] for final in finals}
-
-
-def _first_phones(syllables: Sequence[Syllable]) -> list[int]:
-    return [0, *np.cumsum([len(syllable) for syllable in syllables]).tolist()][:-1]
 
 
 def _means(

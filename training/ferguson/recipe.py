@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.lip_clips import label_clip, read_clips
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
@@ -21,7 +18,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.ferguson.lengths import AlignedSpeech, usual_times
+from kouxing.training.ferguson.lengths import AlignedSpeech, phone_table
 from kouxing.training.ferguson.openings import fit_openings, travel_of
 from kouxing.training.training_set import Report
 
@@ -46,17 +43,15 @@ def train_ferguson(
     openings = fit_openings(used, [label_clip(model, clip) for clip in used], inventory)
     errors = RowErrors()
     rows = training_rows(corpora, inventory, errors, any_license=any_license)
-    times = usual_times(aligned_speech(model, rows, errors), inventory)
+    table = phone_table(openings, aligned_speech(model, rows, errors), inventory)
     errors.print_to(report)
-    _report_travels(travel_of(used), report)
+    of_fap = dict(zip(MOUTH_FAPS, travel_of(used), strict=True))
+    for name, point in lip_points().items():
+        if point.fap is not None:
+            travel = of_fap[point.fap]
+            result = f"travel {travel:.1f} FAP units" if travel else "not measured; keep its value"
+            report(f"lip_points.tsv: point {name}, FAP {point.fap}: {result}")
     licenses = sorted({clip.license for clip in used} | {row.license for row in rows})
-    table = PhoneTable(
-        opening=openings,
-        duration_s=times.duration_s,
-        crossings=times.crossings,
-        level=times.level,
-        influence=times.influence,
-    )
     about = [
         "Made by `kouxing train ferguson`; least squares, no seed.",
         f"Openings from the clips {', '.join(clip.name for clip in used)}; "
@@ -67,16 +62,6 @@ def train_ferguson(
         output.write_text(format_table(table, inventory, about), encoding="utf-8")
     except OSError as error:
         raise UserError(f"cannot write {output}: {error.strerror}") from None
-
-
-def _report_travels(travels: NDArray[np.float64], report: Report) -> None:
-    """Report the travels for ``lip_points.tsv``."""
-    of_fap = dict(zip(MOUTH_FAPS, travels, strict=True))
-    for name, point in lip_points().items():
-        if point.fap is not None:
-            travel = of_fap[point.fap]
-            result = f"travel {travel:.1f} FAP units" if travel else "not measured; keep its value"
-            report(f"lip_points.tsv: point {name}, FAP {point.fap}: {result}")
 
 
 def training_rows(

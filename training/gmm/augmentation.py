@@ -35,12 +35,6 @@ _NARROW_HZ = (300.0, 3400.0)
 _NARROW_LOSS = 8.0  # outside a telephone's band, natural log of power
 
 
-def _over_bands(values: tuple[float, ...]) -> NDArray[np.float32]:
-    """Interpolate values at equal mel distances to all bands, shape (40,)."""
-    at = np.linspace(0, NUM_BANDS - 1, len(values))
-    return np.interp(np.arange(NUM_BANDS), at, values).astype(np.float32)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
     """One augmentation of a recording; equal values give equal results."""
@@ -82,7 +76,8 @@ class Augmentation:
         fraction = (at - low)[:, None].astype(np.float32)
         frames = (1 - fraction) * log_mel[low] + fraction * log_mel[low + 1]
         bands, energy = self._warped(frames[:, 1:]), frames[:, 0]
-        bands = bands + _over_bands(self.color)
+        at_color = np.linspace(0, NUM_BANDS - 1, len(self.color))
+        bands = bands + np.interp(np.arange(NUM_BANDS), at_color, self.color).astype(np.float32)
         power = np.exp(np.concatenate([energy[:, None], bands], axis=1))
         if self.decay:  # the room adds a tail
             tail = lfilter([0.0, 1 - self.decay], [1.0, -self.decay], power, axis=0)

@@ -89,7 +89,9 @@ class Bob:
             _way(azimuth, np.full(strands, -6.0)),
         ]
         on_skull = np.linspace(0.0, 1.0, 2 * steps // 3 + 1)
-        skull = _bezier(np.stack(ways), on_skull)
+        s = on_skull[None, :, None]  # quadratic curves through the three ways
+        first, middle, last = (way[:, None] for way in ways)
+        skull = (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
         skull /= np.linalg.norm(skull, axis=2, keepdims=True)
         # hair rises next to the parting
         swell = 1.0 + 0.035 * np.sin(np.pi * (0.15 + 0.85 * on_skull**0.7))[None, :, None]
@@ -129,13 +131,6 @@ def _way(azimuth: Float, elevation: Float) -> Float:
     """Return directions (A, 3) by azimuth from the front toward x, and elevation, degrees."""
     turn, up = np.radians(azimuth), np.radians(elevation)
     return np.stack([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)], axis=1)
-
-
-def _bezier(points: Float, t: Float) -> Float:
-    """Evaluate quadratic curves with control points (3, A, 3) at (T,) as (A, T, 3)."""
-    first, middle, last = points[:, :, None, :]
-    s = t[None, :, None]
-    return (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,7 +127,9 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: 
     image = _paint_lips(image, face, lips, look)
     image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2], look.lash_line)
     image = _paint_brow(image, face, brow, look)
-    return np.clip(_paint_roots(image, face, look, hair), 0, 1)
+    ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
+    roots = hair.roots(face.x, face.y, face.z) + ragged
+    return np.clip(mix(image, look.hair, np.clip(roots + 0.3, 0, 1) ** 1.6), 0, 1)
 
 
 def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
@@ -265,10 +267,3 @@ def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
     amount = np.zeros(face.x.shape)
     amount[near] = np.clip(0.34 * ground + 0.85 * hairs * np.clip(ends * 1.6, 0, 1), 0, 0.95)
     return mix(image, look.brow, look.brow_strength * amount)
-
-
-def _paint_roots(image: Float, face: FaceMap, look: Look, hair: Hair) -> Float:
-    shape = face.x.shape
-    ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
-    inside = hair.roots(face.x, face.y, face.z) + ragged
-    return mix(image, look.hair, np.clip(inside + 0.3, 0, 1) ** 1.6)

@@ -66,7 +66,9 @@ def estimate_phone_lm(
         raise UserError(f"order {order} is too high for {num_phones} phones; give a lower one")
     silence = inventory.index[inventory.silence]
     grams, counts = _count(np.concatenate(streams), order, silence, num_phones)
-    probs: _Probs = {1: _smooth(grams[1], counts[1], num_phones)}
+    alone = np.full(num_phones, _UNSEEN_COUNT)
+    alone[grams[1]] += counts[1]
+    probs: _Probs = {1: alone / alone.sum()}
     grams[1] = np.arange(num_phones)
     gains: dict[int, NDArray[np.float64]] = {}
     for n in range(2, order + 1):
@@ -98,15 +100,6 @@ def _count(
             code = code + phones[last - (n - 1)] * num_phones ** (n - 1)
         grams[n], counts[n] = np.unique(code, return_counts=True)
     return grams, counts
-
-
-def _smooth(
-    phones: NDArray[np.int64], counts: NDArray[np.int64], num_phones: int
-) -> NDArray[np.float64]:
-    """Estimate probabilities of single phones, all above 0."""
-    smooth = np.full(num_phones, _UNSEEN_COUNT)
-    smooth[phones] += counts
-    return smooth / smooth.sum()
 
 
 def _prune(

@@ -83,7 +83,10 @@ def draw_phones(
 
 def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory) -> Stream:
     silence = inventory.index[inventory.silence]
-    phones = [_phones_of(word, inventory) or (silence,) for word in words]
+    phones = [
+        (inventory.readable.fullmatch(word) and phones_of_text(word, inventory)) or (silence,)
+        for word in words
+    ]
     lengths = np.array([len(one) for one in phones])
     starts = np.cumsum(lengths) - lengths
     ends = np.cumsum(lengths[drawn])
@@ -92,10 +95,6 @@ def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInve
     stream = all_phones[np.arange(ends[-1]) - shift]
     repeated = (stream[1:] == silence) & (stream[:-1] == silence)
     return stream[np.concatenate([[True], ~repeated])]
-
-
-def _phones_of(word: str, inventory: PhoneInventory) -> tuple[int, ...]:
-    return phones_of_text(word, inventory) if inventory.readable.fullmatch(word) else ()
 
 
 def _next_words(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.progress import track
 
-from kouxing.corpora.speech_corpus import RowErrors, Utterance, is_synthetic, read_corpus
+from kouxing.corpora.speech_corpus import RowErrors, is_synthetic, read_corpus
 from kouxing.services.recognizer.acoustic.model_file import (
     phone_lm_arrays,
     phone_lm_from,
@@ -45,26 +45,27 @@ def train_phone_lm(
     streams = [stream_of(_sentences(text, inventory), inventory) for text in texts]
     if drawn is not None:
         streams.append(drawn)
-    rows = [row for c in corpora for row in read_corpus(c, errors, inventory, split="train")]
-    corpus = stream_of(sorted({row.phones for row in rows if _is_sentence(row)}), inventory)
+    sentences = {
+        row.phones
+        for corpus in corpora
+        for row in read_corpus(corpus, errors, inventory, split="train")
+        if len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.license)
+    }
+    corpus_stream = stream_of(sorted(sentences), inventory)
     num_text = sum(map(len, streams))
-    if len(corpus):
-        streams += [corpus] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus)))
-    if not num_text + len(corpus):
+    if len(corpus_stream):
+        streams += [corpus_stream] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus_stream)))
+    if not num_text + len(corpus_stream):
         raise UserError(
             "there is no text to count; give --text, --ngrams or a corpus with sentences"
         )
-    report(f"{num_text} phones of text, {len(corpus)} of sentences of the corpora")
+    report(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
     phone_lm = estimate_phone_lm(streams, inventory, order=order, max_ngrams=max_ngrams)
     write_archive(output, phone_lm_arrays(phone_lm))
     levels = phone_lm.levels
     sizes = ", ".join(f"{end - first}" for first, end in pairwise(levels[1:]))
     errors.print_to(report)
     report(f"n-grams of 1 to {len(levels) - 2} phones kept: {sizes}")
-
-
-def _is_sentence(row: Utterance) -> bool:
-    return len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.license)
 
 
 def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> PhoneLanguageModel:

@@ -96,16 +96,6 @@ def closure_reach(
     return min(_CLOSURE_REACHES_S, key=loss)
 
 
-def _lead(parameters: VisemeParameters) -> VisemeParameters:
-    """Move every apex, and the start and end of speech, forward a little."""
-    return replace(
-        parameters,
-        offset_s=parameters.offset_s - _LEAD_S,
-        offset_left_s=parameters.offset_left_s - _LEAD_S,
-        offset_right_s=parameters.offset_right_s - _LEAD_S,
-    )
-
-
 def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> None:
     """Train viseme parameters on the training clips of a folder.
 
@@ -123,7 +113,13 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
     parameters = estimate(frames_of(used, labels, inventory))
     parameters = replace(parameters, level_db=usual_levels(used, labels, inventory))
     reach_s = closure_reach(parameters, used, labels, inventory)
-    parameters = _lead(replace(parameters, closure_reach_s=reach_s))
+    parameters = replace(
+        parameters,
+        closure_reach_s=reach_s,
+        offset_s=parameters.offset_s - _LEAD_S,
+        offset_left_s=parameters.offset_left_s - _LEAD_S,
+        offset_right_s=parameters.offset_right_s - _LEAD_S,
+    )
     licenses = "; ".join(sorted({clip.license for clip in used}))
     try:
         save_parameters(
