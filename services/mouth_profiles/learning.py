@@ -24,8 +24,8 @@ shifted to where the tracked lips follow the prediction best.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,22 +80,16 @@ class Observations:
         return len(self.known_s)
 
     def __getitem__(self, rows: slice | NDArray[np.bool_]) -> Self:
-        return type(self)(
-            known_s=self.known_s[rows],
-            predicted=self.predicted[rows],
-            hidden=self.hidden[rows],
-            tracked=self.tracked[rows],
-        )
+        return type(self)(**{name: values[rows] for name, values in self._arrays().items()})
+
+    def _arrays(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def join(cls, parts: Sequence[Observations]) -> Self:
         """Concatenate observations."""
-        return cls(
-            known_s=np.concatenate([part.known_s for part in parts]),
-            predicted=np.concatenate([part.predicted for part in parts]),
-            hidden=np.concatenate([part.hidden for part in parts]),
-            tracked=np.concatenate([part.tracked for part in parts]),
-        )
+        arrays = [part._arrays() for part in parts]
+        return cls(**{name: np.concatenate([one[name] for one in arrays]) for name in arrays[0]})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

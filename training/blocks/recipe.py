@@ -14,8 +14,8 @@ clean and whole. A target is the average of both, or only the teacher's label if
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,20 +48,10 @@ from kouxing.training.training_set import (
 _FULL_FOLDER_MINUTES = 35  # longer folders get the weight of this much speech
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Draw:
-    """How much of each kind of speech is drawn, and its share in training."""
-
-    kinds: Mapping[str, tuple[float, int]]  # share, and maximum number of recordings
-    untranscribed_share: float
-    max_untranscribed: int  # pieces of each folder
-
-
 def label(
     examples: Sequence[Example],
     untranscribed: Sequence[Path],
     *,
-    draw: Draw,
     aligner: NeuralModel,
     encoder: WholeEncoder,
     errors: RowErrors,
@@ -75,23 +65,23 @@ def label(
     """
     rng = np.random.default_rng(seed)
     drawn: list[Example] = []
-    for kind, (_, limit) in draw.kinds.items():
+    for kind, (_, limit) in _KINDS.items():
         of_kind = [example for example in examples if example.kind == kind]
         drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:limit]]
     folders: list[list[NDArray[np.int16]]] = []
     for folder in untranscribed:
         pieces = load_untranscribed([folder], errors)
         folders.append(
-            [pieces[place] for place in rng.permutation(len(pieces))[: draw.max_untranscribed]]
+            [pieces[place] for place in rng.permutation(len(pieces))[:_MAX_UNTRANSCRIBED]]
         )
     aligned = align_all(aligner_scores(aligner, drawn), aligner.topology, drawn, report)
-    frames = dict.fromkeys(draw.kinds, 0.0)
+    frames = dict.fromkeys(_KINDS, 0.0)
     for one in aligned:
         frames[one.example.kind] += one.example.weight * len(one.states)
     recordings = []
     for one in aligned:
         kind = one.example.kind
-        weight = draw.kinds[kind][0] * one.example.weight * len(one.states) / frames[kind]
+        weight = _KINDS[kind][0] * one.example.weight * len(one.states) / frames[kind]
         targets = Targets.hard(one.states)
         recordings.append(
             Recording(samples=samples_of(one.example), targets=targets, weight=weight)
@@ -116,7 +106,7 @@ def label(
     counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
     for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
         for sound, targets in pairs:
-            weight = draw.untranscribed_share * count / sum(counted) * len(targets) / size
+            weight = _UNTRANSCRIBED_SHARE * count / sum(counted) * len(targets) / size
             labeled.append(Recording(samples=sound, targets=targets, weight=weight))
     return labeled
 
@@ -156,11 +146,10 @@ NUM_READOUT_STEPS, NUM_STEPS = 450, 475
 BLOCK_LENGTH = 5  # positions, live
 _PHONE_PENALTY = 2.0  # most of the network's errors are deletions
 
-_DRAW = Draw(
-    kinds={"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)},
-    untranscribed_share=0.72,
-    max_untranscribed=3000,
-)
+# of each kind of speech: share in training, and maximum number of recordings
+_KINDS = {"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)}
+_UNTRANSCRIBED_SHARE = 0.72
+_MAX_UNTRANSCRIBED = 3000  # pieces of each folder
 
 
 def train_blocks(
@@ -199,7 +188,6 @@ def train_blocks(
         labeled = label(
             examples,
             untranscribed,
-            draw=_DRAW,
             aligner=before,
             encoder=whole,
             errors=errors,

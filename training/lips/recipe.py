@@ -14,7 +14,7 @@ Source: Hoerl and Kennard 1970, "Ridge regression: biased estimation for nonorth
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -326,24 +326,17 @@ def joined(
     bias[:, :_NUM_FAPS] += linear[-1] * share[:_NUM_FAPS] + units.mean
     bias[:, CLOSURE] += np.log(_MISSED_CLOSURE)
     output = weights["output.weight"].T.reshape(-1, *shape) * share
-    exact = LipPredictor(
+    return LipPredictor(
         delays=np.array(DELAYS_S, np.float32),
         feature_mean=mean,
         projection=projection,
-        entry_weights=weights["entry.weight"].T,
+        entry_weights=np.ascontiguousarray(weights["entry.weight"].T),
         entry_bias=weights["entry.bias"],
-        input_weights=weights["recurrent.weight_ih_l0"].T,
+        input_weights=np.ascontiguousarray(weights["recurrent.weight_ih_l0"].T),
         input_bias=weights["recurrent.bias_ih_l0"],
-        state_weights=weights["recurrent.weight_hh_l0"].T,
+        state_weights=np.ascontiguousarray(weights["recurrent.weight_hh_l0"].T),
         state_bias=weights["recurrent.bias_hh_l0"],
         history_weights=history.reshape(HISTORY, num_components, *shape).astype(np.float32),
         output_weights=output.astype(np.float32),
         output_bias=bias.astype(np.float32),
-    )
-    return replace(
-        exact,
-        **{
-            name: np.ascontiguousarray(getattr(exact, name))
-            for name in ("entry_weights", "input_weights", "state_weights")
-        },
     )

@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax
 
 MAX_DEVIATIONS = 6.0
+_MAX_MASKED = 7  # positions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +42,6 @@ class ReadoutShape:
     constant_noise: float = 0.0  # upper limit of noise that is constant in a recording
     feature_dropout: float = 0.0  # fraction of the features that are 0 in a whole recording
     num_masks: int = 0  # of positions; each is used with a probability of 1/2
-    max_masked: int = 7  # positions
 
 
 class Readout(nn.Module):
@@ -96,7 +96,7 @@ class Readout(nn.Module):
         position = torch.arange(num_positions)[:, None]
         for _ in range(self.shape.num_masks):
             first = torch.randint(num_positions, (batch, 1, 1))
-            width = torch.randint(1, self.shape.max_masked + 1, (batch, 1, 1))
+            width = torch.randint(1, _MAX_MASKED + 1, (batch, 1, 1))
             is_used = torch.rand(batch, 1, 1) < 0.5
             noisy = noisy * ~(is_used & (position >= first) & (position < first + width))
         return noisy
