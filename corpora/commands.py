@@ -30,7 +30,7 @@ def adapt(
     json_file: JsonFile = None,
 ) -> None:
     """Learn a speaker's mouth profile from tracked lips, for the option --mouth."""
-    from kouxing.services.mouth_profiles.adapt import learn_mouth_profile
+    from kouxing.services.mouth_profiles.learning import learn_mouth_profile
     from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 
     check_output(output, json_file)

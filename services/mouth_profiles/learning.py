@@ -31,14 +31,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.mouth_profiles.lip_tracks import (
+    MEASURES,
     correlate_curves,
     interpolate_track,
     lip_measures,
 )
 from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_frames import delay_for
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor, lip_predictor_for
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
 
@@ -237,3 +239,47 @@ def _error(profile: MouthProfile, observations: Observations) -> float:
     squares = (apply_profile(profile, observations)[..., faps] - tracked) ** 2
     relative = squares / np.maximum(tracked.var(axis=(0, 1)), 1e-9)
     return float(relative.mean()) * len(observations)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedProfile:
+    """A mouth profile and what it improves."""
+
+    content: bytes
+    speech_s: float  # speech that it was learned from
+    gain: ProfileGain  # of a profile that was learned from the first three quarters
+
+    def figures(self) -> dict[str, object]:
+        """Return the figures that ``kouxing adapt --json`` writes, see ``docs/my_mouth.md``."""
+        gain = self.gain
+        curves = {
+            measure: dict(zip(("tracked", "before", "after"), map(_plain, curve), strict=True))
+            for measure, curve in zip(MEASURES, gain.curves, strict=True)
+        }
+        return {
+            "speech_s": self.speech_s,
+            "held_back_s": gain.speech_s,
+            "delay_ms": 1e3 * gain.delay_s,
+            "before": dict(zip(MEASURES, _plain(gain.before), strict=True)),
+            "after": dict(zip(MEASURES, _plain(gain.after), strict=True)),
+            "curves": {"time_s": _plain(gain.time_s), **curves},
+        }
+
+
+def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
+    """Learn a mouth profile; UserError if there is too little speech with lips in view."""
+    model = load_model()
+    lips = lip_predictor_for(model)
+    if lips is None or not isinstance(model, NeuralModel):
+        raise UserError("the shipped lip model and acoustic model do not match; reinstall kouxing")
+    observations = Observations.join([observe(model, lips, filmed) for filmed in recordings])
+    return LearnedProfile(
+        content=fit_profile(observations).to_bytes(lips.digest),
+        speech_s=len(observations) * POSITION_S,
+        gain=measure_gain(lips, observations),
+    )
+
+
+def _plain(values: NDArray[np.float64]) -> list[float | None]:
+    """Convert numbers to JSON values; NaN becomes None."""
+    return [round(float(value), 4) if np.isfinite(value) else None for value in values]

@@ -19,7 +19,7 @@ from kouxing.training.blocks.recipe import train_blocks
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
 from kouxing.training.neural import teacher
 from kouxing.training.neural.batches import Recording, Targets
-from kouxing.training.neural.readout import Readout, ReadoutShape
+from kouxing.training.neural.network import Readout, ReadoutShape
 from kouxing.training.neural.teacher import WholeEncoder
 from tests.tones import tones
 from tests.unit.test_block_model import HELLO, SMALL
@@ -78,14 +78,6 @@ def test_a_single_block_is_read_like_a_window() -> None:
     torch.testing.assert_close(read, network.readout(features), rtol=0, atol=1e-5)
 
 
-def test_attention_is_limited_to_the_past_window() -> None:
-    laid = layout(150, 10)
-    last = 149
-    assert laid.may_attend[last].nonzero()[:, 0].tolist() == list(range(140 - 125, 150))
-    of_right = laid.blocks[3, -1]  # the last of the right context of block 3
-    attended = laid.places[laid.may_attend[of_right]]
-    assert attended.tolist() == list(range(50))
-    assert not laid.may_attend[last, 150:].any(), "no copies of other blocks"
 
 
 def test_the_teacher_gets_the_clean_audio(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,15 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.ferguson.lengths import AlignedSpeech, influence_levels, phone_table
-from kouxing.training.ferguson.openings import fit_openings, relative_openings, travel_of
-from kouxing.training.ferguson.recipe import train_ferguson
+from kouxing.training.ferguson.recipe import (
+    AlignedSpeech,
+    fit_openings,
+    influence_levels,
+    phone_table,
+    relative_openings,
+    train_ferguson,
+    travel_of,
+)
 from tests.lips import clip_of, phone, utterance
 
 pytestmark = pytest.mark.unit

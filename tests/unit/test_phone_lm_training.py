@@ -22,11 +22,13 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.commands import app
 from kouxing.training.phone_lm import open_gram
-from kouxing.training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
 from kouxing.training.phone_lm.open_gram import draw_phones
 from kouxing.training.phone_lm.recipe import (
+    Stream,
+    estimate_phone_lm,
     load_phone_lm,
     phones_of_text,
+    stream_of,
     train_phone_lm,
 )
 from tests.languages import (

@@ -26,8 +26,14 @@ from kouxing.services.recognizer.search.forced_path import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations, positions_of
-from kouxing.training.gmm.estimation import decorrelate, estimate, first_estimate, split
-from kouxing.training.gmm.frames import Copy, FrameSet
+from kouxing.training.gmm.estimation import (
+    Copy,
+    FrameSet,
+    decorrelate,
+    estimate,
+    first_estimate,
+    split,
+)
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
 from kouxing.training.training_set import Example, load_examples, speech_span

@@ -16,8 +16,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_IND
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.visemes.fit import estimate
-from kouxing.training.visemes.frames import frames_of
+from kouxing.training.visemes.fit import estimate, frames_of
 from kouxing.training.visemes.recipe import closure_reach, train_visemes, usual_levels
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
 

@@ -36,8 +36,8 @@ from onnx import TensorProto, helper
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
+from kouxing.training.neural.network import MAX_DEVIATIONS
 from kouxing.training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
-from kouxing.training.neural.readout import MAX_DEVIATIONS
 from kouxing.training.neural.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")

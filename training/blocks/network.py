@@ -51,8 +51,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
-from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Shape
-from kouxing.training.neural.readout import Readout
+from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Readout, Shape
 from kouxing.training.neural.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms

@@ -1,26 +1,234 @@
-"""From clips of tracked lips and speech corpora to the table of the ferguson lip model."""
+"""From clips of tracked lips and speech corpora to the table of the ferguson lip model.
+
+Source: Zhang et al. 2021.
+
+Table 2 gives vowels four levels of influence. Their factors are learned here from each final's mean
+fraction of the syllable that is the initial. Finals are grouped into levels such that the fractions
+deviate least from their level's mean.
+
+Section 4 measures each opening on photographs. Here the tracked opening is R(t). Between key frames
+it is linear in the openings of the two phones (eq. 6), so the openings are the solution of a
+bounded linear least-squares problem. Rare phones are shrunk toward the values of their visemes in
+other phones. Silence and bilabials are closed: R is 0.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, islice, pairwise
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.corpora.lip_clips import label_clip, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
 from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
-from kouxing.services.synthesizer.lips.ferguson.table import COLUMNS, PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.key_frames import anchors_of
+from kouxing.services.synthesizer.lips.ferguson.table import COLUMNS, MAX_OPENING, PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.timing import Hiss
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.ferguson.lengths import AlignedSpeech, phone_table
-from kouxing.training.ferguson.openings import fit_openings, travel_of
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 from kouxing.training.training_set import Report
+
+Array = NDArray[np.float64]
+
+NUM_LEVELS = 4
+_KIND_RIDGE = 5.0  # weight of the mean of all phones of a kind, phones
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedSpeech:
+    """A recording with its syllables and the times of their phones."""
+
+    slices: Sequence[Progress]
+    syllables: Sequence[Syllable]
+    phones: Sequence[Phone]  # without silence
+
+
+def phone_table(
+    opening: dict[str, float], speech: Iterable[AlignedSpeech], inventory: PhoneInventory
+) -> PhoneTable:
+    """Add durations, zero crossings and influence to the openings of the phones."""
+    durations: dict[str, list[float]] = defaultdict(list)
+    crossings: dict[str, list[float]] = defaultdict(list)
+    shares: dict[str, list[float]] = defaultdict(list)
+    for recording in speech:
+        hiss = Hiss(recording.slices)
+        remaining = iter(recording.phones)
+        for syllable in recording.syllables:
+            phones = list(islice(remaining, len(syllable)))
+            for phone in phones:
+                durations[phone.symbol].append(phone.duration_s)
+            crossings[syllable[0]].append(float(hiss.at(np.array([phones[0].onset_s]))[0]))
+            if len(syllable) > 1 and syllable[0] in inventory.initials:
+                length_s = phones[0].duration_s + phones[1].duration_s
+                shares[syllable[1]].append(phones[0].duration_s / length_s)
+    kind = dict(zip(inventory.phones, inventory.kinds, strict=True))
+    share = _means(shares, sorted(inventory.vowels), lambda _: "vowel")
+    counts = {phone: len(shares[phone]) + _KIND_RIDGE for phone in share}
+    level, influence = influence_levels(share, counts)
+    return PhoneTable(
+        opening=opening,
+        duration_s=_means(durations, inventory.phones, kind.__getitem__),
+        crossings=_means(crossings, inventory.phones, kind.__getitem__),
+        level=level,
+        influence=influence,
+    )
+
+
+def influence_levels(
+    share: Mapping[str, float], weight: Mapping[str, float]
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Group finals by their initials' share; return level and factor of each.
+
+    ``share`` is the mean fraction of the syllable that is the initial, for at least ``NUM_LEVELS``
+    finals.
+    """
+    finals = sorted(share, key=lambda final: (-share[final], final))
+    values = np.array([share[final] for final in finals])
+    weights = np.array([weight[final] for final in finals])
+
+    def groups(cuts: tuple[int, ...]) -> list[slice]:
+        return [slice(start, end) for start, end in pairwise((0, *cuts, len(finals)))]
+
+    def factor(group: slice) -> float:
+        return float(np.average(values[group], weights=weights[group]))
+
+    def misfit(cuts: tuple[int, ...]) -> float:
+        return sum(
+            float(weights[group] @ (values[group] - factor(group)) ** 2) for group in groups(cuts)
+        )
+
+    best = groups(min(combinations(range(1, len(finals)), NUM_LEVELS - 1), key=misfit))
+    level = {final: row for row, group in enumerate(best, start=1) for final in finals[group]}
+    factors = [factor(group) for group in best]
+    return level, {final: factors[level[final] - 1] for final in finals}
+
+
+def _means(
+    by_phone: Mapping[str, list[float]], phones: Sequence[str], kind: Callable[[str], str]
+) -> dict[str, float]:
+    """Compute the mean of each phone; rare phones are shrunk toward the mean of their kind."""
+    of_kind: dict[str, list[float]] = defaultdict(list)
+    for phone in phones:
+        of_kind[kind(phone)] += by_phone.get(phone, [])
+    everything = [value for values in of_kind.values() for value in values]
+    means = {}
+    for phone in phones:
+        values = by_phone.get(phone, [])
+        usual = np.mean(of_kind[kind(phone)] or everything)
+        means[phone] = float((sum(values) + _KIND_RIDGE * usual) / (len(values) + _KIND_RIDGE))
+    return means
+
+
+_FULL_PERCENTILE = 98.0  # of a speaker's opening, where R is 5
+_OPENING_RIDGE = 10.0  # weight of the value from a phone's visemes, video frames
+_CLOSED = (REST, "b")  # visemes whose lips touch
+_DEFAULT_OPENING = 2.0  # of a viseme without data
+
+
+def relative_openings(clips: Sequence[LipClip]) -> list[Array]:
+    """Compute R of the frames of each clip, (num_frames,); NaN if not measured.
+
+    R is 0 for a closed mouth and 5 for the speaker's widest.
+    """
+    openings = [-clip.faps[:, columns((4, 5))].sum(axis=1) for clip in clips]
+    of_speaker: dict[str, list[Array]] = defaultdict(list)
+    for clip, opening in zip(clips, openings, strict=True):
+        of_speaker[clip.speaker].append(opening)
+    widest = {
+        speaker: float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE))
+        for speaker, group in of_speaker.items()
+    }
+    return [
+        np.clip(MAX_OPENING * opening / max(widest[clip.speaker], 1.0), 0.0, MAX_OPENING)
+        for clip, opening in zip(clips, openings, strict=True)
+    ]
+
+
+def fit_openings(
+    clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
+) -> dict[str, float]:
+    """Estimate the opening of each phone from clips and their phones."""
+    is_open = np.array(
+        [inventory.visemes[phone][0][0] not in _CLOSED for phone in inventory.phones]
+    )
+    parts, heights = [], []
+    for clip, phones, opening in zip(clips, labels, relative_openings(clips), strict=True):
+        is_measured = np.isfinite(opening)
+        parts.append(_opening_weights(clip.time_s[is_measured], phones, inventory) * is_open)
+        heights.append(opening[is_measured])
+    weights, height = np.concatenate(parts), np.concatenate(heights)
+    shares = _viseme_shares(inventory) * is_open[:, None]
+    of_visemes = _least_squares(
+        weights @ shares, height, np.full(shares.shape[1], _DEFAULT_OPENING)
+    )
+    fitted = _least_squares(weights, height, shares @ of_visemes)
+    return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
+
+
+def travel_of(clips: Sequence[LipClip]) -> Array:
+    """Measure the travel of each mouth FAP from a closed to the widest mouth, FAP units.
+
+    These are the coefficients of motion of Zhang et al. 2021, section 3, by least squares through
+    the closed mouth, (num_mouth_faps,); 0 for FAPs that were not measured.
+    """
+    opening = np.concatenate(relative_openings(clips)) / MAX_OPENING
+    faps = np.concatenate([clip.faps for clip in clips])
+    travel = np.zeros(len(MOUTH_FAPS))
+    for column in range(len(MOUTH_FAPS)):
+        is_measured = np.isfinite(opening) & np.isfinite(faps[:, column])
+        x, y = opening[is_measured], faps[is_measured, column]
+        if len(x):
+            travel[column] = float(x @ y) / max(float(x @ x), 1.0)
+    return travel
+
+
+def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory) -> Array:
+    """Compute the weight of each phone's opening in R at some times, (num_times, num_phones)."""
+    anchors = anchors_of(phones, inventory.silence)
+    weights = np.zeros((len(times_s), len(inventory)))
+    anchors_s = [time_s for time_s, _ in anchors]
+    for number, (_, symbol) in enumerate(anchors):
+        tent = np.zeros(len(anchors))
+        tent[number] = 1.0
+        weights[:, inventory.index[symbol]] += np.interp(times_s, anchors_s, tent)
+    return weights
+
+
+def _viseme_shares(inventory: PhoneInventory) -> Array:
+    """Return the share of each viseme in each phone, (num_phones, num_visemes)."""
+    names = sorted({name for shares in inventory.visemes.values() for name, _ in shares})
+    shares = np.zeros((len(inventory), len(names)))
+    for row, phone in enumerate(inventory.phones):
+        for name, share in inventory.visemes[phone]:
+            shares[row, names.index(name)] += share
+    return shares
+
+
+def _least_squares(weights: Array, height: Array, start: Array) -> Array:
+    ridge = np.sqrt(_OPENING_RIDGE)
+    result = lsq_linear(
+        np.vstack([weights, ridge * np.eye(len(start))]),
+        np.concatenate([height, ridge * start]),
+        (0.0, MAX_OPENING),
+    )
+    return np.clip(result.x, 0.0, MAX_OPENING)
+
 
 _MIN_SYLLABLES = 3  # isolated words are slower than connected speech
 _MAX_OF_SPEAKER = 60  # recordings

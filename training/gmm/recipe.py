@@ -16,13 +16,15 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training import SYNTHETIC_WEIGHT
 from kouxing.training.gmm.augmentation import Augmentation
 from kouxing.training.gmm.estimation import (
+    Copy,
+    FrameSet,
+    Hmm,
     decorrelate,
     estimate,
     first_estimate,
     split,
     topology_of,
 )
-from kouxing.training.gmm.frames import Copy, FrameSet, Hmm
 from kouxing.training.model_card import write_card
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.search_weights import SearchWeights, choose_search_weights

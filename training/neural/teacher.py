@@ -43,9 +43,8 @@ from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
 from kouxing.training.neural.batches import Recording, Sample, Targets, batches_of, sampling_probs
-from kouxing.training.neural.network import Encoder, Shape, mixed_precision
+from kouxing.training.neural.network import Encoder, Readout, ReadoutShape, Shape, mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, rise_and_fall
-from kouxing.training.neural.readout import Readout, ReadoutShape
 from kouxing.training.training_set import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder

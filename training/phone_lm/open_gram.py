@@ -22,8 +22,7 @@ from rich.progress import track
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.phone_lm.estimation import Stream
-from kouxing.training.phone_lm.recipe import phones_of_text
+from kouxing.training.phone_lm.recipe import Stream, phones_of_text
 
 _BASE = 100_000  # of the n-grams' codes, greater than the number of words
 _NUM_CHAINS = 100_000  # drawn in parallel

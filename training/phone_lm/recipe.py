@@ -1,11 +1,32 @@
-"""From texts and corpora to a file with a phone language model."""
+"""Estimate a phone language model: count n-grams, smooth them, keep the most informative ones.
+
+Sources: Witten and Bell 1991, "The zero-frequency problem", as interpolation (Chen and Goodman
+1999, section 2.6); Seymore and Rosenfeld 1996, "Scalable backoff language models" (pruning).
+
+======== ======================================================== ============
+symbol   meaning                                                  shape
+======== ======================================================== ============
+g        n-gram: its phones as digits to the base num_phones      (n-grams,)
+c        count of the n-gram                                      (n-grams,)
+N, T     count of its context, and number of phones seen after it (n-grams,)
+======== ======================================================== ============
+
+    p(u | h) = (c + T p(u | h')) / (N + T)
+
+The gain of an n-gram, ``c log(p(u | h) / (T p(u | h') / (N + T)))``, is how much it raises the log
+likelihood of the texts. The n-grams with the highest gains and their prefixes are kept.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.speech_corpus import RowErrors, is_synthetic, read_corpus
@@ -18,8 +39,160 @@ from kouxing.services.recognizer.acoustic.model_file import (
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
 from kouxing.training.training_set import MAX_WORD_PHONES, Example, Report
+
+Stream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
+
+_UNSEEN_COUNT = 0.5  # added to the count of each single phone
+_MIN_REMAINDER = 1e-4
+_MAX_CODE = np.iinfo(np.int64).max
+
+_Grams = dict[int, NDArray[np.int64]]  # by n, ascending
+_Probs = dict[int, NDArray[np.float64]]  # by n
+
+
+def stream_of(sentences: Sequence[Sequence[int]], inventory: PhoneInventory) -> Stream:
+    """Join sentences, given as indices of phones, with a pause before each."""
+    silence = inventory.index[inventory.silence]
+    phones = [phone for sentence in sentences for phone in (silence, *sentence)]
+    return np.array(phones, dtype=np.uint8)
+
+
+def estimate_phone_lm(
+    streams: Sequence[Stream],
+    inventory: PhoneInventory,
+    *,
+    order: int = 6,
+    max_ngrams: int = 1_000_000,
+) -> PhoneLanguageModel:
+    """Estimate a phone language model of about ``max_ngrams`` n-grams.
+
+    ``streams`` are texts as indices of phones, with a pause between sentences or where a reader
+    would pause. A text counts once for each stream that contains it. ``order`` is the number of
+    phones in the longest n-grams, 2 or more. UserError if it is too high for 64-bit codes.
+    """
+    num_phones = len(inventory)
+    if num_phones**order > _MAX_CODE:
+        raise UserError(f"order {order} is too high for {num_phones} phones; give a lower one")
+    silence = inventory.index[inventory.silence]
+    grams, counts = _count(np.concatenate(streams), order, silence, num_phones)
+    alone = np.full(num_phones, _UNSEEN_COUNT)
+    alone[grams[1]] += counts[1]
+    probs: _Probs = {1: alone / alone.sum()}
+    grams[1] = np.arange(num_phones)
+    gains: dict[int, NDArray[np.float64]] = {}
+    for n in range(2, order + 1):
+        _, context = np.unique(grams[n] // num_phones, return_inverse=True)
+        total = np.bincount(context, weights=counts[n])  # N
+        distinct = np.bincount(context)  # T
+        shorter = np.searchsorted(grams[n - 1], grams[n] % num_phones ** (n - 1))
+        backoff = (distinct / (total + distinct))[context] * probs[n - 1][shorter]
+        probs[n] = counts[n] / (total + distinct)[context] + backoff
+        gains[n] = counts[n] * np.log(probs[n] / backoff)
+    _prune(grams, probs, gains, max_ngrams, num_phones)
+    return _Tree(grams, probs, inventory).phone_lm()
+
+
+def _count(
+    stream: Stream, order: int, silence: int, num_phones: int
+) -> tuple[_Grams, dict[int, NDArray[np.int64]]]:
+    """Count n-grams of 1 to ``order`` phones; a pause may only be the first or the last phone."""
+    phones = stream.astype(np.int64)
+    last = np.arange(1, len(phones))  # where n-grams end; the first pause is only context
+    pauses = np.maximum.accumulate(np.where(phones == silence, np.arange(len(phones)), 0))
+    pause = pauses[last - 1]  # the pause before
+    code = phones[last]
+    grams, counts = {}, {}
+    for n in range(1, order + 1):
+        if n > 1:
+            inside = last - (n - 1) >= pause
+            last, pause, code = last[inside], pause[inside], code[inside]
+            code = code + phones[last - (n - 1)] * num_phones ** (n - 1)
+        grams[n], counts[n] = np.unique(code, return_counts=True)
+    return grams, counts
+
+
+def _prune(
+    grams: _Grams,
+    probs: _Probs,
+    gains: dict[int, NDArray[np.float64]],
+    max_ngrams: int,
+    num_phones: int,
+) -> None:
+    """Keep the n-grams with the highest gains, and their prefixes, in place."""
+    all_gains = np.concatenate(list(gains.values()))
+    threshold = 0.0
+    if len(all_gains) > max_ngrams:
+        threshold = np.partition(all_gains, -max_ngrams)[-max_ngrams]
+    prefixes = np.empty(0, np.int64)
+    for n in range(max(gains), 1, -1):
+        kept = gains[n] >= threshold
+        kept[np.searchsorted(grams[n], prefixes)] = True
+        grams[n], probs[n] = grams[n][kept], probs[n][kept]
+        prefixes = np.unique(grams[n] // num_phones)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tree:
+    """Arranges n-grams as a tree with back-off weights."""
+
+    grams: _Grams
+    probs: _Probs
+    inventory: PhoneInventory
+
+    def phone_lm(self) -> PhoneLanguageModel:
+        """Compute back-off weights such that the probabilities after each context sum to 1."""
+        order, num_phones = len(self.grams), len(self.inventory)
+        backoffs: _Probs = {}
+        for n in range(1, order):
+            parent = np.searchsorted(self.grams[n], self.grams[n + 1] // num_phones)
+            shorter = self._prob(self.grams[n + 1] % num_phones**n, n, backoffs)
+            num_parents = len(self.grams[n])
+            counted = np.bincount(parent, weights=self.probs[n + 1], minlength=num_parents)
+            replaced = np.bincount(parent, weights=shorter, minlength=num_parents)
+            backoffs[n] = _remainder(counted) / _remainder(replaced)
+        backoffs[order] = np.ones(len(self.grams[order]))
+        levels = [self.grams[n] for n in range(1, order + 1)]
+        children = [
+            np.bincount(np.searchsorted(above, below // num_phones), minlength=len(above))
+            for above, below in pairwise(levels)
+        ]
+        leaves = np.zeros(len(levels[-1]), np.int64)
+        num_children = np.concatenate([[num_phones], *children, leaves])
+        phone = np.concatenate([[0], *(level % num_phones for level in levels)])
+        return PhoneLanguageModel(
+            inventory=self.inventory,
+            num_children=num_children.astype(np.uint8),
+            phone=phone.astype(np.uint8),
+            log_prob=_logs(self.probs),
+            log_backoff=_logs(backoffs),
+        )
+
+    def _prob(self, wanted: NDArray[np.int64], n: int, backoffs: _Probs) -> NDArray[np.float64]:
+        num_phones = len(self.inventory)
+        at = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
+        probs = self.probs[n][at]
+        missing = np.flatnonzero(self.grams[n][at] != wanted)
+        if len(missing):
+            pruned = wanted[missing]
+            context, contexts = pruned // num_phones, self.grams[n - 1]
+            at = np.minimum(np.searchsorted(contexts, context), len(contexts) - 1)
+            weight = np.where(contexts[at] == context, backoffs[n - 1][at], 1.0)
+            shorter = self._prob(pruned % num_phones ** (n - 1), n - 1, backoffs)
+            probs[missing] = weight * shorter
+        return probs
+
+
+def _remainder(total: NDArray[Any]) -> NDArray[np.float64]:
+    """Return what a sum of probabilities leaves of 1, at least a little."""
+    return np.maximum(1 - total, _MIN_REMAINDER)
+
+
+def _logs(values: _Probs) -> NDArray[np.float32]:
+    """Return the logarithms of all levels in order, the root's (0) first."""
+    logs = np.log(np.concatenate([[1.0], *(values[n] for n in range(1, len(values) + 1))]))
+    return logs.astype(np.float32)
+
 
 _CORPUS_WEIGHT = 0.012  # corpus phones per phone of other texts
 

@@ -28,8 +28,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.visemes.fit import estimate
-from kouxing.training.visemes.frames import Array, frames_of
+from kouxing.training.visemes.fit import Array, estimate, frames_of
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
 _SPOKEN_DB = 25.0  # audio this far below the loudest is not speech
