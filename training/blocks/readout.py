@@ -8,8 +8,7 @@ targets).
 ====== ============================================================== ===================
 symbol meaning                                                        shape
 ====== ============================================================== ===================
-y      posteriors of the states, :mod:`kouxing.training.neural.       (frames, states)
-       readout`
+y      posteriors of the states                                       (frames, states)
 s, q   target states of a frame and their probabilities               (frames, k)
 w      weight of a frame: 1 in the last 0.4 s of the window, which    (frames,)
        are read live, and 1/4 before

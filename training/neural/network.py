@@ -1,4 +1,4 @@
-"""The neural recognizer's network in PyTorch, a causal transformer encoder, and a recurrent readout.
+"""The networks in PyTorch: a causal transformer encoder, and a recurrent readout of states.
 
 Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (Whisper:
 the encoder's layers and the initial weights); Vaswani et al. 2017, "Attention is all you need"
@@ -18,9 +18,9 @@ Position ``p`` has seen the frames up to ``2 p + 2``. With a look-ahead of ``d``
 frames are ``2 p + 2 - d`` and ``2 p + 3 - d``; the second one's look-ahead is a frame shorter. All
 look-aheads share the layers, and each has its own output layer.
 
-The readout computes states from the positions of Whisper's encoder. Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder for statistical
-machine translation" (the GRU); Schuster and Paliwal 1997, "Bidirectional recurrent neural
-networks".
+The readout computes states from the positions of Whisper's encoder. Sources: Cho et al. 2014,
+"Learning phrase representations using RNN encoder-decoder for statistical machine translation" (the
+GRU); Schuster and Paliwal 1997, "Bidirectional recurrent neural networks".
 
     z = clip((concat(h_4, h_5, h_6) - mean) / deviation, -6, 6)
     a = gelu(W z)
