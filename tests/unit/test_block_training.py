@@ -78,8 +78,6 @@ def test_a_single_block_is_read_like_a_window() -> None:
     torch.testing.assert_close(read, network.readout(features), rtol=0, atol=1e-5)
 
 
-
-
 def test_the_teacher_gets_the_clean_audio(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_DISTURB_PROB", 0.0)
     batch = block_batch(RECORDINGS, 0, 1)
