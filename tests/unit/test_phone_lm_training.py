@@ -213,57 +213,38 @@ def test_draws_words_with_their_probabilities(model: tuple[Path, Path]) -> None:
     assert people.count("") / len(people) == pytest.approx(0.15, abs=0.03)
 
 
+NO_NGRAMS = "is not output of `tslminfo -v`"
+NO_DICTIONARY = "is not a SunPinyin dictionary"
+START_AT_12 = bytes(8) + struct.pack("<I", 12)
+
+
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("damaged", "content", "message"),
     [
-        (None, "is not output of `tslminfo -v`"),
-        ("", "has 0 levels of n-grams instead of 4"),
-        ("\\0-gram\\1\n0 0 (0,0)\n\\1-gram\\1\n3 0.1 0 (0,0)\n", "has 2 levels"),
-        ("\\0-gram\\1\n0 0\n\\1-gram\\1\n3\n", "is not output of `tslminfo -v`"),
-        ("\\0-gram\\1\n0 0\n\\1-gram\\1\n3 none\n", "is not output of `tslminfo -v`"),
-        ("三", "is not output of `tslminfo -v`"),
+        (0, None, NO_NGRAMS),
+        (0, b"", "has 0 levels of n-grams instead of 4"),
+        (0, b"\\0-gram\\1\n0 0 (0,0)\n\\1-gram\\1\n3 0.1 0 (0,0)\n", "has 2 levels"),
+        (0, b"\\0-gram\\1\n0 0\n\\1-gram\\1\n3\n", NO_NGRAMS),
+        (0, b"\\0-gram\\1\n0 0\n\\1-gram\\1\n3 none\n", NO_NGRAMS),
+        (0, "三".encode(), NO_NGRAMS),
+        (1, None, NO_DICTIONARY),
+        (1, b"", NO_DICTIONARY),
+        (1, START_AT_12 + b"\0\0\0", NO_DICTIONARY),
+        (1, START_AT_12 + b"\xff" * 8, NO_DICTIONARY),
+        # fewer words than the n-grams have
+        (1, START_AT_12 + "\0你\0好".encode("utf-32-le"), "has words that"),
     ],
 )
-def test_rejects_damaged_n_grams(
-    content: str | None, message: str, model: tuple[Path, Path]
+def test_rejects_damaged_n_grams_and_dictionaries(
+    damaged: int, content: bytes | None, message: str, model: tuple[Path, Path]
 ) -> None:
-    ngrams, dictionary = model
-    ngrams.unlink()
+    path = model[damaged]
+    path.unlink()
     if content is not None:
-        ngrams.write_text(content, encoding="utf-8")
+        path.write_bytes(content)
     with pytest.raises(UserError, match=message) as raised:
-        draw_phones(ngrams, dictionary, MANDARIN, num_words=10)
-    assert str(ngrams) in str(raised.value)
-
-
-def test_rejects_words_outside_the_dictionary(model: tuple[Path, Path]) -> None:
-    content = model[0].read_text(encoding="ascii")
-    model[0].write_text(content.replace("\\3-gram", "3 99 0.1 0 (0,0)\n\\3-gram"), encoding="ascii")
-    with pytest.raises(UserError, match="has words that"):
         draw_phones(*model, MANDARIN, num_words=10)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "is not a SunPinyin dictionary"),
-        (b"", "is not a SunPinyin dictionary"),
-        (bytes(8) + struct.pack("<I", 12) + b"\0\0\0", "is not a SunPinyin dictionary"),
-        (bytes(8) + struct.pack("<I", 12) + b"\xff" * 8, "is not a SunPinyin dictionary"),
-        # fewer words than the n-grams know
-        (bytes(8) + struct.pack("<I", 12) + "\0你\0好".encode("utf-32-le"), "has words that"),
-    ],
-)
-def test_rejects_damaged_dictionaries(
-    content: bytes | None, message: str, model: tuple[Path, Path]
-) -> None:
-    ngrams, dictionary = model
-    dictionary.unlink()
-    if content is not None:
-        dictionary.write_bytes(content)
-    with pytest.raises(UserError, match=message) as raised:
-        draw_phones(ngrams, dictionary, MANDARIN, num_words=10)
-    assert str(dictionary) in str(raised.value)
+    assert str(path) in str(raised.value)
 
 
 # --- from files to a file
