@@ -17,9 +17,9 @@ from kouxing.training import SYNTHETIC_WEIGHT
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
 Corpora = Annotated[
-    list[Path],
-    typer.Option("--corpus", help="Corpus folder or manifest; repeatable."),
+    list[Path], typer.Option("--corpus", help="Corpus folder or manifest; repeatable.")
 ]
+Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")]
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same model.")]
 SyntheticWeight = Annotated[
@@ -31,8 +31,7 @@ PhoneLm = Annotated[
     typer.Option(help="Phone language model: phone_lm.npz, or the file of an acoustic model."),
 ]
 AnyLicense = Annotated[
-    bool,
-    typer.Option("--any-license", help="Also use data whose license forbids distribution."),
+    bool, typer.Option("--any-license", help="Also use data whose license forbids distribution.")
 ]
 Whisper = Annotated[
     Path, typer.Option(help="Folder of Whisper base for faster-whisper, for its encoder.")
@@ -53,8 +52,9 @@ Untranscribed = Annotated[
 
 
 @contextmanager
-def _neural_training() -> Iterator[None]:
-    """Explain how to install a missing package."""
+def _neural_training(output: Path) -> Iterator[None]:
+    """Check the output, and explain how to install a missing package."""
+    check_output(output)
     try:
         yield
     except ModuleNotFoundError as error:
@@ -99,13 +99,7 @@ def phone_lm(
     if ngrams and dictionary:
         drawn = draw_phones(ngrams, dictionary, inventory, num_words=words, seed=seed)
     train_phone_lm(
-        corpus or [],
-        text or [],
-        output,
-        inventory,
-        drawn=drawn,
-        order=order,
-        max_ngrams=max_ngrams,
+        corpus or [], text or [], output, inventory, drawn=drawn, order=order, max_ngrams=max_ngrams
     )
 
 
@@ -141,8 +135,7 @@ def neural(
     corpus: Corpora,
     output: Model,
     aligner: Annotated[
-        Path | None,
-        typer.Option(help="Model for the first alignment. Default: --start-from."),
+        Path | None, typer.Option(help="Model for the first alignment. Default: --start-from.")
     ] = None,
     whisper: Annotated[
         Path | None,
@@ -164,8 +157,7 @@ def neural(
     any_license: AnyLicense = False,
 ) -> None:
     """Train the neural recognizer, and write its model card and training curves."""
-    check_output(output)
-    with _neural_training():
+    with _neural_training(output):
         from kouxing.training.neural.recipe import train_neural
 
     train_neural(
@@ -201,8 +193,7 @@ def blocks(
 
     Repeat the command to resume an interrupted run.
     """
-    check_output(output)
-    with _neural_training():
+    with _neural_training(output):
         from kouxing.training.blocks.recipe import train_blocks
 
     train_blocks(
@@ -220,7 +211,7 @@ def blocks(
 
 @app.command()
 def visemes(
-    clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
+    clips: Clips,
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
     any_license: AnyLicense = False,
 ) -> None:
@@ -233,7 +224,7 @@ def visemes(
 
 @app.command()
 def lips(
-    clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
+    clips: Clips,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
     ] = Path("services/recognizer/models/lips.npz"),
@@ -245,30 +236,23 @@ def lips(
         ),
     ] = None,
     whisper: Annotated[
-        Path | None,
-        typer.Option(help="Folder of Whisper base for faster-whisper, the teacher."),
+        Path | None, typer.Option(help="Folder of Whisper base for faster-whisper, the teacher.")
     ] = None,
     seed: Seed = 0,
     any_license: AnyLicense = False,
 ) -> None:
     """Train the lip model on tracked lips, and write its model card."""
-    check_output(output)
-    with _neural_training():
+    with _neural_training(output):
         from kouxing.training.lips.recipe import train_lips
 
     train_lips(
-        clips,
-        output,
-        speech=speech or [],
-        whisper=whisper,
-        seed=seed,
-        any_license=any_license,
+        clips, output, speech=speech or [], whisper=whisper, seed=seed, any_license=any_license
     )
 
 
 @app.command()
 def ferguson(
-    clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
+    clips: Clips,
     corpus: Corpora,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
     any_license: AnyLicense = False,
