@@ -120,21 +120,18 @@ def _score_rate(
         for name, curves in _methods(model, samples, syllables, phones):
             frames[name].append(curves(times_s))
             onsets[name].append(curves(onsets_s))
+    frames_of = {name: np.concatenate(mouths) for name, mouths in frames.items()}
+    means_of = {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()}
+
+    def accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
+        return {name: accuracy_of(mouths, real) for name, mouths in made.items()} | bounds(real)
+
     return RateScore(
         rate=rate,
         syllables_per_s=num_syllables / max(seconds, 1e-9),
-        of_frames=_accuracies(
-            {name: np.concatenate(mouths) for name, mouths in frames.items()}, np.concatenate(real)
-        ),
-        of_phones=_accuracies(
-            {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()},
-            mean_mouths(symbols, np.concatenate(real_onsets)),
-        ),
+        of_frames=accuracies(frames_of, np.concatenate(real)),
+        of_phones=accuracies(means_of, mean_mouths(symbols, np.concatenate(real_onsets))),
     )
-
-
-def _accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
-    return {name: accuracy_of(mouths, real) for name, mouths in made.items()} | bounds(real)
 
 
 def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
@@ -267,8 +264,7 @@ def rates_figure(scores: Sequence[RateScore]) -> Any:
             percents = [100 * accuracies(score)[name] for score in scores]
             color = "0.6" if name in _BOUND_STYLES else None
             axis.plot(rates, percents, _BOUND_STYLES.get(name, "o-"), color=color, label=name)
-        axis.set_title(title)
-        axis.set_xlabel("speaking rate, relative to the recording")
+        axis.set(title=title, xlabel="speaking rate, relative to the recording")
     axes[0].set_ylabel("accuracy, %")
     axes[1].legend(fontsize=8)
     return figure

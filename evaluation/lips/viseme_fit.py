@@ -116,16 +116,15 @@ def viseme_errors(fitted: Sequence[FittedClip]) -> list[VisemeError]:
             if name != "all":
                 rows &= viseme == VISEMES.index(name)
             if rows.any():
-                errors.append(
-                    VisemeError(
-                        viseme=name,
-                        measure=measure,
-                        num_frames=int(rows.sum()),
-                        extent=float(real[rows].std()),
-                        learnt=_rms(learnt[rows] - real[rows]),
-                        guessed=_rms(guessed[rows] - real[rows]),
-                    )
+                error = VisemeError(
+                    viseme=name,
+                    measure=measure,
+                    num_frames=int(rows.sum()),
+                    extent=float(real[rows].std()),
+                    learnt=_rms(learnt[rows] - real[rows]),
+                    guessed=_rms(guessed[rows] - real[rows]),
                 )
+                errors.append(error)
     return errors
 
 
@@ -210,8 +209,11 @@ def _busiest_stretch(fitted: FittedClip) -> tuple[float, int]:
 def _draw_fit(axes: Any, fitted: FittedClip, start_s: float, end_s: float) -> None:
     first, last = (round(max(time_s, 0.0) * SAMPLE_RATE_HZ) for time_s in (start_s, end_s))
     phones = [phone for phone in fitted.phones if start_s <= phone.onset_s < end_s]
-    _draw_waveform(axes[0], fitted.clip.samples[first:last], first / SAMPLE_RATE_HZ)
-    top = axes[0].get_ylim()[1]
+    samples = fitted.clip.samples[first:last]
+    axes[0].plot((first + np.arange(len(samples))) / SAMPLE_RATE_HZ, samples, color="0.6", lw=0.3)
+    bottom = -1.1 * float(np.abs(samples).max(initial=1e-3))
+    top = -1.5 * bottom
+    axes[0].set(ylim=(bottom, top), yticks=[])
     for number, phone in enumerate(phones):
         for axis in axes:
             axis.axvline(phone.onset_s, color="0.92", zorder=0)
@@ -227,11 +229,3 @@ def _draw_fit(axes: Any, fitted: FittedClip, start_s: float, end_s: float) -> No
         axis.plot(time_s, real, color="0.6", linewidth=2.5, label="measured")
         axis.plot(time_s, learnt, color="black", linewidth=1.2, label="learnt parameters")
     axes[-1].set_xlabel("s")
-
-
-def _draw_waveform(axis: Any, samples: NDArray[np.float32], start_s: float) -> None:
-    time_s = start_s + np.arange(len(samples)) / SAMPLE_RATE_HZ
-    axis.plot(time_s, samples, color="0.6", linewidth=0.3)
-    top = 1.1 * float(np.abs(samples).max(initial=1e-3))
-    axis.set_ylim(-top, 1.5 * top)
-    axis.set_yticks([])

@@ -17,7 +17,8 @@ phones. Every recording is a separate session, so the live mean starts from the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -36,23 +37,27 @@ from kouxing.corpora.scoring import (
 )
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.recognizer.confusions import Confusions
-from kouxing.evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.offline import decode_offline
+from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 
+Samples = NDArray[np.float32]
 # The paper's rule, and rules that use only confident frames.
 RULES = tuple(
     OutputRuleConfig(*parameters)
     for parameters in ((1, 0.0), (3, 0.0), (5, 0.0), (3, 0.95), (3, 0.99), (1, 0.98))
 )
+CHUNK_SAMPLES = 160  # 10 ms, as live audio arrives
 _NUM_RESAMPLES = 2000
 
 
@@ -194,9 +199,7 @@ def _rule_name(rule: OutputRuleConfig) -> str:
     return f"N = {rule.num_stable_frames}{confidence}"
 
 
-def _score(
-    model: AcousticModel, samples: NDArray[np.float32]
-) -> list[tuple[float, list[ScoreEvent]]]:
+def _score(model: AcousticModel, samples: Samples) -> list[tuple[float, list[ScoreEvent]]]:
     """Score a recording live; return media time in seconds and the new events, by chunk."""
     scorer = SpeechScorer(model)
     scored = []
@@ -266,3 +269,34 @@ class _Reference:
             for i, j in matched_pairs(self.phones, symbols)
             if i is not None and j is not None and self.phones[i] == symbols[j]
         ]
+
+
+def cpu_by_stage(model: AcousticModel, samples: Samples) -> dict[str, float]:
+    """Return CPU seconds per second of audio by stage, with chunks of 10 ms."""
+    chunks = [samples[at : at + CHUNK_SAMPLES] for at in range(0, len(samples), CHUNK_SAMPLES)]
+    blocks = [
+        samples[at : at + BLOCK_SAMPLES]
+        for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
+    ]
+    front_end, stream = model.create_front_end(), model.create_stream()
+    decoder = Decoder(model.topology)
+    detector, resampler = VoiceActivityDetector(), Resampler(48_000)
+    frames = model.create_front_end().accept_waveform(samples)
+    scores = model.create_stream().score(frames)  # compiles before the clock starts
+    decoder.advance(scores[:1])
+    decoder.reset()
+
+    def run(stage: Callable[[Samples], object], pieces: Iterable[Samples]) -> float:
+        start = time.process_time()
+        for piece in pieces:
+            stage(piece)
+        return (time.process_time() - start) * SAMPLE_RATE_HZ / len(samples)
+
+    at_48_khz = np.array_split(np.repeat(samples, 3), len(chunks))
+    return {
+        "resampler_from_48_khz": run(resampler.accept_waveform, at_48_khz),
+        "voice_activity": run(detector.detect, blocks),
+        "front_end": run(front_end.accept_waveform, chunks),
+        "acoustic_model": run(stream.score, np.split(frames, len(frames))),
+        "decoder": run(decoder.advance, np.split(scores, len(scores))),
+    }

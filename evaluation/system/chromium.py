@@ -74,12 +74,8 @@ class Chromium:
 
     def close(self) -> None:
         """Close the browser."""
-
-        async def close() -> None:
-            await self._socket.close()
-            await self._http.close()
-
-        self._loop.run_until_complete(close())
+        for connection in (self._socket, self._http):
+            self._loop.run_until_complete(connection.close())
         self._loop.close()
         self._process.terminate()
         self._process.wait(_TIMEOUT_S)
@@ -104,13 +100,8 @@ class Chromium:
 
     def resize(self, width_px: int, height_px: int, *, mobile: bool = False) -> None:
         """Resize the window; ``mobile`` emulates a phone."""
-        self.command(
-            "Emulation.setDeviceMetricsOverride",
-            width=width_px,
-            height=height_px,
-            deviceScaleFactor=1,
-            mobile=mobile,
-        )
+        size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1}
+        self.command("Emulation.setDeviceMetricsOverride", **size, mobile=mobile)
 
     def cpu_s(self) -> float:
         """Return the CPU time of the process that draws, seconds."""
@@ -142,10 +133,9 @@ class Chromium:
             f"const box = document.getElementById('{name}').getBoundingClientRect();"
             "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
         )
+        press: dict[str, object] = {"x": x, "y": y, "button": "left", "clickCount": 1}
         for event in ("mousePressed", "mouseReleased"):
-            self.command(
-                "Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", clickCount=1
-            )
+            self.command("Input.dispatchMouseEvent", type=event, **press)
 
     def wait_for(self, condition: str, limit_s: float = _TIMEOUT_S) -> None:
         """Wait until an expression becomes true."""
