@@ -124,12 +124,10 @@ def _frames_with_mouth(
     sentence: RecognizedSentence,
 ) -> list[Frame]:
     """Replace the mouth of a condition's face; keep its blinks and head motion."""
-    frames = _frames(condition, sentence)
-    faps = np.array([faps for _, faps in frames])
-    times_s = np.array([time_s for time_s, _ in frames])
-    mouth = np.array(MOUTH_FAPS) - 1
-    faps[:, mouth] = mouth_of(sentence.sentence.clip, times_s)[:, mouth]
-    return [(time_s, row) for (time_s, _), row in zip(frames, faps, strict=True)]
+    times_s, faps = zip(*_frames(condition, sentence), strict=True)
+    frames, mouth = np.array(faps), np.array(MOUTH_FAPS) - 1
+    frames[:, mouth] = mouth_of(sentence.sentence.clip, np.array(times_s))[:, mouth]
+    return list(zip(times_s, frames, strict=True))
 
 
 def tracked_frames(clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
