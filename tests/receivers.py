@@ -52,7 +52,7 @@ def _read_plain_osc(frame: FaceFrame, target: Target) -> list[float]:
     connection = OscConnection(target)
     messages = dict(read_osc(list(connection.encode(frame))))
     for other in ("time", "head"):
-        del messages[connection.prefix + other]
+        del messages[f"/kouxing/{other}"]
     return [value for (value,) in messages.values()]
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour, lip_lines
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, LipLine, contour, lip_lines
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames
 
 pytestmark = pytest.mark.property
@@ -22,17 +22,21 @@ STRAIGHT = 0.2  # curvature below which an edge counts as straight
 MAX_INFLECTIONS = 2  # per edge: a dent between two bumps
 
 
+def sample(line: LipLine) -> NDArray[np.float64]:
+    return np.linspace(float(line.closed.x[0]), float(line.closed.x[-1]), 201)
+
+
 def assert_no_sick_shape(openings: Sequence[float] | NDArray[np.float64]) -> None:
     """Check that lips do not cross and edges do not bend sharply or have more than one dent."""
     opening = np.asarray(openings, float)
-    x = np.linspace(*lip_lines()["inner upper"].ends, 201)
+    x = sample(lip_lines()["inner upper"])
     heights = np.stack([lip_lines()[name].heights(x, opening) for name in LINES])
     outer_upper, inner_upper, inner_lower, outer_lower = heights
     assert (inner_upper - inner_lower >= -1e-9).all()
     assert (outer_upper > inner_upper).all()
     assert (inner_lower > outer_lower).all()
     for line in lip_lines().values():
-        x = np.linspace(*line.ends, 201)
+        x = sample(line)
         slope, bend = (
             line.closed(x, order) + opening[:, None] * line.travel(x, order) for order in (1, 2)
         )
