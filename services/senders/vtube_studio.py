@@ -14,7 +14,6 @@ import json
 import math
 import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -26,6 +25,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.keys import key_folder
 from kouxing.shared.logs import LOG
 
+_TOKENS = "vtube-studio.json"
 TIMEOUT_S = 5.0  # of a connection attempt, and of sending a frame
 
 PLUGIN = {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
@@ -273,21 +273,17 @@ class VTubeStudioConnection(Connection):
         _write_tokens({**_read_tokens(), self._address: token})
 
 
-def _tokens_file() -> Path:
-    return key_folder() / "vtube-studio.json"
-
-
 def _read_tokens() -> dict[str, str]:
     """Return the tokens issued by VTube Studio, by its address."""
     try:
-        tokens = json.loads(_tokens_file().read_text(encoding="utf-8"))
+        tokens = json.loads((key_folder() / _TOKENS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return tokens if isinstance(tokens, dict) else {}
 
 
 def _write_tokens(tokens: dict[str, str]) -> None:
-    path = _tokens_file()
+    path = key_folder() / _TOKENS
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)

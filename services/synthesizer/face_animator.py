@@ -263,10 +263,6 @@ class FaceAnimator:
             if change.active:  # levels before speech are noise
                 self._levels = [level for level in self._levels if level[0] >= change.time_s]
 
-    def _speech_starts_soon(self) -> bool:
-        soon_s = self._time_s + _SPEECH_LEAD_S
-        return any(change.active and change.time_s <= soon_s for change in self._changes)
-
     def _make_frame(self, mouth: MouthFrame) -> Frame:
         rehearsed = self._goal
         faps = self._make_goal(mouth)
@@ -305,12 +301,14 @@ class FaceAnimator:
         """Return the FAPs (68,) of a mouth after all modifiers."""
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
         faps[_MOUTH] = mouth.faps
+        soon_s = self._time_s + _SPEECH_LEAD_S
+        starts_soon = any(change.active and change.time_s <= soon_s for change in self._changes)
         context = FrameContext(
             time_s=self._time_s,
             known_s=self._time_s + self._delay_s,
             elapsed_s=(self._num_frames - 1) / self._frame_rate_hz,
             step_s=step_s,
-            is_speaking=self._is_speaking or self._speech_starts_soon(),
+            is_speaking=self._is_speaking or starts_soon,
             levels=levels,
             pitches=pitches,
             articulation=mouth.articulation,

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,20 +216,10 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         colors=(arrays["colors"].astype(np.float32)[kept] / np.float32(255)) ** 2,
         head_weight=arrays["head_weight"].astype(np.float32)[kept] / np.float32(255),
         basis=basis,
-        fapu={
-            str(key): float(value)
-            for key, value in zip(
-                arrays["fapu_names"].astype(str), arrays["fapu"].astype(float), strict=True
-            )
-        },
-        feature_points={
-            str(key): int(place[vertex])
-            for key, vertex in zip(
-                arrays["feature_point_names"].astype(str),
-                arrays["feature_points"].astype(np.int64),
-                strict=True,
-            )
-        },
+        fapu=_by_name(arrays["fapu_names"], arrays["fapu"].astype(float)),
+        feature_points=_by_name(
+            arrays["feature_point_names"], place[arrays["feature_points"].astype(np.int64)]
+        ),
         eye_centers=arrays["eye_centres"].astype(np.float32),
         textures={
             key.removeprefix("texture_"): value.astype(np.uint8).tobytes()
@@ -238,6 +228,10 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         },
         cel=bool(arrays.get("cel", False)),
     )
+
+
+def _by_name(names: NDArray[Any], values: NDArray[Any]) -> dict[str, Any]:
+    return dict(zip(names.astype(str).tolist(), values.tolist(), strict=True))
 
 
 def _check(arrays: dict[str, NDArray[np.generic]]) -> None:

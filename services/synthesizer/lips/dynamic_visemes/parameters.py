@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -133,10 +132,7 @@ def _clips_of(data: dict[str, Any]) -> frozenset[str]:
 
 def _read(path: Path | None) -> dict[str, Any]:
     if path is None:
-        path = (
-            Path(str(resources.files("kouxing.services.synthesizer.lips.dynamic_visemes")))
-            / "parameters.json"
-        )
+        path = Path(__file__).with_name("parameters.json")
     data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return data
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeShares
 
 REST = "rest"
@@ -63,13 +62,7 @@ def check_visemes(inventory: PhoneInventory) -> None:
 
 def static_targets() -> NDArray[np.float64]:
     """Read the static targets T (num_visemes, num_mouth_faps), FAP units."""
-    text = (
-        resources.files("kouxing.services.synthesizer.lips.dynamic_visemes")
-        .joinpath("targets.tsv")
-        .read_text("utf-8")
-    )
+    text = (resources.files(__package__) / "targets.tsv").read_text("utf-8")
     lines = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
-    if lines[0][1:] != [str(fap) for fap in MOUTH_FAPS]:
-        raise UserError("targets.tsv does not have the columns of the mouth FAPs; restore the file")
-    rows = {row[0]: [float(value) for value in row[1:]] for row in lines[1:]}
+    rows = {row[0]: [float(value) for value in row[1:]] for row in lines[1:]}  # as MOUTH_FAPS
     return np.array([rows[viseme] for viseme in VISEMES])

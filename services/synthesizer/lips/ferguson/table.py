@@ -45,9 +45,7 @@ def load_table(inventory: PhoneInventory) -> PhoneTable:
 
     Raises ``UserError`` if the language has no table, or the table is damaged.
     """
-    file = (
-        resources.files("kouxing.services.synthesizer.lips.ferguson") / f"{inventory.language}.tsv"
-    )
+    file = resources.files(__package__) / f"{inventory.language}.tsv"
     if not file.is_file():
         raise UserError(
             f"the lip model ferguson has no table for {inventory.language}; use another lip model"
