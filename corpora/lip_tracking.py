@@ -37,7 +37,7 @@ def read_video(
         with av.open(str(path)) as container:
             if not (container.streams.video and container.streams.audio):
                 raise UserError(
-                    f"{path}: the video needs images and audio; record it with a microphone"
+                    f"{path}: the video must have images and audio; record it with a microphone"
                 )
             return _decode(path, container, on_image)
     except (av.error.FFmpegError, OSError) as error:
@@ -62,7 +62,7 @@ def _decode(
         time_s = frame.time - start_s
         if time_s > MAX_DURATION_S:
             raise UserError(
-                f"{path}: the video is longer than {MAX_DURATION_S / 60:g} minutes; cut it"
+                f"{path}: the video is longer than {MAX_DURATION_S / 60:g} minutes; shorten it"
             )
         if time_s >= 0:
             on_image(time_s, _image_of(frame))
@@ -96,8 +96,8 @@ def track_video(video: Path, clip: Path) -> tuple[int, int]:
     seen = np.array([landmarks is not None for landmarks in tracked])
     if seen.sum() < MIN_FRAMES:
         raise UserError(
-            f"{video}: a face was found in only {seen.sum()} images; film it from the front in "
-            "good light, for 20 s or more"
+            f"{video}: a face was found in only {seen.sum()} images; film the face from the front "
+            "in good light, for 20 s or more"
         )
     time_s = np.array(times)
     faps = np.full((len(seen), len(MOUTH_FAPS)), np.nan)

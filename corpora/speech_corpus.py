@@ -84,7 +84,7 @@ class RowErrors:
     def nothing_left(self, where: str) -> UserError:
         """Make the error that no recording can be used, with the reason for the last one."""
         last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
-        return UserError(f"no usable recordings {where}{last}; give others")
+        return UserError(f"no usable recordings {where}{last}; give other recordings")
 
 
 def may_ship(license_name: str) -> bool:
@@ -127,7 +127,9 @@ def read_corpus(
     try:
         chosen = [(place, row) for place, row in rows if split in (None, _split_of(row))]
     except UnicodeDecodeError as error:
-        raise UserError(f"{folder}: its list is not UTF-8 text ({error}); convert it") from error
+        raise UserError(
+            f"{folder}: the list of recordings is not UTF-8 text ({error}); convert it"
+        ) from error
     except OSError as error:
         raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
     utterances = [_utterance(place, row, errors, inventory) for place, row in chosen]

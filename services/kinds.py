@@ -72,7 +72,7 @@ def available_addresses(settings: Settings) -> dict[str, str]:
                 if not setting.is_default:
                     raise UserError(
                         f"{kind.name}.{key}: another program uses port {port}; set another port, or"
-                        " none to use a free one"
+                        " remove the setting to use a free one"
                     )
             environment[variable(kind.name, key)] = free[variable(kind.name, key)]
     return environment

@@ -168,7 +168,7 @@ class Bus:
             raw.close(linger=0)
             raise UserError(
                 f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
-                "is another system running, or the address not this host's?"
+                "stop any other system, and use an address of this host"
             ) from None
         limited.port = int(raw.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         socket = Socket(

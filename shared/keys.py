@@ -252,7 +252,7 @@ def _parse_grants(path: Path) -> dict[str, Grant]:
         name, *roles = named or [""]
         is_whole = _PUBLIC.fullmatch(public) and _NAME.fullmatch(name)
         if not (is_whole and all(map(_ROLE.fullmatch, roles))):
-            raise UserError(f"{path}: {line!r} is not PUBLIC-KEY NAME ROLE...")
+            raise UserError(f"{path}: {line!r} is not of the form PUBLIC-KEY NAME ROLE...")
         grants[public] = Grant(name, tuple(roles))
     return grants
 
@@ -267,7 +267,7 @@ def _check_number(grants: Grants) -> None:
             )
     if len(grants) > MAX_KEYS:
         raise UserError(
-            f"{len(grants)} keys are too many, the maximum is {MAX_KEYS};"
+            f"there are {len(grants)} keys, but the maximum is {MAX_KEYS};"
             " revoke some with 'kouxing keys revoke'"
         )
     if len(_lines(grants)) > _MAX_ALLOWED_BYTES:

@@ -268,7 +268,7 @@ class Service(MessageLoop):
             return
         bound = [endpoint for endpoint in self.endpoints.values() if endpoint.startswith("tcp://")]
         if not all(is_loopback(split_endpoint(endpoint, "")[0]) for endpoint in bound):
-            LOG.warning("insecure = true: anyone who reaches %s has full access", " ".join(bound))
+            LOG.warning("insecure = true: anyone who can reach %s has full access", " ".join(bound))
 
     # --- control -------------------------------------------------------------------------------
 
@@ -386,7 +386,7 @@ class Service(MessageLoop):
             save_grants(grants)
             self.bus.zap.refresh()
         except UserError as error:
-            LOG.error("the allowed keys apply only until this process ends: %s", error)
+            LOG.error("cannot save the allowed keys; they apply until this process ends: %s", error)
             self.bus.zap.allow(grants)
 
 

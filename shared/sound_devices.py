@@ -121,7 +121,7 @@ def _sound_library() -> ModuleType:
         import sounddevice  # noqa: PLC0415 - fails to import without PortAudio
     except OSError:
         raise UserError(
-            "the microphone needs the PortAudio library; type: sudo apt install libportaudio2"
+            "the microphone needs the PortAudio library: sudo apt install libportaudio2"
         ) from None
     return sounddevice  # type: ignore[no-any-return] # it is untyped
 
@@ -167,4 +167,4 @@ def _choose(name: str, devices: list[SoundDevice]) -> SoundDevice:
         if name.lower() in device.name.lower():
             return device
     names = ", ".join(repr(device.name) for device in devices) or "nothing"
-    raise UserError(f"no device is called {name!r}; this machine has {names}")
+    raise UserError(f"no device is named {name!r}; this machine has {names}")

@@ -77,7 +77,7 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     """Return the error for a file that cannot be written."""
     if isinstance(error, FileNotFoundError):
         return UserError(
-            f"{path}: cannot be written: there is no such folder; first run: mkdir -p {path.parent}"
+            f"{path}: cannot be written: the folder does not exist; run: mkdir -p {path.parent}"
         )
     return UserError(f"{path}: cannot be written: {error.strerror}")
 

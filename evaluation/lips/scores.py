@@ -316,7 +316,9 @@ def clips_to_score(
             not sources or clip.source in sources
         ),
         "no clip is held out; list clips or speakers in held.txt": lambda clip: clip.part == "held",
-        "the parameters were trained on all clips; give others": lambda clip: clip.name not in seen,
+        "the parameters were trained on all clips; use other clips": lambda clip: (
+            clip.name not in seen
+        ),
         "no clip measures lip opening (FAP 4 and 5), mouth width (FAP 6 and 7) or jaw (FAP 3); "
         "add such columns": lambda clip: any(is_measured(clip, name) for name in MEASURES),
     }

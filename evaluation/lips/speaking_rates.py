@@ -93,7 +93,7 @@ def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list
     """Score all methods on the Mandarin clips of a part ("choice" or "held") that are in sync."""
     clips = [clip for clip in read_clips(folder) if clip.part == part and clip.is_in_sync]
     if not clips:
-        raise UserError(f"{folder} has no {part} clips in sync")
+        raise UserError(f"{folder} has no {part} clips with sound in sync; use another folder")
     real = scale_openings([clip.speaker for clip in clips], [clip.faps for clip in clips])
     model = load_live_model()
     return [_score_rate(model, clips, real, rate) for rate in rates]

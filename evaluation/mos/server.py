@@ -118,8 +118,10 @@ async def serve(
     server = WebServer(
         listening,
         endpoint.tls,
-        on_refused=lambda address: LOG.warning("refused a connection of %s: too many", address),
-        on_bad_request=lambda: LOG.warning("dropped a request: it is not HTTP"),
+        on_refused=lambda address: LOG.warning(
+            "refused a connection from %s: it has too many", address
+        ),
+        on_bad_request=lambda: LOG.warning("dropped a request that is not HTTP"),
         address_share=config.address_share,
     )
     await server.start(ListeningTest(study, store).make_application(endpoint.access), ())

@@ -47,7 +47,9 @@ class Store:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._file.close()
-            raise UserError(f"{folder}: another process serves this study") from None
+            raise UserError(
+                f"{folder}: another process is serving this study; stop it first"
+            ) from None
         self._judges: dict[str, int] = {}  # number by token
         self._last_places: dict[int, int] = {}
         for line in _read_lines(path):

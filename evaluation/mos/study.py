@@ -55,7 +55,7 @@ def new_study(
     """
     file = folder / FILE_NAME
     if file.exists():
-        raise UserError(f"{file} exists, with answers that belong to it; use another folder")
+        raise UserError(f"{file} exists, and answers may refer to it; use another folder")
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
     _check_names(conditions, {path.parent.name for path in videos})
     content = {
@@ -97,7 +97,7 @@ def _parse(folder: Path, content: Any) -> Study:
         if not path.is_relative_to(root) or path.suffix.lower() not in SUFFIXES:
             raise UserError(f"{entry['file']}: not a video inside {folder}")
         if not path.is_file():
-            raise UserError(f"{entry['file']}: this video of the study is missing in {folder}")
+            raise UserError(f"{entry['file']}: this video is missing from {folder}; restore it")
         files[str(entry["sentence"]), str(entry["condition"])] = path
     if not files:
         raise UserError(f"{folder} has no videos; name them CONDITION/SENTENCE.mp4")

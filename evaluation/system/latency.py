@@ -109,7 +109,9 @@ def stream(
         while (left_s := start_s + number * CHUNK_S - time.perf_counter()) > 0:
             receive(left_s)
         if not session.try_push(samples[start : start + chunk].astype("<f4").tobytes()):
-            raise UserError("the recognizer does not accept audio; this machine is too busy")
+            raise UserError(
+                "the recognizer does not accept audio; close other programs and try again"
+            )
         sent_s.append(time.perf_counter())
     live_until_s = time.perf_counter()
     session.finish()
@@ -117,7 +119,7 @@ def stream(
     while not output.has_ended:
         receive(1.0)
         if time.perf_counter() > end_s:
-            raise UserError("the last frame did not arrive; this machine is too busy")
+            raise UserError("the last frame did not arrive; close other programs and try again")
     session.close()
     times, to_frame, from_sound = [], [], []
     for media_s, arrival_s in arrived:

@@ -126,7 +126,7 @@ def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
         session.close()
         if seen.is_whole:
             return seen
-    raise UserError("results are missing without any fault; this machine is too busy")
+    raise UserError("frames are missing without any fault; close other programs and try again")
 
 
 class _Speaker:

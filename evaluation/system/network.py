@@ -51,7 +51,7 @@ class Network:
         missing = [tool for tool in TOOLS if shutil.which(tool) is None]
         if missing or os.geteuid() != 0:
             need = f"install {' and '.join(missing)}" if missing else "run it as root"
-            raise UserError(f"virtual hosts need network namespaces of Linux: {need}")
+            raise UserError(f"virtual hosts need Linux network namespaces: {need}")
         self._addresses = {host: f"10.77.{n}.2" for n, host in enumerate(hosts, start=1)}
         self._link = link
         self._name = f"kouxing-{secrets.token_hex(3)}"
@@ -139,7 +139,7 @@ class Network:
         end_s = time.monotonic() + _READY_S
         while DELAY_DEVICE not in self._on_router("ip", "-brief", "link", "show", "up"):
             if time.monotonic() > end_s or self._delayer.poll() is not None:
-                raise UserError("packets cannot be delayed; is there /dev/net/tun?")
+                raise UserError("cannot delay packets; check that /dev/net/tun exists")
             time.sleep(0.02)
         self._on_router("ip", "route", "add", "default", "dev", DELAY_DEVICE, "table", "77")
         for host in self._addresses:

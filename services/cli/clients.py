@@ -69,7 +69,7 @@ def speak(
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
-        raise UserError("--device is for mic and monitor: kouxing speak mic --device NAME")
+        raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
     if source == "mic":
         audio = microphone(device)
     elif source == "monitor":

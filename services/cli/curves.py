@@ -48,7 +48,7 @@ class CurveExporter(ABC):
                 " .csv or .jsonl"
             )
         if len(options.lips) > 1:
-            raise UserError("curves are of one face; give --lips only once")
+            raise UserError("a curve file holds one face; give --lips only once")
         if not output.parent.is_dir():
             raise cannot_write(output, FileNotFoundError())
         self._output = output

@@ -41,7 +41,7 @@ class VideoExporter:
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
         if options.at_s is not None:
-            raise UserError("--at selects one picture; give the name of a picture (.png)")
+            raise UserError("--at selects one picture; write a .png file")
         check_name(output)
         self._output = output
         self._rate_hz = options.rate_hz
@@ -107,11 +107,11 @@ def open_exporter(output: Path, options: ExportOptions) -> Exporter:
 def _make_renderer(output: Path, options: ExportOptions) -> Renderer | SideBySide:
     """Return a renderer that draws a face for each lip model, side by side."""
     if options.form is not CurveForm.FAPS:
-        raise UserError(f"--as {options.form} is for curves; write .csv, .jsonl or .glb")
+        raise UserError(f"--as {options.form} applies to curves; write .csv, .jsonl or .glb")
     num_faces = len(options.lips)
     width_px, height_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
     if width_px % num_faces:
-        raise UserError(f"--size {options.size}: choose a width that {num_faces} divides")
+        raise UserError(f"--size {options.size}: choose a width that is a multiple of {num_faces}")
     background = scene.background(options.background)
     if background is None and output.suffix == ".mp4":
         raise UserError("MP4 has no transparency; write .mov, .webm or pictures (.png)")

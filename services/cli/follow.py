@@ -41,7 +41,7 @@ def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, con
     if control does not answer, or the file cannot be written.
     """
     if shown is not Shown.FAPS and (output is not None or form is not CurveForm.FAPS):
-        raise UserError(f"--show {shown} only prints; --output and --as are for frames")
+        raise UserError(f"--show {shown} cannot be combined with --output or --as")
     exporter = None if output is None else _open_exporter(output, form)
     with connect(control) as client:
         followed = _wait_for_session(session, client)

@@ -47,7 +47,7 @@ def read_text(text: str, inventory: PhoneInventory) -> Transcript:
         words = ", ".join(repr(word) for word in transcript.dropped)
         print_message(f"ignored in the text: {words}; write them as they are spoken, in characters")
     if not transcript.syllables:
-        raise UserError("the text is empty; give the words that are spoken")
+        raise UserError("the text is empty; give the spoken words")
     return transcript
 
 
@@ -68,7 +68,7 @@ def text_of(text: str) -> str:
         path = Path(text)
         if not path.is_file():
             if path.suffix.lower() == ".txt":
-                raise UserError(f"{path}: there is no such file")
+                raise UserError(f"{path}: no such file")
             return text
     except (OSError, ValueError):  # too long for a file name
         return text

@@ -92,9 +92,9 @@ def draw_mouth(
     if write is None:
         raise UserError(f"{output}: give a name that ends in {', '.join(_WRITERS)}")
     if text is not None and speech_to_text is not None:
-        raise UserError("give either a text or --speech-to-text")
+        raise UserError("give either a text or --speech-to-text, not both")
     if text is None and speech_to_text is None and timing is not None:
-        raise UserError("--timing is for a text; give the spoken text before the output file")
+        raise UserError("--timing needs a text; give the spoken text before the output file")
     check_output(output)
     samples = read_mono_16k(source)
     inventory = load_inventory()

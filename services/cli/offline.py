@@ -113,14 +113,14 @@ def render(
     from kouxing.services.cli.exporters import open_exporter
 
     if live and text is not None:
-        raise UserError("--live does not know a text in advance; use either --live or --text")
+        raise UserError("a live stream has no text in advance; use either --live or --text")
     if is_fap(source):
         _check_no_sound_options(
             source, lips=lips, live=live or None, text=text, mouth=mouth,
             expressiveness=expressiveness,
         )  # fmt: skip
     elif sound is not None:
-        raise UserError(f"--sound is for a .fap file; {source} has its own sound")
+        raise UserError(f"--sound applies to .fap files; {source} has its own sound")
     models = tuple(lips or [DEFAULT_LIP_MODEL])
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
@@ -136,7 +136,7 @@ def render(
                 expressiveness=expressiveness,
             )  # fmt: skip
         if not motion.frames:
-            raise UserError(f"{source}: the file has no frames")
+            raise UserError(f"{source}: the file contains no frames; export it again")
         count = exporter.export(motion, progress)
     if motion.num_phones == 0:
         print_message(f"{source}: no speech was found; the mouth stays closed")
@@ -147,7 +147,7 @@ def render(
 def _check_no_sound_options(source: Path, **options: object) -> None:
     for name, value in options.items():
         if value is not None:
-            raise UserError(f"--{name} is for a sound; {source} already contains the lip motion")
+            raise UserError(f"--{name} applies to sound; {source} already contains the lip motion")
 
 
 def _plural(count: int, noun: str) -> str:

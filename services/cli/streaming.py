@@ -166,7 +166,7 @@ class _Streaming:
         for error in errors:
             self._warn(str(error))
             if error.code in ("unknown-session", "bad-token", "finished"):
-                raise UserError("the session was lost; speak again to open a new one")
+                raise UserError("the session was lost; run the command again")
         for event in self._events.available():
             if event.name == "error":
                 self._warn(event.detail)
@@ -179,7 +179,7 @@ class _Streaming:
             while True:
                 drawn_s = self._drawn_s(DRIVER_TIMEOUT_S)
                 if drawn_s < newest_s:
-                    raise UserError("the driver restarted, so there is no video; speak again")
+                    raise UserError("the driver restarted, so no video was written; try again")
                 newest_s = drawn_s
                 progress.update(task, completed=drawn_s - drawn_before_s)
                 for event in self._events.available(STATUS_S):
@@ -198,7 +198,7 @@ class _Streaming:
             if drivers:
                 return max(state.metrics.get("video_ms", 0.0) for state in drivers) / 1000
             if time.monotonic() >= end_s:
-                raise UserError("no driver runs, so there is no video; start one: kouxing driver")
+                raise UserError("no driver is running to write the video; start 'kouxing driver'")
             time.sleep(STATUS_S)
 
     def _warn(self, text: str) -> None:

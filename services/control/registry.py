@@ -90,7 +90,9 @@ class Registry:
         if record is None:
             is_full = len(self._services) >= MAX_SERVICES
             if is_full or self._num_per_key[peer.key] >= MAX_SERVICES_PER_KEY:
-                raise Refusal(ErrorCode.TOO_MANY_SERVICES, "too many services are registered")
+                raise Refusal(
+                    ErrorCode.TOO_MANY_SERVICES, "too many services are registered; stop some"
+                )
         elif record.peer.key != peer.key:
             text = f"{heartbeat.instance} is registered with another key"
             raise Refusal(ErrorCode.NOT_ALLOWED, text)
@@ -268,5 +270,5 @@ def _check_endpoints(heartbeat: Heartbeat) -> None:
         except UserError as error:
             raise Refusal(ErrorCode.BAD_MESSAGE, str(error)) from None
         if "*" in (host, port):
-            text = f"{name}: {endpoint!r} has no host or port to connect to"
+            text = f"{name}: {endpoint!r} does not name a host and port to connect to"
             raise Refusal(ErrorCode.BAD_MESSAGE, text)

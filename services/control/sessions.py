@@ -53,7 +53,7 @@ class Sessions:
         """Return a session; raise ``Refusal`` if there is no such session."""
         record = self._records.get(name)
         if record is None:
-            text = f"there is no session {name!r}; open it first"
+            text = f"session {name!r} does not exist; open it first"
             raise Refusal(ErrorCode.UNKNOWN_SESSION, text)
         return record
 
@@ -64,7 +64,7 @@ class Sessions:
         """
         record = self.find(name)
         if not secrets.compare_digest(record.token.encode(), token.encode()):
-            raise Refusal(ErrorCode.BAD_TOKEN, f"the token is not that of session {name!r}")
+            raise Refusal(ErrorCode.BAD_TOKEN, f"the token does not belong to session {name!r}")
         return record
 
     def opened_by(self, opening: OpenSession, client: Peer) -> SessionRecord | None:
@@ -110,11 +110,11 @@ class Sessions:
             text = f"session {name!r} is open; choose another name"
             raise Refusal(ErrorCode.SESSION_EXISTS, text)
         if len(self._records) >= self._max_sessions:
-            text = f"{self._max_sessions} sessions are open; the limit is control.max_sessions"
+            text = f"{self._max_sessions} sessions are open, the limit of control.max_sessions"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         num_of_key = self._num_per_key[client.key]
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
-            text = f"{num_of_key} sessions of your key are open; the rest is for other keys"
+            text = f"your key has {num_of_key} open sessions, its maximum; close some first"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         workers = self._placement.place({}, now_s, may_refuse=opening.paced)
         facts = self._registry.facts(workers.values())

@@ -114,7 +114,7 @@ class DriverService(Service):
     def on_shutdown(self) -> None:
         """Save the unfinished part of the remaining videos."""
         for session in self._recordings.close_early():
-            LOG.warning("the video ends early: no time to finish it", extra={"session": session})
+            LOG.warning("the driver stopped, so the video ends early", extra={"session": session})
         self.view.close()
 
     def session_inputs(self) -> dict[str, SessionInput]:
@@ -165,7 +165,7 @@ class DriverService(Service):
         is_stalled = self.poses.is_stalled(now_s)
         if is_stalled and not self._was_stalled:
             LOG.warning(
-                "no FAP frames for %g s: the face fades to rest",
+                "no FAP frames for %g s: the face returns to rest",
                 STALL_S,
                 extra={"session": self.poses.shown},
             )

@@ -101,5 +101,5 @@ class View:
         except UserError as error:
             if config.view == "window":
                 raise
-            LOG.warning("no window: %s", error)
+            LOG.warning("cannot open a window: %s", error)
             return None

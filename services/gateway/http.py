@@ -198,7 +198,7 @@ def _page_head(name: str) -> Path:
         with contextlib.suppress(web.HTTPNotFound):
             return _find(folder, file, {".glb"})
     folder = page_heads_folder()
-    text = f"there is no head {file}; create all heads with 'kouxing head export --all {folder}'\n"
+    text = f"head {file} is missing; create all heads with 'kouxing head export --all {folder}'\n"
     raise web.HTTPNotFound(text=text)
 
 

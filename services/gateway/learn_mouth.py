@@ -79,7 +79,9 @@ class MouthLearner:
             while not exchange.done():
                 await asyncio.wait({exchange}, timeout=PRESENCE_CHECK_S)
                 if asyncio.get_running_loop().time() > deadline_s:
-                    raise UserError(f"learning took longer than {LEARNING_LIMIT_S:g} s")
+                    raise UserError(
+                        f"learning took longer than {LEARNING_LIMIT_S:g} s; try again later"
+                    )
                 if request.transport is None:
                     raise UserError("the browser has disconnected")
         finally:

@@ -191,7 +191,7 @@ class Viewers:
                 self._sample = viewer.chosen = self._play_sample(lips or "")
             elif lips:
                 if not self._sample or viewer.chosen != self._sample:
-                    raise UserError("a viewer can choose the lips of the sample sentence only")
+                    raise UserError("a viewer can choose lips only for the sample sentence")
                 self._choose_sample_lips(lips)
             elif settings is not None:
                 if viewer.shown is None:

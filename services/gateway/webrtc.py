@@ -63,7 +63,7 @@ class Peer:
                 transceiver.direction = "recvonly" if is_sound else "inactive"
             await self._connection.setLocalDescription(await self._connection.createAnswer())
         except Exception as error:  # aiortc raises various types for malformed lines
-            raise UserError(f"expected an SDP offer that can be answered: {error}") from None
+            raise UserError(f"cannot answer this SDP offer: {error}") from None
         if self._track is None or not _OPUS.search(offer):
             raise UserError("expected an offer with an audio track in Opus (opus/48000/2)")
         return self._connection.localDescription.sdp

@@ -142,7 +142,7 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
         settings["lips"] = lips
     if expressions is not None:
         if not isinstance(expressions, dict):
-            raise UserError("express must be an object of strengths by name")
+            raise UserError("express must be an object that maps names to strengths")
         check_expressions(expressions, hold_s)
         settings.update(expressions=expressions, hold_s=hold_s)
     if (amount := fields.get("expressiveness")) is not None:

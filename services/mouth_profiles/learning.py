@@ -149,8 +149,8 @@ def fit_profile(observations: Observations) -> MouthProfile:
     speech_s = len(usable) * POSITION_S
     if speech_s < MIN_SPEECH_S:
         raise UserError(
-            f"there are {speech_s:.0f} s of speech with lips in view; film "
-            f"{MIN_SPEECH_S:.0f} s or more, better a minute"
+            f"only {speech_s:.0f} s of speech show the lips; film "
+            f"{MIN_SPEECH_S:.0f} s or more, preferably a minute"
         )
     block = np.arange(len(usable)) // _BLOCK
     fold_of = block % min(_MAX_FOLDS, block[-1] + 1)

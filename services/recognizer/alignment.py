@@ -100,8 +100,8 @@ def align_syllables(
         path, _ = viterbi_path(on_graph, graph, topology.log_stay, topology.log_leave)
     if len(path) == 0:
         raise UserError(
-            f"{len(frames) * HOP_S:.2f} s of audio are too short for "
-            f"{sum(map(len, syllables))} phones; check that the text belongs to the recording"
+            f"{len(frames) * HOP_S:.2f} s of audio is too short for "
+            f"{sum(map(len, syllables))} phones; check that the text matches the recording"
         )
     best_of_phones = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
     phones: list[Phone] = []

@@ -80,8 +80,8 @@ class RecognizerService(Service):
         self._lips = lips or lip_predictor_for(model)
         if self._lips is None:
             LOG.warning(
-                "this acoustic model has no lip predictor, so the learnt lips move with dynamic "
-                "visemes; set synthesizer.lips = dynamic-visemes to get their own delay"
+                "this acoustic model has no lip predictor, so the lip model learnt uses dynamic "
+                "visemes; set synthesizer.lips = dynamic-visemes to use their delay too"
             )
         self._recognizer.warm_up()
         for socket in (self._audio, self._unpaced_audio):
@@ -180,7 +180,7 @@ class RecognizerService(Service):
             blocked.add(session.start.paced)
             session.overdue_since_s = session.overdue_since_s or now_s
             if now_s - session.overdue_since_s > MAX_OVERDUE_S:
-                text = "the synthesizer does not acknowledge phones; they are dropped"
+                text = "dropped phones that the synthesizer does not acknowledge"
                 self.warn("no-link", text, session.name)
                 session.link.disconnect()
         self._is_live_blocked, self._is_unpaced_blocked = True in blocked, False in blocked
@@ -236,7 +236,7 @@ class RecognizerService(Service):
         session = self._sessions.get(message.session)
         try:
             if session is None:
-                text = f"session {message.session!r} is not here; open it at control"
+                text = f"session {message.session!r} is not open here; open it at control"
                 raise AudioRejected(ErrorCode.UNKNOWN_SESSION, text)
             session.check_sender(message, socket)
         except AudioRejected as rejection:

@@ -105,7 +105,7 @@ class RecognizerSession:
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``AudioRejected`` if the sender may not send this message here."""
         if not secrets.compare_digest(self.start.token.encode(), message.token.encode()):
-            text = f"the token is not that of session {self.name!r}"
+            text = f"the token does not belong to session {self.name!r}"
             raise AudioRejected(ErrorCode.BAD_TOKEN, text)
         if socket is not self.socket:
             text = f"send the audio of session {self.name!r} to the endpoint in session-opened"

@@ -143,7 +143,7 @@ def test_webrtc_streams_sound_and_returns_frames(
         ("{}", "application/json", 415, "expected an SDP offer (application/sdp)"),
         ("hello", SDP, 422, "expected"),
         ("v=0\r\n", SDP, 422, "an audio track in Opus"),
-        ("v=0\r\nm=audio x", SDP, 422, "expected an SDP offer"),
+        ("v=0\r\nm=audio x", SDP, 422, "cannot answer this SDP offer"),
         (b"\xff\xfe", SDP, 422, "expected"),
     ],
 )

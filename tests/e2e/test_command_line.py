@@ -172,7 +172,7 @@ def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> Non
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
         (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "this format holds faps"),
-        (["listen", "heard", "--show", "phones", "--as", "vrm"], "--as are for frames"),
+        (["listen", "heard", "--show", "phones", "--as", "vrm"], "cannot be combined"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["speak", SENTENCE, "--session", "two words"], "letters, digits"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),

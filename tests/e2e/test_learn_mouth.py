@@ -113,7 +113,7 @@ def test_learns_keeps_uses_and_forgets_a_mouth(system: System, browser: Browser)
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
     )
     read_aloud(browser)
-    assert "of speech with lips in view; film 10 s or more" in text_of(browser, "lesson-problem")
+    assert "of speech show the lips; film 10 s or more" in text_of(browser, "lesson-problem")
 
     recording = browser.evaluate(
         "recording.bytes().then((bytes) =>"

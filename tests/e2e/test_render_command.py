@@ -122,7 +122,7 @@ def test_renders_a_sound_as_curves_and_converts_them(tmp_path: Path) -> None:
     frames = [json.loads(line) for line in lines.read_text().splitlines()]
     jaw = [frame["arkit"]["jawOpen"] for frame in frames]
     assert np.corrcoef(jaw, faps.faps[:, 2])[0, 1] > 0.8
-    with pytest.raises(UserError, match="--live does not know"):
+    with pytest.raises(UserError, match="a live stream has no text"):
         render(SENTENCE, lines, live=True, text="啊")
 
 
@@ -155,7 +155,7 @@ def test_renders_lip_models_side_by_side(tmp_path: Path) -> None:
     np.testing.assert_array_equal(learnt[:140], default[:140])
     assert np.abs(visemes - learnt)[:140].max() > 40
     assert default[140:].min(axis=2).max() < 200 < learnt[140:].min(axis=2).max(), "a caption"
-    with pytest.raises(UserError, match="choose a width that 2 divides"):
+    with pytest.raises(UserError, match="choose a width that is a multiple of 2"):
         render(SENTENCE, both, lips=lips, size="401x160", **shot)
 
 

@@ -337,7 +337,7 @@ async def test_microphone_and_sample_choose_their_lips(
             "lips must be the name of a lip model" in (await receive_json(viewer, "error"))["text"]
         )
         await viewer.send_json({"lips": "learnt"})
-        assert "of the sample sentence only" in (await receive_json(viewer, "error"))["text"]
+        assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lips": "learnt"})
         await until(lambda: len(system.chosen) == 3)
         await receive_json(viewer, "session", sample=True)

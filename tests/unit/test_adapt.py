@@ -101,7 +101,7 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="a face was found in only 0 images"):
         run(track_app, video, "-o", tmp_path / "me")
     write_video(video, [picture("woman_rest")] * 3, sound=False)
-    with pytest.raises(UserError, match="needs images and audio"):
+    with pytest.raises(UserError, match="must have images and audio"):
         run(track_app, video, "-o", tmp_path / "me")
     video.write_bytes(b"no video")
     with pytest.raises(UserError, match="cannot read the video"):

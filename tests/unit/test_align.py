@@ -122,7 +122,7 @@ def test_rejects_a_text_that_does_not_fit(
 
 
 def test_rejects_a_missing_text_file() -> None:
-    with pytest.raises(UserError, match=r"nowhere\.txt: there is no such file"):
+    with pytest.raises(UserError, match=r"nowhere\.txt: no such file"):
         align(DEMO / "hello-female.wav", "nowhere.txt")
 
 

@@ -227,5 +227,5 @@ def test_trains_and_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_needs_a_neural_model_to_start_from(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="is not a neural model; give one that"):
+    with pytest.raises(UserError, match="is not a neural model; give one from"):
         train_blocks([], tmp_path / "b.npz", whisper=tmp_path, start=model_path("gmm"))

@@ -83,10 +83,10 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
     [
         ("a.fap", {"form": CurveForm.ARKIT}, "holds faps; for arkit, write .csv"),
         ("a.glb", {"form": CurveForm.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
-        ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "curves are of one face"),
+        ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "a curve file holds one face"),
         ("no/a.csv", {}, "cannot be written"),
         ("no/a.mp4", {}, "cannot write"),
-        ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit is for curves"),
+        ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit applies to curves"),
         ("a.mp4", {"background": "transparent"}, "MP4 has no transparency"),
         ("a.mp4", {"background": "mud"}, "write studio, transparent"),
         ("a.mp4", {"at_s": 0.1}, "--at selects one picture"),

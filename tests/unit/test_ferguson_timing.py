@@ -115,7 +115,7 @@ def test_more_and_fewer_segments_than_syllables() -> None:
 
 def test_rejects_text_that_cannot_be_timed() -> None:
     silent = progress_of(speech([("-", 1.0)]))
-    with pytest.raises(UserError, match="found no speech"):
+    with pytest.raises(UserError, match="no speech was found"):
         time_text(silent, [("a",)], TABLE)
     with pytest.raises(UserError, match="the text is empty"):
         time_text(silent, [], TABLE)

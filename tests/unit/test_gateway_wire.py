@@ -98,7 +98,7 @@ def test_parses_face_settings() -> None:
         ({"express": {"glee": 0.5}}, "glee"),
         ({"express": {"joy": 2}}, "joy: strength 2"),
         ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
-        ({"express": "joy"}, "strengths by name"),
+        ({"express": "joy"}, "names to strengths"),
         ({"expressiveness": 3}, "expressiveness is 3"),
         ({"lips": "no name"}, "lips must be the name"),
     ],

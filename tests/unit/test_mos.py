@@ -109,7 +109,7 @@ def test_creates_a_study_from_folders(folder: Path) -> None:
     study = new_study(folder, title="头", reference="real", anchor="still")
     assert study == load_study(folder)
     assert (study.sentences, set(study.conditions)) == (SENTENCES, set(CONDITIONS))
-    with pytest.raises(UserError, match="exists, with answers"):
+    with pytest.raises(UserError, match="exists, and answers"):
         new_study(folder)
 
 

@@ -92,7 +92,7 @@ def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
     ("text", "output", "timing", "message"),
     [
         (TEXT, "mouth.gif", None, "ends in .svg, .png, .mp4, .csv"),
-        (None, "mouth.svg", Timing.ALIGN, "--timing is for a text"),
+        (None, "mouth.svg", Timing.ALIGN, "--timing needs a text"),
         ("", "mouth.svg", None, "text is empty"),
     ],
 )

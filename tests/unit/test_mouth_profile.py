@@ -150,7 +150,7 @@ def test_measures_the_gain_on_held_out_speech() -> None:
 
 @pytest.mark.parametrize("num_positions", [0, 499])
 def test_rejects_too_little_speech(num_positions: int) -> None:
-    with pytest.raises(UserError, match="s of speech with lips in view"):
+    with pytest.raises(UserError, match="s of speech show the lips"):
         fit_profile(observations(num_positions, PROFILE))
 
 

@@ -61,7 +61,7 @@ def test_lists_devices(server: Path) -> None:
 
 def test_rejects_an_unknown_name_and_lists_the_devices(server: Path) -> None:
     with pytest.raises(
-        UserError, match="no device is called 'vlc'; this machine has 'HDMI', 'Firefox'"
+        UserError, match="no device is named 'vlc'; this machine has 'HDMI', 'Firefox'"
     ):
         monitor("vlc")
 

@@ -173,7 +173,7 @@ def train_blocks(
     start = start or NEURAL_PATH
     before = load_model(start)
     if not isinstance(before, NeuralModel):
-        raise UserError(f"{start} is not a neural model; give one that 'kouxing train neural' made")
+        raise UserError(f"{start} is not a neural model; give one from 'kouxing train neural'")
     torch.set_num_threads(1)  # the same sums on every machine
     torch.manual_seed(seed)
     whole = init_encoder(whisper, before.topology.num_states).eval()

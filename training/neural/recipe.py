@@ -130,7 +130,7 @@ def train_neural(
     before = load_model(start) if start else None
     first = load_model(aligner) if aligner else before
     if first is None:
-        raise UserError("no model aligns the recordings; give --aligner or --start-from")
+        raise UserError("no model can align the recordings; give --aligner or --start-from")
     inventory = first.inventory
     network = init_network(whisper, before, inventory, all_look_aheads(look_ahead_ms))
     encoder = init_encoder(whisper, network.shape.num_states) if whisper else None

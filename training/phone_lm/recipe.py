@@ -229,9 +229,7 @@ def train_phone_lm(
     if len(corpus_stream):
         streams += [corpus_stream] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus_stream)))
     if not num_text + len(corpus_stream):
-        raise UserError(
-            "there is no text to count; give --text, --ngrams or a corpus with sentences"
-        )
+        raise UserError("no text to count; give --text, --ngrams or a corpus with sentences")
     report(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
     phone_lm = estimate_phone_lm(streams, inventory, order=order, max_ngrams=max_ngrams)
     write_archive(output, phone_lm_arrays(phone_lm))

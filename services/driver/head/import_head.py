@@ -184,7 +184,7 @@ class _Import:
         a, b, c = triangles.T
         self._triangles: Index = triangles[(a != b) & (b != c) & (c != a)]
         if not len(self._triangles):
-            raise UserError(f"{self._mesh} has no faces with an area")
+            raise UserError(f"all faces of {self._mesh} have zero area; export the mesh again")
         edges = np.concatenate([self._triangles[:, [0, 1]], self._triangles[:, [1, 2]]])
         graph = sparse.coo_array((np.ones(len(edges)), edges.T), (count, count))
         _, self._component = csgraph.connected_components(graph, directed=False)

@@ -104,7 +104,7 @@ def syllable_times(
     """
     segments = segment_speech(slices)
     if not segments:
-        raise UserError("found no speech; check that text and recording belong together")
+        raise UserError("no speech was found; check that the text matches the recording")
     text = _Text(
         duration_s=np.array(
             [sum(table.duration_s[phone] for phone in phones) for phones in syllables]
