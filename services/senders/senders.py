@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 import time
 from collections import deque
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from kouxing.services.senders.connection import Connection
 from kouxing.services.senders.face_frame import FaceFrame
-from kouxing.services.senders.playout_clock import PlayoutClock
 from kouxing.services.senders.protocols import connect
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
@@ -24,6 +24,8 @@ from kouxing.shared.face.idle_motion import FADE_S, RESTING_RATE_HZ, STALL_S, Re
 
 MAX_SENDERS = 16
 RATE_WINDOW_S = 2.0
+WINDOW_S = 2.0  # period in which the smallest network delay counts
+PAUSE_S = 0.5  # a frame that is this much later than the others follows a pause
 MAX_COUNTED = 1000  # frames in the window
 
 Faps = NDArray[np.float32]
@@ -50,6 +52,37 @@ class _Sender:
     timer: asyncio.TimerHandle | None = None
     sent_s: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_COUNTED))
     reported: str = ""
+
+
+class PlayoutClock:
+    """Removes network jitter from frame times.
+
+    The frame with the smallest network delay defines when every other frame could have arrived at
+    the earliest. A frame is due at that time plus the target's delay. Without a delay it is due on
+    arrival; a delay above the jitter removes the jitter. Clocks drift, so only recent frames count.
+    The delay is measured again when media time stops, goes back or is late.
+    """
+
+    def __init__(self) -> None:
+        self._time_s = -math.inf  # of the newest frame
+        self._window_end_s = -math.inf
+        self._shortest_s = self._previous_shortest_s = math.inf  # of this window and the last one
+
+    def earliest_s(self, time_s: float, now_s: float) -> float:
+        """Return the earliest time at which a frame that has just arrived could have arrived.
+
+        ``time_s`` is its media time. ``now_s`` and the result are times of a monotonic clock.
+        """
+        delay_s = now_s - time_s
+        shortest_s = min(self._shortest_s, self._previous_shortest_s)
+        if time_s <= self._time_s or delay_s > shortest_s + PAUSE_S:
+            self._shortest_s, self._window_end_s = math.inf, -math.inf
+        if now_s > self._window_end_s:
+            self._previous_shortest_s, self._shortest_s = self._shortest_s, math.inf
+            self._window_end_s = now_s + WINDOW_S
+        self._time_s = time_s
+        self._shortest_s = min(self._shortest_s, delay_s)
+        return time_s + min(self._shortest_s, self._previous_shortest_s)
 
 
 class Senders:

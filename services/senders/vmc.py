@@ -15,9 +15,10 @@ Therefore head rotation is off unless ``head=on``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import ClassVar
+
+from scipy.spatial.transform import Rotation
 
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
 from kouxing.services.senders.face_frame import Angles, FaceFrame
@@ -60,13 +61,6 @@ class VmcConnection(DatagramConnection):
 
 def _quaternion(angles: Angles) -> tuple[float, float, float, float]:
     """Return x, y, z, w of yaw * pitch * roll in Unity's axes."""
-    pitch, yaw, roll = (angle / 2 for angle in angles)
-    cp, sp, cy, sy, cr, sr = (
-        part for angle in (pitch, -yaw, -roll) for part in (math.cos(angle), math.sin(angle))
-    )
-    return (
-        cy * sp * cr + sy * cp * sr,
-        sy * cp * cr - cy * sp * sr,
-        cy * cp * sr - sy * sp * cr,
-        cy * cp * cr + sy * sp * sr,
-    )
+    pitch, yaw, roll = angles
+    x, y, z, w = Rotation.from_euler("YXZ", [-yaw, pitch, -roll]).as_quat().tolist()
+    return x, y, z, w

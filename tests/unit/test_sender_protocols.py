@@ -10,8 +10,8 @@ import pytest
 
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
-from kouxing.services.senders.playout_clock import PAUSE_S, WINDOW_S, PlayoutClock
 from kouxing.services.senders.protocols import connect, parse_target
+from kouxing.services.senders.senders import PAUSE_S, WINDOW_S, PlayoutClock
 from kouxing.services.senders.vtube_studio import Denied, Dialogue, tracking_parameters
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS

@@ -30,6 +30,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.head.shading import Shading
@@ -149,12 +150,8 @@ class Head:
 
 def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
     """Return the matrix (3, 3) of yaw (left), pitch (down) and roll (right)."""
-    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    cr, sr = np.cos(roll), np.sin(roll)
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
-    about_z = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
-    return np.asarray(about_y @ about_x @ about_z, dtype=np.float32)
+    rotation = Rotation.from_euler("YXZ", [yaw, pitch, roll])
+    return np.asarray(rotation.as_matrix(), dtype=np.float32)
 
 
 def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine") -> Head:
