@@ -119,7 +119,7 @@ async def serve(
         listening,
         endpoint.tls,
         on_refused=lambda address: LOG.warning(
-            "refused a connection from %s: it has too many", address
+            "refused a connection from %s: too many are open", address
         ),
         on_bad_request=lambda: LOG.warning("dropped a request that is not HTTP"),
         address_share=config.address_share,

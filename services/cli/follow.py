@@ -81,7 +81,9 @@ def _wait_for_session(name: str, client: Client) -> Session:
         if not is_waiting:
             wanted = f"session {name}" if name else "a session"
             opener = f"speak my.wav --session {name}" if name else "speak my.wav"
-            print_message(f"waiting for {wanted} to open, as with kouxing {opener}; Ctrl-C ends")
+            print_message(
+                f"waiting for {wanted} to open, as with kouxing {opener}; press Ctrl-C to stop"
+            )
             is_waiting = True
         time.sleep(OPEN_POLL_S)
 

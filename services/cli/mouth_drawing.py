@@ -154,7 +154,7 @@ def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
     shows_text = not are_pixels or drawing.can_draw("".join(texts))
     if not shows_text:
         print_message(
-            "labels are only pinyin: no font with Chinese characters was found (Debian: install"
+            "labels show only pinyin: no font with Chinese characters was found (Debian: install"
             " fonts-noto-cjk)"
         )
     return [

@@ -35,7 +35,7 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
         client.status()
         for target in targets:
             senders.start(target)
-            print_message(f"sending {target.contents} to {target.url}; Ctrl-C ends")
+            print_message(f"sending {target.contents} to {target.url}; press Ctrl-C to stop")
         with _Search(session, client) as search:
             _send_frames(search, client, senders)
 
@@ -101,4 +101,4 @@ def _is_another(session: SessionState, before: SessionState) -> bool:
 
 
 def _report(url: str, problem: str) -> None:
-    print_message(f"{url}: {problem or 'frames leave again'}")
+    print_message(f"{url}: {problem or 'sending frames again'}")

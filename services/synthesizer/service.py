@@ -290,9 +290,9 @@ class SynthesizerService(Service):
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
-            self.warn("unknown-session", "phones of an unknown session", message.session)
+            self.warn("unknown-session", "dropped phones of an unknown session", message.session)
         elif sender.key != key_of(session.start.endpoints.get("phones", "")):
-            self.warn("foreign", "phones from a different recognizer", message.session)
+            self.warn("foreign", "dropped phones of another recognizer", message.session)
         elif message.epoch != session.start.epoch:  # resent until both ends have the epoch
             self.metrics.count("other_epoch")
         elif len(session.queue) >= MAX_QUEUED:
