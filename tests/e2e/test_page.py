@@ -512,9 +512,8 @@ def test_a_dropped_file_is_streamed(
 def test_a_file_without_sound_is_refused(page: Browser, tmp_path: Path) -> None:
     (tmp_path / "not.wav").write_text("no sound")
     choose_file(page, tmp_path / "not.wav")
-    page.wait_for(
-        "document.getElementById('notice').textContent.includes('cannot decode the sound of not.wav')"
-    )
+    notice = "document.getElementById('notice').textContent"
+    page.wait_for(f"{notice}.includes('cannot decode the sound of not.wav')")
     assert not page.evaluate("window.kouxing.state.microphone")
 
 
