@@ -1,7 +1,7 @@
 // A listening test: one video after another, with two scores each. The server decides what comes
 // next, so a reload continues where the judge was.
 
-import { languageFor, say, setLanguage } from "./language.js";
+import { languageFor } from "./language.js";
 
 // The five grades of ITU-T P.910 (absolute category rating), best first.
 const GRADES = [
@@ -58,8 +58,14 @@ function setDisabled(isDisabled) {
   for (const scale of scales) scale.disabled = isDisabled;
 }
 
+/** Return the text in the page's language, "en" or "zh". */
+function say(texts) {
+  return texts[document.documentElement.lang];
+}
+
 function chooseLanguage(language) {
-  setLanguage(language);
+  document.documentElement.lang = language;
+  element("progress").ariaLabel = say({ en: "rated videos", zh: "已评视频" });
   element("language").textContent = say({ en: "中文", zh: "English" });
 }
 
