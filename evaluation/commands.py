@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
 from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+
+if TYPE_CHECKING:
+    from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+    from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 
 
 class BenchGroup(TyperGroup):
@@ -46,6 +51,10 @@ Split = Annotated[str, typer.Option(help="Split of the corpus.")]
 Acoustic = Annotated[
     list[str] | None, typer.Option(help="Model: neural, blocks, gmm or a file; repeatable.")
 ]
+LookAhead = Annotated[
+    list[float] | None,
+    typer.Option("--look-ahead-ms", help="Look-ahead, for models with a choice; repeatable."),
+]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
 Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
@@ -57,10 +66,7 @@ def recognizer(
     audio: AudioFolder = None,
     split: Split = "test",
     acoustic: Acoustic = None,
-    look_ahead: Annotated[
-        list[float] | None,
-        typer.Option("--look-ahead-ms", help="Look-ahead, for models with a choice; repeatable."),
-    ] = None,
+    look_ahead: LookAhead = None,
     confusions: Annotated[
         Path | None, typer.Option(help="Plot the phone confusions of the last model (.png).")
     ] = None,
@@ -74,24 +80,62 @@ def recognizer(
         draw_delay_curve,
         print_figures,
     )
-    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
-    from kouxing.services.recognizer.config import RecognizerConfig
 
     check_output(confusions, curve, json_file)
-    results = {}
-    for name in acoustic or [DEFAULT_MODEL]:
-        defaults = RecognizerConfig(acoustic=name)
-        for look_ahead_ms in look_ahead or [defaults.look_ahead_ms]:
-            model = load_live_model(name, look_ahead_ms=look_ahead_ms)
-            title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_ahead else name
-            figures = evaluate_recognizer(model, manifest, split, defaults.output_rule, audio=audio)
-            results[title] = {"acoustic": name, **figures}
+    results = {
+        title: {
+            "acoustic": name,
+            **evaluate_recognizer(model, manifest, split, rule, audio=audio),
+        }
+        for title, name, model, rule in _models(acoustic, look_ahead)
+    }
     print_figures(results, Console())
     write_json(json_file, results)
     if confusions is not None:
         draw_confusions(list(results.values())[-1], confusions)
     if curve is not None:
         draw_delay_curve(list(results.values()), curve)
+
+
+@app.command()
+def robustness(
+    manifest: Manifest,
+    audio: AudioFolder = None,
+    split: Split = "test",
+    acoustic: Acoustic = None,
+    look_ahead: LookAhead = None,
+    other_language: Annotated[
+        Path | None, typer.Option(help="Folder of recordings in another language.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure errors in disturbed speech, and phones recognized in sounds without speech."""
+    from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+
+    check_output(json_file)
+    results = {
+        title: evaluate_robustness(
+            model, manifest, split, rule, audio=audio, other_language=other_language
+        )
+        for title, _, model, rule in _models(acoustic, look_ahead)
+    }
+    print_robustness(results, Console())
+    write_json(json_file, results)
+
+
+def _models(
+    names: list[str] | None, look_aheads_ms: list[float] | None
+) -> Iterator[tuple[str, str, AcousticModel, OutputRuleConfig]]:
+    """Yield title, name, model and default output rule of each model and look-ahead."""
+    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
+    from kouxing.services.recognizer.config import RecognizerConfig
+
+    for name in names or [DEFAULT_MODEL]:
+        defaults = RecognizerConfig(acoustic=name)
+        for look_ahead_ms in look_aheads_ms or [defaults.look_ahead_ms]:
+            model = load_live_model(name, look_ahead_ms=look_ahead_ms)
+            title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_aheads_ms else name
+            yield title, name, model, defaults.output_rule
 
 
 @app.command()

@@ -36,6 +36,7 @@ from rich.table import Table
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
+from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
@@ -147,31 +148,6 @@ def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
             total = np.nansum(rows, axis=0)
             means.append(np.where(num_measured, total / np.maximum(num_measured, 1), np.nan))
     return np.array(means).reshape(-1, mouths.shape[1])
-
-
-def change_speed(samples: Samples, factor: float) -> Samples:
-    """Change the speed of speech at constant pitch.
-
-    Overlap-add of the most similar 20 ms segments (WSOLA, Verhelst and Roelands 1993).
-    """
-    hop, search = 160, 120  # 10 and 7.5 ms; segments are two hops long
-    window = np.hanning(2 * hop + 1)[: 2 * hop]
-    padded = np.pad(samples.astype(np.float64), (search, 3 * hop + 2 * search))
-    num_segments = int(len(samples) / (hop * factor))
-    out = np.zeros((num_segments + 1) * hop)
-    source = 0  # start of the last segment
-    for number in range(num_segments):
-        at = round(number * hop * factor)
-        if number:
-            continuation = padded[source + hop : source + 3 * hop]  # the natural continuation
-            near = padded[at : at + 2 * search + 2 * hop]
-            energy = np.convolve(near**2, np.ones(2 * hop), "valid")
-            similarity = np.correlate(near, continuation, "valid") / np.sqrt(energy + 1e-9)
-            at += int(similarity.argmax())
-        source = at
-        out[number * hop : (number + 2) * hop] += window * padded[at : at + 2 * hop]
-    clipped: Samples = np.clip(out[hop:], -1.0, 1.0).astype(np.float32)
-    return clipped
 
 
 def scale_openings(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:

@@ -49,10 +49,10 @@ def _outputs(figures: Figures) -> Table:
     for score in figures["scores"]:
         table.add_row(
             score["output"],
-            _percent(score["phone_error_rate"]),
+            percent(score["phone_error_rate"]),
             _interval(score["phone_interval_95"]),
             _kinds(score["phone_errors"]),
-            _percent(score["viseme_error_rate"]),
+            percent(score["viseme_error_rate"]),
             _interval(score["viseme_interval_95"]),
         )
     return table
@@ -76,11 +76,11 @@ def _speakers(figures: Figures) -> Table:
         table.add_row(
             speaker,
             str(errors["reference"]),
-            _percent(errors["rate"]),
+            percent(errors["rate"]),
             _kinds(errors),
-            _percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
-            _percent(live["phone_errors_by_speaker"][speaker]["rate"]),
-            _percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
+            percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
+            percent(live["phone_errors_by_speaker"][speaker]["rate"]),
+            percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
         )
     return table
 
@@ -89,7 +89,7 @@ def _labials(figures: Figures) -> Table:
     columns = ("recall", "precision", "recognized as d t n g k h", "d t n g k h spoken")
     table = _table("p, b, m and f, %", ("output", *columns))
     for output, fractions in figures["labials"].items():
-        table.add_row(output, *map(_percent, fractions.values()))
+        table.add_row(output, *map(percent, fractions.values()))
     return table
 
 
@@ -110,7 +110,7 @@ def _table(title: str, columns: Iterable[str]) -> Table:
     return table
 
 
-def _percent(rate: float | None) -> str:
+def percent(rate: float | None) -> str:
     return "-" if rate is None else f"{100 * rate:.1f}"
 
 
@@ -118,16 +118,16 @@ def _rates(score: Figures, hypothesis: str = "") -> str:
     if f"{hypothesis}phone_error_rate" not in score:
         return ""
     kinds = ("phone", "viseme")
-    return " / ".join(_percent(score[f"{hypothesis}{kind}_error_rate"]) for kind in kinds)
+    return " / ".join(percent(score[f"{hypothesis}{kind}_error_rate"]) for kind in kinds)
 
 
 def _interval(bounds: tuple[float, float] | None) -> str:
-    return "-" if bounds is None else f"{_percent(bounds[0])}-{_percent(bounds[1])}"
+    return "-" if bounds is None else f"{percent(bounds[0])}-{percent(bounds[1])}"
 
 
 def _kinds(errors: Mapping[str, int]) -> str:
     kinds = ("insertions", "deletions", "substitutions")
-    return "/".join(_percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
+    return "/".join(percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
 
 
 def _delay(score: Figures) -> str:

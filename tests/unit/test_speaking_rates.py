@@ -10,7 +10,6 @@ from kouxing.evaluation.lips.speaking_rates import (
     STILL,
     accuracy_of,
     bounds,
-    change_speed,
     mean_mouths,
     scale_openings,
 )
@@ -61,13 +60,3 @@ def test_bounds_of_one_opening_and_of_a_still_mouth() -> None:
     scores = bounds(real)
     assert scores[BEST_OPENING] == pytest.approx(1.0)
     assert scores[STILL] < 0.6
-
-
-@pytest.mark.parametrize("factor", [0.8, 1.0, 1.3])
-def test_speed_changes_at_constant_pitch(factor: float) -> None:
-    time_s = np.arange(16_000) / 16_000
-    changed = change_speed((0.3 * np.sin(2 * np.pi * 200 * time_s)).astype(np.float32), factor)
-    assert len(changed) == pytest.approx(16_000 / factor, abs=200)
-    middle = changed[2000:10_000]
-    spectrum = np.abs(np.fft.rfft(middle * np.hanning(len(middle))))
-    assert np.fft.rfftfreq(len(middle), 1 / 16_000)[spectrum.argmax()] == pytest.approx(200, abs=4)

@@ -1,0 +1,146 @@
+"""Disturbances have the stated amount, and the figures count recognized phones."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from kouxing.evaluation.recognizer import robustness
+from kouxing.evaluation.recognizer.disturbances import (
+    SOUNDS,
+    SPEECH_CONDITIONS,
+    add_echoes,
+    add_noise,
+    add_sound,
+    babble,
+    change_level,
+    change_speed,
+    clip,
+    limit_to_telephone_band,
+    pink_noise,
+)
+from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+RATE_HZ = 16_000
+
+
+def tone(frequency_hz: float) -> np.ndarray:
+    time_s = np.arange(RATE_HZ) / RATE_HZ
+    return (0.3 * np.sin(2 * np.pi * frequency_hz * time_s)).astype(np.float32)
+
+
+def level(samples: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(samples.astype(np.float64) ** 2)))
+
+
+@pytest.mark.parametrize("below_db", [20.0, 10.0, 5.0])
+def test_noise_has_the_requested_level(below_db: float) -> None:
+    speech = tone(440)
+    noise = add_noise(speech, below_db) - speech
+    assert 20 * np.log10(level(speech) / level(noise)) == pytest.approx(below_db, abs=0.2)
+
+
+def test_pink_noise_has_equal_power_in_every_octave() -> None:
+    power = np.abs(np.fft.rfft(pink_noise(2**17, np.random.default_rng(0)))) ** 2
+    hz = np.fft.rfftfreq(2**17, 1 / RATE_HZ)
+    octaves = [power[(hz >= low) & (hz < 2 * low)].sum() for low in (125, 250, 500, 1000, 2000)]
+    assert np.ptp(10 * np.log10(octaves)) < 0.7
+
+
+@pytest.mark.parametrize(("frequency_hz", "passes"), [(1000, True), (100, False), (6000, False)])
+def test_telephone_band(frequency_hz: float, passes: bool) -> None:
+    share = level(limit_to_telephone_band(tone(frequency_hz))) / level(tone(frequency_hz))
+    assert share == pytest.approx(1.0, abs=0.05) if passes else share < 0.03
+
+
+def test_babble_mixes_six_voices() -> None:
+    voices = [tone(frequency_hz) for frequency_hz in (200, 400, 600, 800, 1000, 1200)]
+    together = babble([(number + 1) * voice for number, voice in enumerate(voices)])
+    first_s = np.abs(np.fft.rfft(together[:RATE_HZ]))  # as each is one second long
+    assert set(np.argsort(first_s)[-6:]) == {200, 400, 600, 800, 1000, 1200}
+    speech = tone(440)
+    heard = add_sound(speech, together, 10.0) - speech
+    assert 20 * np.log10(level(speech) / level(heard)) == pytest.approx(10, abs=0.5)
+
+
+def test_echoes_last_half_a_second() -> None:
+    click = np.zeros(RATE_HZ, np.float32)
+    click[0] = 1
+    heard = add_echoes(click)
+    assert heard[0] == pytest.approx(np.sqrt(1 / 2), rel=0.1)
+    falls = level(heard[1:801]) / level(heard[4001:4801])
+    assert 20 * np.log10(falls) == pytest.approx(30, abs=2)  # in a quarter of a second
+    assert np.abs(heard[8000:]).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["MP3, 16 kbit/s", "Opus, 9 kbit/s"])
+def test_codecs_keep_length_and_pitch(name: str) -> None:
+    speech = tone(440)
+    decoded = SPEECH_CONDITIONS[name](speech)
+    assert len(decoded) == pytest.approx(len(speech), abs=2000)
+    spectrum = np.abs(np.fft.rfft(decoded[4000:12_000]))
+    assert np.fft.rfftfreq(8000, 1 / RATE_HZ)[spectrum.argmax()] == 440
+
+
+def test_clipping_is_relative_to_the_peak() -> None:
+    assert np.abs(clip(tone(440), 0.2)).max() == pytest.approx(0.06, abs=1e-3)
+
+
+def test_double_level_clips() -> None:
+    assert change_level(tone(440), 4.0).max() == 1.0
+    np.testing.assert_array_equal(change_level(tone(440), 0.5), tone(440) / 2)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.3])
+def test_speed_changes_at_constant_pitch(factor: float) -> None:
+    changed = change_speed(tone(200), factor)
+    assert len(changed) == pytest.approx(RATE_HZ / factor, abs=200)
+    middle = changed[2000:10_000]
+    spectrum = np.abs(np.fft.rfft(middle * np.hanning(len(middle))))
+    assert np.fft.rfftfreq(len(middle), 1 / RATE_HZ)[spectrum.argmax()] == pytest.approx(200, abs=4)
+
+
+@pytest.mark.parametrize("name", SOUNDS)
+def test_sounds_are_reproducible(name: str) -> None:
+    sound = SOUNDS[name](1.5)
+    assert sound.shape == (24_000,)
+    assert 0.02 < level(sound) <= 0.06
+    np.testing.assert_array_equal(sound, SOUNDS[name](1.5))
+
+
+@pytest.mark.slow
+def test_evaluates_a_small_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = "utt_id\tpath\tspeaker\tsplit\tseconds\tpinyin\n"
+    (tmp_path / "manifest.tsv").write_text(
+        f"{rows}one\t{DEMO / 'hello-male.wav'}\tm\tdev\t3\tni3 hao3\n", encoding="utf-8"
+    )
+    conditions = {name: SPEECH_CONDITIONS[name] for name in ("as recorded", "half level")}
+    monkeypatch.setattr(robustness, "SPEECH_CONDITIONS", conditions)
+    monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
+    figures = evaluate_robustness(
+        load_model(), tmp_path, "dev", OutputRuleConfig(1, 0.9), other_language=DEMO
+    )
+    assert set(figures["speech"]) == {*conditions, "babble 10 dB below"}
+    rates = figures["speech"]["as recorded"]["offline"]
+    assert rates["phone_error_rate"] > 0 < rates["viseme_error_rate"]  # the text is too short
+    assert rates["labials"]["recall"] is None  # no p, b, m, f in it
+    assert figures["sounds"]["noise"] == 0
+    assert figures["sounds"]["other language"] > 60
+    output = io.StringIO()
+    print_robustness({"a model": figures}, Console(file=output, width=120))
+    assert "half level" in output.getvalue()
+    with pytest.raises(UserError, match="no usable recordings in the split 'test'"):
+        evaluate_robustness(load_model(), tmp_path, "test", OutputRuleConfig())
+
+
+def test_rejects_a_folder_without_recordings(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="contains no wav"):
+        robustness.read_recordings(tmp_path)
