@@ -111,6 +111,7 @@ def _table(title: str, columns: Iterable[str]) -> Table:
 
 
 def percent(rate: float | None) -> str:
+    """Return a rate as a percentage for a table."""
     return "-" if rate is None else f"{100 * rate:.1f}"
 
 
