@@ -43,6 +43,7 @@ MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
 BUDGET = 5000.0  # of a connection
 BUDGET_PER_S = 500.0
+MIN_BUDGET = 100.0  # of a new connection: enough for an honest client of a key that was misused
 PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
@@ -298,7 +299,7 @@ class ConnectionLimiter:
         Disconnect it if its key has too many connections.
         """
         if (kept := self._budgets.get(connection.owner)) is not None:
-            connection.budget = Budget(kept.left)
+            connection.budget = Budget(max(MIN_BUDGET, kept.left))
         same_key = [c for c in list(self._connections.values()) if c.key == connection.key]
         max_shared = MAX_SHARE * self._max_connections
         if connection.key and sum(not c.is_cut for c in same_key) > max_shared:

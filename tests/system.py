@@ -135,6 +135,7 @@ class System:
             **(settings or {}),
         }
         self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=insecure)
+        self._is_insecure = insecure
 
     def __enter__(self) -> Self:
         try:
@@ -176,6 +177,10 @@ class System:
         self.start(service, name, **addresses, **{variable(service, "instance"): name})
         self.wait_until(lambda report: name in {state.instance for state in report.services})
 
+    def client(self, timeout_s: float = 10.0) -> Client:
+        """Return a client of the system."""
+        return Client(self.control, timeout_s=timeout_s, insecure=self._is_insecure)
+
     def log(self, service: str) -> str:
         return (self.folder / f"{service}.log").read_text(encoding="utf-8")
 
@@ -187,7 +192,7 @@ class System:
     def wait_until(self, condition: Callable[[Status], bool], deadline_s: float = 110.0) -> None:
         """Wait until control reports what is wanted; no service may end meanwhile."""
         end_s = time.monotonic() + deadline_s
-        with Client(self.control, timeout_s=2.0) as client:
+        with self.client(timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.assert_all_alive()
                 with contextlib.suppress(KouxingError):  # control may not run yet
@@ -198,14 +203,14 @@ class System:
 
     def endpoints(self) -> dict[str, str]:
         """Return where every socket of the services is bound, with its key, by name."""
-        with Client(self.control) as client:
+        with self.client() as client:
             services = client.status().services
         return {name: each for state in services for name, each in state.endpoints.items()}
 
     def num_gaps(self) -> float:
         """Return how many gaps there were in the sound of all sessions."""
         time.sleep(0.6)  # until the next heartbeat
-        with Client(self.control) as client:
+        with self.client() as client:
             metrics = {state.service: state.metrics for state in client.status().services}
         return metrics["recognizer"].get("audio_gaps", 0.0)
 

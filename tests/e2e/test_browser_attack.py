@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from kouxing_client import Client
 
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import Heartbeat
@@ -72,7 +71,7 @@ def test_a_page_of_another_origin_cannot_forge_a_message(
                 f" body: Uint8Array.from(atob('{body}'), c => c.charCodeAt(0)),"
                 " signal: AbortSignal.timeout(1000)}).catch(() => {})"
             )
-        with Client(system.control) as client:
+        with system.client() as client:
             known = {service.instance for service in client.status().services}
     assert known
     assert "forged" not in known

@@ -71,7 +71,7 @@ def test_workers_are_placed_restarted_elsewhere_and_stopped(
     assert stream(control.control, samples).frames
 
     assert "waits for a free core" in scale(recognizers=2)
-    assert "no worker runs" in scale(recognizers=0, synthesizers=0)
+    assert "no workers are running" in scale(recognizers=0, synthesizers=0)
     control.wait_until(lambda report: not workers(report))
 
 

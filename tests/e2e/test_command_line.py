@@ -180,7 +180,7 @@ def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> Non
         (["express", "heard", "joy=2"], "between 0 and 1"),
         (["express", "heard", "joy"], "joy=0.4"),
         (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
-        (["express", "nobody", "joy=1"], "no session 'nobody'"),
+        (["express", "nobody", "joy=1"], "session 'nobody' does not exist"),
     ],
 )
 def test_rejects_wrong_arguments(system: System, arguments: list[str], word: str) -> None:

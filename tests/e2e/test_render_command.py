@@ -98,10 +98,10 @@ def test_reports_the_line_of_a_bad_fap_file(tmp_path: Path) -> None:
     [
         ("a.png", {"at": 9.0, "size": "64x48"}, "give 0 to 0.45 seconds"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
-        ("a.mp4", {"lips": ["learnt"]}, "--lips is for a sound"),
-        ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth is for a sound"),
-        ("a.mp4", {"live": True}, "--live is for a sound"),
-        ("a.csv", {"text": "你好"}, "--text is for a sound"),
+        ("a.mp4", {"lips": ["learnt"]}, "--lips applies to sound"),
+        ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to sound"),
+        ("a.mp4", {"live": True}, "--live applies to sound"),
+        ("a.csv", {"text": "你好"}, "--text applies to sound"),
         ("no/a.png", {"size": "64x48"}, "cannot write"),
     ],
 )

@@ -14,6 +14,7 @@ from kouxing.shared.connections import (
     BUDGET,
     BUDGET_PER_S,
     MAX_QUEUED,
+    MIN_BUDGET,
     PENALTY_S,
     STALLED_S,
     Budget,
@@ -228,7 +229,17 @@ def test_a_disconnected_owner_is_blocked(
     assert limiter.is_blocked("hostile")
     assert not limiter.is_blocked("other")
     assert list(socket.ended) == [1]
-    assert deliver(socket, 2, "hostile").budget.left < 0
+
+
+def test_a_client_with_a_blocked_key_keeps_a_connection_that_it_has(
+    kernel: Kernel, limiter: ConnectionLimiter, socket: LimitedSocket
+) -> None:
+    hostile = deliver(socket, 1, "key")
+    hostile.disconnect("test", PENALTY_S)
+    limiter.look(0.0)
+    honest = deliver(socket, 2, "key")
+    assert not honest.is_cut
+    assert honest.budget.left >= MIN_BUDGET
 
 
 def test_a_reused_descriptor_is_another_connection(
