@@ -20,7 +20,7 @@ _NONE = (-1, -1)
 
 
 class Transport(Protocol):
-    """What a follower needs of its surroundings. A connection is any object."""
+    """The sockets and the clock that a follower uses. A connection is any object."""
 
     @property
     def now_s(self) -> float:
