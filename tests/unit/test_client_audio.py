@@ -66,8 +66,12 @@ def test_resends_what_is_not_acknowledged_in_time_and_waits_longer_each_time() -
     assert not stream.is_stuck(30.0)
 
 
-def test_a_recognizer_that_never_acknowledges_gets_audio_once() -> None:
-    assert not stream_of(3).is_stuck(100.0)
+def test_resends_audio_that_was_lost_before_the_first_acknowledgement() -> None:
+    stream = stream_of(3)
+    assert not stream.is_stuck(0.5)
+    assert stream.is_stuck(0.7)
+    stream.resend(0.7)
+    assert sent(stream) == [1, 2, 3]
 
 
 def test_the_shortest_round_trip_limits_new_connections() -> None:

@@ -137,9 +137,7 @@ class AudioStream:
 
     def is_stuck(self, now_s: float) -> bool:
         """Return whether acknowledgements have stopped, so the connection may be dead."""
-        # A recognizer that never acknowledges is an older one.
-        is_behind = self.acknowledged > 0 and self.num_unacknowledged > 0
-        return is_behind and now_s - self._progress_s > self._answer_s
+        return self.num_unacknowledged > 0 and now_s - self._progress_s > self._answer_s
 
     def resend(self, now_s: float) -> None:
         """Send unacknowledged messages again, and wait longer for the next acknowledgement."""
