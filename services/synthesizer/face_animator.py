@@ -41,7 +41,9 @@ MAX_DELAY_S = 1.5  # at most 0.3 live; a viseme further ahead has no visible wei
 REST_S = 0.3  # duration of the frames that lead to rest after the end of the sound
 _RECENT_S = 2.0  # events that a new lip model receives
 _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
-_REHEARSAL_S = 0.8  # frames of a resumed face before it is shown
+# Frames of a resumed face before it is shown. Older levels all act in the first of them. A brow or
+# head movement that they start must end, and no longer block the next one, before the face is shown
+_REHEARSAL_S = 1.6
 _MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # of mouth FAPs, of other FAPs
 _BIND_S = 0.04  # after this part of a transition, lips close fully for speech
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
