@@ -94,7 +94,10 @@ export class Speaker {
   close(): void;
 }
 
-/** Read a `.csv` or `.jsonl` file of `kouxing listen -o` or `kouxing render -o`. */
+/**
+ * Read a `.csv` or `.jsonl` file of `kouxing listen -o` or `kouxing render`, or a take (`.csv`) of the
+ * app Live Link Face. Throws an error if the table has no times, or a value is not a number.
+ */
 export function readRecording(text: string): {
   /** names of the shapes; null: the values are the 68 FAPs */
   names: string[] | null;

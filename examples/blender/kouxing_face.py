@@ -2,7 +2,8 @@
 
 It moves all shape keys of the scene that have one of ARKit's 52 names. Live weights arrive by UDP
 in the format of the app Live Link Face (`kouxing send livelink://127.0.0.1:11111`). A recording is
-a file of `kouxing render my.wav my.csv --as arkit`, or a .jsonl file. Install this file with "Edit
+a file of `kouxing render my.wav my.csv --as arkit`, or a .jsonl file; for a take of the app, run
+`kouxing render take.csv my.csv --as arkit` first. Install this file with "Edit
 > Preferences > Add-ons > Install from Disk". The panel is in the sidebar (N) of the 3-D view.
 """
 
@@ -69,7 +70,8 @@ def read_recording(path):
     with Path(path).open(encoding="utf-8") as file:
         if path.endswith(".csv"):
             rows = [
-                {name: float(value) for name, value in row.items()} for row in csv.DictReader(file)
+                {name: float(value) for name, value in row.items() if name != "phone"}
+                for row in csv.DictReader(file)
             ]
             times_s = [row.pop("time_s") for row in rows]
         else:

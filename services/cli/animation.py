@@ -1,4 +1,4 @@
-"""The motion of a face: computed from sound, or read from a ``.fap`` file."""
+"""The motion of a face: computed from sound, or read from a ``.fap`` file or a table."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
+from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.inputs import does_not_fit, read_mono_16k, read_text
 from kouxing.services.driver.video import film
 from kouxing.services.live_chain import LiveChain
@@ -39,17 +40,17 @@ class Motion:
     frame_rate_hz: float
     image_rate_hz: float  # default for a video
     samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
-    num_phones: int | None = None  # None if the source is a .fap file
+    phones: list[Phone] | None = None  # spoken phones in order; None if the source has no sound
 
 
-def is_fap(source: Path) -> bool:
+def has_motion(source: Path) -> bool:
     """Return whether a source already contains the motion of a face."""
-    return source.suffix.lower() == ".fap"
+    return source.suffix.lower() in (".fap", *TABLE_SUFFIXES)
 
 
 def read_motion(source: Path, sound: Path | None) -> Motion:
-    """Read a ``.fap`` file, with the sound that goes with it, if any."""
-    animation = read_fap(source)
+    """Read a ``.fap`` file or a table, with the sound that goes with it, if any."""
+    animation = read_fap(source) if source.suffix.lower() == ".fap" else read_table(source)
     return Motion(
         film.expand_frames(animation),
         animation.frame_rate_hz,
@@ -100,7 +101,7 @@ def animate(
         settings[0].frame_rate_hz,
         _IMAGE_RATE_HZ,
         samples,
-        _count_phones(events, model.inventory.silence),
+        _spoken_phones(events, model.inventory.silence),
     )
 
 
@@ -148,7 +149,8 @@ def _load_lip_predictor(model: AcousticModel, mouth: Path | None) -> LipPredicto
         raise UserError(f"--mouth {mouth}: {error}") from None
 
 
-def _count_phones(events: Iterable[SoundEvent], silence: str) -> int:
-    return len(
-        {event.index for event in events if isinstance(event, Phone) and event.symbol != silence}
-    )
+def _spoken_phones(events: Iterable[SoundEvent], silence: str) -> list[Phone]:
+    """Return the last version of each phone, without silence and withdrawn phones."""
+    newest = {event.index: event for event in events if isinstance(event, Phone)}
+    spoken = [phone for phone in newest.values() if phone.symbol != silence]
+    return sorted(spoken, key=lambda phone: (phone.onset_s, phone.index))

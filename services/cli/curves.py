@@ -1,14 +1,16 @@
 """Exporters of a face's curves: FAPs or blend shapes of every frame.
 
 To add a format, write a subclass of ``CurveExporter`` and add its suffix to ``CURVE_EXPORTERS``.
-``kouxing render`` and ``kouxing listen`` then write it.
+``kouxing render`` and ``kouxing listen`` then write it. ``curve_reader`` reads tables.
 """
 
 from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -18,10 +20,13 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.cli.options import CurveForm, ExportOptions
+from kouxing.services.senders import live_link
+from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.phones.events import Phone
 from kouxing.shared.terminal import cannot_write
 
 if TYPE_CHECKING:
@@ -29,23 +34,34 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float32]
 Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
+_LIVE_LINK_RATE_HZ = 60  # of the time code; the app's default
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Frames to write, as they arrive."""
+
+    rows: Iterable[Row]
+    frame_rate_hz: float | None = None  # None: estimated from the times of the frames
+    phones: Sequence[Phone] | None = None  # spoken phones by onset; tables get a column for them
 
 
 class CurveExporter(ABC):
     """Writes the curves of a face to a file.
 
-    Of the options, only ``form``, ``head`` and ``lips`` are used. Raises ``UserError`` if they do
-    not fit the format, or the folder does not exist.
+    Raises ``UserError`` if the options do not fit the format, or the folder does not exist.
     """
 
     unit: ClassVar[str] = "frame"
+    options: ClassVar[frozenset[str]] = frozenset({"lips", "form"})
     forms: ClassVar[tuple[CurveForm, ...]] = tuple(CurveForm)
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
         if options.form not in self.forms:
+            suffixes = [name for name, cls in CURVE_EXPORTERS.items() if options.form in cls.forms]
             raise UserError(
                 f"{output}: this format holds {' or '.join(self.forms)}; for {options.form}, write"
-                " .csv or .jsonl"
+                f" {' or '.join(suffixes)}"
             )
         if len(options.lips) > 1:
             raise UserError("a curve file holds one face; give --lips only once")
@@ -58,36 +74,40 @@ class CurveExporter(ABC):
     def export(self, motion: Motion, progress: Progress) -> int:
         """Write all frames of a motion and return their number."""
         rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
-        return self.write(rows, motion.frame_rate_hz)
+        return self.write(Curves(rows, motion.frame_rate_hz, motion.phones))
 
     @abstractmethod
-    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+    def write(self, curves: Curves) -> int:
         """Write frames as they arrive and return their number.
 
-        If ``frame_rate_hz`` is None, it is estimated from the times of the frames. Raises
-        ``UserError`` if the file cannot be written.
+        Raises ``UserError`` if the file cannot be written.
         """
 
 
 class CsvExporter(CurveExporter):
     """Writes comma-separated values, with a column for each FAP or shape."""
 
-    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+    def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
-        columns = ",".join(["time_s", *_value_names(self._form)])
-        lines = (
-            ",".join([f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, self._form))])
-            for time_s, _, faps in rows
-        )
-        return _write_lines(self._output, chain([columns], lines)) - 1
+        if self._form is CurveForm.LIVELINK:
+            columns = _LIVE_LINK_COLUMNS
+            cells = (_live_link_cells(row) for row in curves.rows)
+        else:
+            columns = ["time_s", *_value_names(self._form)]
+            columns += [] if curves.phones is None else ["phone"]
+            cells = (_cells(row, self._form, curves.phones) for row in curves.rows)
+        return _write_lines(self._output, map(",".join, chain([columns], cells))) - 1
 
 
 class JsonLinesExporter(CurveExporter):
     """Writes a JSON object for each frame."""
 
-    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+    forms = tuple(form for form in CurveForm if form is not CurveForm.LIVELINK)
+
+    def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
-        return _write_lines(self._output, (json_line(row, self._form) for row in rows))
+        lines = (json_line(row, self._form, curves.phones) for row in curves.rows)
+        return _write_lines(self._output, lines)
 
 
 class FapExporter(CurveExporter):
@@ -95,9 +115,9 @@ class FapExporter(CurveExporter):
 
     forms = (CurveForm.FAPS,)
 
-    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+    def write(self, curves: Curves) -> int:
         """Write the frames when the last one has arrived."""
-        frames = list(rows)
+        frames, frame_rate_hz = list(curves.rows), curves.frame_rate_hz
         if frame_rate_hz is None:
             steps_s = np.diff([time_s for time_s, _, _ in frames])
             steps_s = steps_s[steps_s > 0]
@@ -110,14 +130,15 @@ class FapExporter(CurveExporter):
 class GlbExporter(CurveExporter):
     """Writes the head as a GLB with the motion as an animation."""
 
+    options = CurveExporter.options | {"head"}
     forms = (CurveForm.FAPS, CurveForm.ARKIT)
 
-    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+    def write(self, curves: Curves) -> int:
         """Write the frames when the last one has arrived."""
         from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - slow
         from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
 
-        frames = [(time_s, faps) for time_s, _, faps in rows]
+        frames = [(time_s, faps) for time_s, _, faps in curves.rows]
         is_arkit = self._form is CurveForm.ARKIT
         export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)
         return len(frames)
@@ -131,13 +152,53 @@ CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
 }
 
 
-def json_line(row: Row, form: CurveForm) -> str:
+def json_line(row: Row, form: CurveForm, phones: Sequence[Phone] | None = None) -> str:
     """Return a JSON object for a frame: FAPs in the order of their numbers, or named shapes."""
     time_s, number, faps = row
     is_faps = form is CurveForm.FAPS
     rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, form)]
     values = rounded if is_faps else dict(zip(_value_names(form), rounded, strict=True))
-    return json.dumps({"time_s": time_s, "sequence": number, form.value: values})
+    fields = {"time_s": time_s, "sequence": number, form.value: values}
+    return json.dumps(fields if phones is None else {**fields, "phone": phone_at(phones, time_s)})
+
+
+def phone_at(phones: Sequence[Phone], time_s: float) -> str:
+    """Return the symbol of the phone at a time, or "" outside all phones, ordered by onset."""
+    index = bisect_right(phones, time_s, key=lambda phone: phone.onset_s) - 1
+    if index < 0 or time_s >= phones[index].onset_s + phones[index].duration_s:
+        return ""
+    return phones[index].symbol
+
+
+def _cells(row: Row, form: CurveForm, phones: Sequence[Phone] | None) -> list[str]:
+    time_s, _, faps = row
+    cells = [f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, form))]
+    return cells if phones is None else [*cells, phone_at(phones, time_s)]
+
+
+def _live_link_cells(row: Row) -> list[str]:
+    time_s, _, faps = row
+    face = FaceFrame(faps, time_s)
+    weights = face.weights(CurveForm.ARKIT)
+    milliframes = round(time_s * _LIVE_LINK_RATE_HZ * 1000)
+    seconds, frame = divmod(milliframes, _LIVE_LINK_RATE_HZ * 1000)
+    time_code = (
+        f"{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}:{frame / 1000:06.3f}"
+    )
+    values = [*(weights[name] for name in _LIVE_LINK_SHAPES), *live_link.face_angles(face)]
+    return [time_code, str(len(values)), *(f"{value:.6f}" for value in values)]
+
+
+# The app's tables have the right jaw and mouth before the left ones, unlike its packets.
+_SWAPPED = {"jawLeft": "jawRight", "mouthLeft": "mouthRight"}
+_SWAPPED |= {right: left for left, right in _SWAPPED.items()}
+_LIVE_LINK_SHAPES = [_SWAPPED.get(name, name) for name in live_link.ORDER]
+_LIVE_LINK_COLUMNS = [
+    "Timecode",
+    "BlendShapeCount",
+    *(name[0].upper() + name[1:] for name in _LIVE_LINK_SHAPES),
+    *live_link.ANGLES,
+]
 
 
 def _write_lines(output: Path, lines: Iterable[str]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import fields
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -10,7 +11,7 @@ from rich.progress import Progress
 
 from kouxing.services.cli.animation import Motion
 from kouxing.services.cli.curves import CURVE_EXPORTERS
-from kouxing.services.cli.options import CurveForm, ExportOptions
+from kouxing.services.cli.options import ExportOptions
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
@@ -18,11 +19,16 @@ from kouxing.services.driver.video import film
 from kouxing.services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_sequence
 from kouxing.shared.errors import UserError
 
+_DRAWING_OPTIONS = frozenset(
+    {"lips", "head", "size", "background", "camera", "yaw_deg", "pitch_deg"}
+)
+
 
 class Exporter(Protocol):
     """Writes the motion of a face in one format."""
 
     unit: ClassVar[str]  # what ``export`` counts
+    options: ClassVar[frozenset[str]]  # fields of ``ExportOptions`` that apply
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
         """Check output and options. This comes before long work."""
@@ -38,10 +44,9 @@ class VideoExporter:
     """
 
     unit: ClassVar[str] = "image"
+    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"rate_hz", "sound"}
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        if options.at_s is not None:
-            raise UserError("--at selects one picture; write a .png file")
         check_name(output)
         self._output = output
         self._rate_hz = options.rate_hz
@@ -68,6 +73,7 @@ class PictureExporter:
     """Draws one picture (PNG); parameters and errors as for ``VideoExporter``."""
 
     unit: ClassVar[str] = "image"
+    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"at_s"}
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
         self._output = output
@@ -93,21 +99,31 @@ def open_exporter(output: Path, options: ExportOptions) -> Exporter:
 
     Raises ``UserError`` if the suffix is unknown, or the options do not fit the format.
     """
-    if is_sequence(output):
-        return VideoExporter(output, options)
-    exporter = EXPORTERS.get(output.suffix.lower())
+    exporter = VideoExporter if is_sequence(output) else EXPORTERS.get(output.suffix.lower())
     if exporter is None:
         raise UserError(
             f"{output}: unknown format; give a name that ends in {', '.join(EXPORTERS)}, a folder,"
             " or a name with a number such as face%05d.png"
         )
+    _check_options(output, options, exporter)
     return exporter(output, options)
+
+
+def _check_options(output: Path, options: ExportOptions, exporter: type[Exporter]) -> None:
+    for field in fields(ExportOptions):
+        name = field.name
+        if getattr(options, name) != field.default and name not in exporter.options:
+            suffixes = [suffix for suffix, cls in EXPORTERS.items() if name in cls.options]
+            option = {"form": "as"}.get(name, name.removesuffix("_deg"))
+            option = option.removesuffix("_hz").removesuffix("_s")
+            raise UserError(
+                f"{output}: --{option} does not apply to this format; it applies to"
+                f" {', '.join(suffixes)}"
+            )
 
 
 def _make_renderer(output: Path, options: ExportOptions) -> Renderer | SideBySide:
     """Return a renderer that draws a face for each lip model, side by side."""
-    if options.form is not CurveForm.FAPS:
-        raise UserError(f"--as {options.form} applies to curves; write .csv, .jsonl or .glb")
     num_faces = len(options.lips)
     width_px, height_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
     if width_px % num_faces:

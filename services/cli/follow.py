@@ -14,6 +14,7 @@ from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 from kouxing.services.cli.curves import (
     CURVE_EXPORTERS,
     CurveExporter,
+    Curves,
     Row,
     json_line,
 )
@@ -42,6 +43,8 @@ def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, con
     """
     if shown is not Shown.FAPS and (output is not None or form is not CurveForm.FAPS):
         raise UserError(f"--show {shown} cannot be combined with --output or --as")
+    if form is CurveForm.LIVELINK and output is None:
+        raise UserError("--as livelink is a table; add --output face.csv")
     exporter = None if output is None else _open_exporter(output, form)
     with connect(control) as client:
         followed = _wait_for_session(session, client)
@@ -52,7 +55,7 @@ def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, con
         else:
             frames = _until_interrupted(followed.results(FapFrame, keep_all=True), followed.name)
             rows = map(_row, frames)
-            count = _print_frames(rows, form) if exporter is None else exporter.write(rows)
+            count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
     unit = "frames" if shown is Shown.FAPS else shown.value
     print_message(f"session {followed.name} ended: {count} {unit}")
     if output is not None:

@@ -50,7 +50,14 @@ _FORMAT_OF_SUFFIX = {
 
 
 def render(
-    source: Annotated[Path, typer.Argument(metavar="SOUND|FAP", help="Audio, video or .fap file.")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOUND|CURVES",
+            help="Audio or video file, or curves (.fap, .csv, .jsonl) of kouxing or of the app Live"
+            " Link Face.",
+        ),
+    ],
     output: Annotated[
         Path,
         typer.Argument(
@@ -95,40 +102,42 @@ def render(
     rate: Annotated[
         float | None,
         typer.Option(
-            min=1, max=240, help="Images per second. Default: 25, or the rate of the .fap file."
+            min=1, max=240, help="Images per second. Default: 25, or the rate of the curves."
         ),
     ] = None,
-    sound: Annotated[Path | None, typer.Option(help="Sound to add to a .fap file.")] = None,
+    sound: Annotated[Path | None, typer.Option(help="Sound to add to curves.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, in seconds.")] = None,
     mouth: MouthFile = None,
     expressiveness: Annotated[
         float | None,
-        typer.Option(min=0.5, max=2, help="Size of the mouth movements; not for .fap files."),
+        typer.Option(min=0.5, max=2, help="Size of the mouth movements; not for curves."),
     ] = None,
 ) -> None:
-    """Make a video, pictures or curves from an audio, video or FAP file."""
+    """Make a video, pictures or curves from sound, or from curves."""
     from rich.progress import Progress
 
-    from kouxing.services.cli.animation import animate, is_fap, read_motion
+    from kouxing.services.cli.animation import animate, has_motion, read_motion
     from kouxing.services.cli.exporters import open_exporter
 
     if live and text is not None:
         raise UserError("a live stream has no text in advance; use either --live or --text")
-    if is_fap(source):
+    if has_motion(source):
         _check_no_sound_options(
             source, lips=lips, live=live or None, text=text, mouth=mouth,
             expressiveness=expressiveness,
         )  # fmt: skip
     elif sound is not None:
-        raise UserError(f"--sound applies to .fap files; {source} has its own sound")
+        raise UserError(f"--sound applies to curves; {source} has its own sound")
     models = tuple(lips or [DEFAULT_LIP_MODEL])
+    if mouth is not None and "learnt" not in models:
+        raise UserError("--mouth applies to learnt lips; add --lips learnt")
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
-        yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at,
+        yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,
     )  # fmt: skip
     exporter = open_exporter(output, options)
     with Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive) as progress:
-        if is_fap(source):
+        if has_motion(source):
             motion = read_motion(source, sound)
         else:
             motion = animate(
@@ -138,9 +147,9 @@ def render(
         if not motion.frames:
             raise UserError(f"{source}: the file contains no frames; export it again")
         count = exporter.export(motion, progress)
-    if motion.num_phones == 0:
+    if motion.phones == []:
         print_message(f"{source}: no speech was found; the mouth stays closed")
-    phones = "" if motion.num_phones is None else f", {_plural(motion.num_phones, 'phone')}"
+    phones = "" if motion.phones is None else f", {_plural(len(motion.phones), 'phone')}"
     print_message(f"wrote {output}: {_plural(count, exporter.unit)}{phones}")
 
 

@@ -46,6 +46,7 @@ class CurveForm(StrEnum):
     ARKIT = ShapeSetName.ARKIT
     OCULUS = ShapeSetName.OCULUS
     VRM = ShapeSetName.VRM
+    LIVELINK = "livelink"  # ARKit and head angles, as the app Live Link Face records them
 
 
 class Shown(StrEnum):
@@ -77,3 +78,4 @@ class ExportOptions:
     pitch_deg: float = 0.0
     rate_hz: float | None = None  # images per second; None: the default of the motion
     at_s: float | None = None  # time of a single picture
+    sound: Path | None = None  # to add to a .fap file

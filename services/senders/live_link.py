@@ -28,7 +28,17 @@ FRAME_RATE_HZ = 50  # of the time code
 ORDER = tuple(
     row["shape"] for row in sorted(fap_table("arkit.tsv")[0], key=lambda row: int(row["live_link"]))
 )
+ANGLES = (
+    "HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw", "LeftEyePitch", "LeftEyeRoll", "RightEyeYaw",
+    "RightEyePitch", "RightEyeRoll",
+)  # fmt: skip
 _DEVICE = str(uuid.uuid5(uuid.NAMESPACE_DNS, "kouxing")).upper().encode()  # 36 characters
+
+
+def face_angles(frame: FaceFrame) -> list[float]:
+    """Return ``ANGLES`` (9) in radians; the eyes do not roll."""
+    (pitch, yaw, roll), eyes = frame.head, frame.eyes
+    return [yaw, pitch, roll, *eyes[:2], 0.0, *eyes[2:], 0.0]
 
 
 class LiveLinkConnection(DatagramConnection):
@@ -46,10 +56,7 @@ class LiveLinkConnection(DatagramConnection):
     def encode_at(self, frame: FaceFrame, clock_s: float) -> bytes:
         """Return the datagram of a frame at a time code, seconds since midnight."""
         weights = frame.weights("arkit", is_mouth_only=self.target.is_mouth_only)
-        angles = [0.0] * 9
-        if not self.target.is_mouth_only:
-            (pitch, yaw, roll), eyes = frame.head, frame.eyes
-            angles = [yaw, pitch, roll, *eyes[:2], 0.0, *eyes[2:], 0.0]
+        angles = [0.0] * len(ANGLES) if self.target.is_mouth_only else face_angles(frame)
         values = [*(weights.get(name, 0.0) for name in ORDER), *angles]
         sub_frame, number = math.modf(clock_s * FRAME_RATE_HZ)
         name = (self.target.options["name"] or "kouxing").encode()

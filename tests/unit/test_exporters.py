@@ -12,7 +12,7 @@ import pytest
 from rich.progress import Progress
 
 from kouxing.services.cli.animation import Motion
-from kouxing.services.cli.curves import CURVE_EXPORTERS, Row
+from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves, Row
 from kouxing.services.cli.exporters import open_exporter
 from kouxing.services.cli.follow import follow
 from kouxing.services.cli.options import CurveForm, ExportOptions, Shown
@@ -61,7 +61,7 @@ def test_json_lines_have_an_object_per_frame(tmp_path: Path) -> None:
 def test_fap_has_the_frame_rate_of_the_motion_or_of_the_times(tmp_path: Path) -> None:
     export(tmp_path / "face.fap")
     exporter = CURVE_EXPORTERS[".fap"](tmp_path / "live.fap", ExportOptions())
-    assert exporter.write(rows()) == 5
+    assert exporter.write(Curves(rows())) == 5
     for name in ("face.fap", "live.fap"):
         animation = read_fap(tmp_path / name)
         assert animation.frame_rate_hz == pytest.approx(RATE_HZ)
@@ -86,10 +86,20 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "a curve file holds one face"),
         ("no/a.csv", {}, "cannot be written"),
         ("no/a.mp4", {}, "cannot write"),
-        ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit applies to curves"),
+        ("a.jsonl", {"form": CurveForm.LIVELINK}, "for livelink, write .csv"),
+        (
+            "a.mp4",
+            {"form": CurveForm.ARKIT},
+            "--as does not apply .* .fap, .csv",
+        ),
+        ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
+        ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),
+        ("a.png", {"rate_hz": 30.0}, "--rate does not apply"),
+        ("a.glb", {"yaw_deg": 9.0}, "--yaw does not apply"),
+        ("a.csv", {"sound": Path("a.wav")}, "--sound does not apply"),
         ("a.mp4", {"background": "transparent"}, "MP4 has no transparency"),
         ("a.mp4", {"background": "mud"}, "write studio, transparent"),
-        ("a.mp4", {"at_s": 0.1}, "--at selects one picture"),
+        ("a.mp4", {"at_s": 0.1}, "--at does not apply to this format; it applies to .png"),
         ("a.mp4", {"size": "huge"}, "WIDTHxHEIGHT"),
         ("a.mp4", {"size": "161x120"}, "even for a video"),
         ("a.mp4", {"size": "99999x2"}, "7680"),

@@ -16,7 +16,12 @@ test("reads recordings in JSON lines and CSV, with FAPs or shapes", () => {
   assert.deepEqual(readRecording("time_s,jawOpen,mouthClose\n0.000,0.25,1\n0.020,0.5,0\n"), named);
   const faps = { names: null, frames: [[0, Float32Array.of(7, 8)]] };
   assert.deepEqual(readRecording('{"time_s": 0, "sequence": 0, "faps": [7, 8]}'), faps);
-  assert.deepEqual(readRecording("time_s,viseme,expression\n0,7,8\n"), faps);
+  assert.deepEqual(readRecording("time_s,viseme,expression,phone\n0,7,8,b\n"), faps);
+  const take = "Timecode,BlendShapeCount,JawOpen,MouthClose\n13:13:04:59.5,61,0.25,1\n13:13:05:00.7,61,0.5,0\n";
+  assert.deepEqual(readRecording(take).names, named.names);
+  assert.deepEqual(readRecording(take).frames.map(([time]) => Math.round(time)), [0, 320]);
+  assert.throws(() => readRecording("frame,jawOpen\n0,0.5\n"), /no times; add a column time_s/);
+  assert.throws(() => readRecording("time_s,jawOpen\n0,\n"), /frame 1 of the recording/);
 });
 
 test("speech returns as frames, shapes, phones and sound", async () => {

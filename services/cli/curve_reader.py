@@ -1,0 +1,141 @@
+"""Reads the motion of a face from a table, as ``CsvExporter`` and ``JsonLinesExporter`` write it.
+
+Takes of the app Live Link Face (CSV) are read too. Their time code is HH:MM:SS:FF.fff, where FF.fff
+counts frames. The file does not name their rate. It is taken as the lowest standard rate above the
+largest FF. If a take does not cross a full second, it is taken as the app's default.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.senders.live_link import ANGLES
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import FapAnimation
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.shapes import SHAPE_SETS
+
+TABLE_SUFFIXES = (".csv", ".jsonl")
+MAX_MB = 128  # about two hours
+_MAX_VALUE = float(np.finfo(np.float32).max)
+_TIME_CODE_RATES_HZ = (24, 25, 30, 48, 50, 60)
+_DAY_S = 86400.0
+_HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
+
+Float64 = NDArray[np.float64]
+
+
+def read_table(path: Path) -> FapAnimation:
+    """Read a table of FAPs or shapes and resample it at its median frame rate.
+
+    Raises ``UserError`` if the file cannot be read, has no times, no known column, or a value that
+    is not a number.
+    """
+    try:
+        if path.stat().st_size > MAX_MB * 1_000_000:
+            raise UserError(f"{path} is larger than {MAX_MB} MB; split it")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: this is not a text file; give a table of curves") from None
+    rows = _json_rows(path, lines) if path.suffix.lower() == ".jsonl" else csv.reader(lines)
+    names = [str(name).strip().lower() for name in next(rows, [])]
+    time_name = next((name for name in ("time_s", "timecode") if name in names), None)
+    if time_name is None:
+        raise UserError(f"{path}: the table has no times; add a column time_s or Timecode")
+    columns, basis = _known_columns(path, names)
+    times: list[str] = []
+    values: list[Float64] = []
+    for number, row in enumerate(rows, start=1):
+        try:
+            times.append(row[names.index(time_name)])
+            values.append(np.array([row[column] for column in columns], np.float64))
+        except (ValueError, TypeError, IndexError):
+            raise UserError(f"{path}, frame {number}: a value is missing or not a number") from None
+        if len(row) != len(names) or not (np.abs(values[-1]) <= _MAX_VALUE).all():
+            raise UserError(f"{path}, frame {number}: a value is missing or not a number")
+    times_s = _times_s(path, times, is_time_code=time_name == "timecode")
+    return _resample(path, times_s, np.array(values) @ basis)
+
+
+def _json_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the names of the first frame, then the values of each frame."""
+    names: list[str] = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            frame = json.loads(line)
+            values = next(frame[key] for key in ("faps", *SHAPE_SETS) if key in frame)
+            if isinstance(values, list):
+                values = dict(zip(FAP_NUMBER, values, strict=True))
+            fields = {"time_s": frame["time_s"], **values}
+            if not names:
+                names = list(fields)
+                yield names
+            yield [fields[name] for name in names]
+        except (ValueError, TypeError, LookupError, StopIteration, RecursionError):
+            raise UserError(
+                f"{path}, line {number}: expected an object with time_s and the values of a face"
+            ) from None
+
+
+def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
+    """Return the columns of FAPs or of one set of shapes, and their FAPs at a value of 1."""
+    fap_rows = np.eye(NUM_FAPS)
+    tables = [
+        [(name, fap_rows[number - 1]) for name, number in FAP_NUMBER.items()],
+        *(list(zip(shapes.names, shapes.basis, strict=True)) for shapes in SHAPE_SETS.values()),
+    ]
+    known = max(
+        ([(name, row) for name, row in table if name.lower() in names] for table in tables), key=len
+    )
+    if not known:
+        raise UserError(f"{path}: no column has the name of a FAP or of a shape such as jawOpen")
+    for angle, fap in _HEAD_FAPS.items():
+        if angle.lower() in names:
+            known.append((angle, fap_rows[FAP_NUMBER[fap] - 1] / RADIANS_PER_ANGLE_UNIT))
+    return [names.index(name.lower()) for name, _ in known], np.array([row for _, row in known])
+
+
+def _times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
+    try:
+        fields = np.array([str(time).split(":") for time in times], np.float64)
+        if fields.ndim != 2 or fields.shape[1] != (4 if is_time_code else 1):
+            raise ValueError
+        if not np.isfinite(fields).all():
+            raise ValueError
+    except ValueError:
+        form = "a time code HH:MM:SS:FF.fff" if is_time_code else "a time in seconds"
+        raise UserError(f"{path}: every line needs {form}") from None
+    if not is_time_code:
+        return fields[:, 0]
+    hours, minutes, seconds, frames = fields.T
+    crosses_a_second = len(np.unique(seconds)) > 1
+    rate_hz = next(
+        (rate for rate in _TIME_CODE_RATES_HZ if crosses_a_second and frames.max() < rate),
+        _TIME_CODE_RATES_HZ[-1],
+    )
+    times_s: Float64 = 3600 * hours + 60 * minutes + seconds + frames / rate_hz
+    midnights = np.cumsum(np.diff(times_s, prepend=times_s[0]) < -_DAY_S / 2)
+    return times_s + midnights * _DAY_S
+
+
+def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
+    steps_s = np.diff(times_s)
+    if (steps_s < 0).any():
+        number = int(np.argmax(steps_s < 0)) + 2
+        raise UserError(f"{path}, frame {number}: its time is earlier than that of the last frame")
+    times_s, first = np.unique(times_s - times_s[0], return_index=True)
+    rate_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 1 else 50.0
+    num_frames = round(times_s[-1] * rate_hz) + 1
+    if not 1.0 <= rate_hz <= 1000.0 or num_frames > 10 * len(times_s) + 1000:
+        raise UserError(f"{path}: the times are not those of 1 to 1000 frames per second")
+    grid_s = np.arange(num_frames) / rate_hz
+    columns = [np.interp(grid_s, times_s, column) for column in faps[first].T]
+    return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))

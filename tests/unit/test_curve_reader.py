@@ -1,0 +1,115 @@
+"""Tables of curves are read as they were written; unclear ones are rejected with their fault."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kouxing.services.cli.curve_reader import read_table
+from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
+from kouxing.services.cli.options import CurveForm, ExportOptions
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.shapes import ARKIT
+from kouxing.shared.phones.events import Phone
+
+pytestmark = pytest.mark.unit
+RATE_HZ = 50.0
+JAW = FAP_NUMBER["open_jaw"] - 1
+HEAD_YAW = FAP_NUMBER["head_yaw"] - 1
+
+
+def face_curves() -> Curves:
+    faps = np.zeros((60, NUM_FAPS), np.float32)
+    for row, jaw_open in zip(faps, np.linspace(0.0, 0.5, 60), strict=True):
+        row[:] = ARKIT.faps(np.where(np.array(ARKIT.names) == "jawOpen", jaw_open, 0.0))
+        row[HEAD_YAW] = 5000.0
+    rows = [(number / RATE_HZ, number, row) for number, row in enumerate(faps)]
+    phone = Phone(index=0, symbol="a", onset_s=0.1, duration_s=0.195, confidence=1.0, final=True)
+    return Curves(rows, RATE_HZ, [phone])
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "has_head"),
+    [
+        ("face.csv", CurveForm.FAPS, True),
+        ("face.jsonl", CurveForm.FAPS, True),
+        ("face.csv", CurveForm.ARKIT, False),
+        ("face.jsonl", CurveForm.ARKIT, False),
+        ("face.csv", CurveForm.LIVELINK, True),
+    ],
+)
+def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveForm, has_head: bool) -> None:
+    path, curves = tmp_path / name, face_curves()
+    CURVE_EXPORTERS[path.suffix](path, ExportOptions(form=form)).write(curves)
+    animation = read_table(path)
+    assert animation.frame_rate_hz == pytest.approx(RATE_HZ)
+    faps = np.array([row for _, _, row in curves.rows])
+    np.testing.assert_allclose(animation.faps[:, JAW], faps[:, JAW], atol=5.0)
+    np.testing.assert_allclose(animation.faps[:, HEAD_YAW], 5000.0 * has_head, atol=1.0)
+
+
+def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
+    path = tmp_path / "take.csv"
+    CURVE_EXPORTERS[".csv"](path, ExportOptions(form=CurveForm.LIVELINK)).write(face_curves())
+    header, *rows = csv.reader(path.read_text().splitlines())
+    assert header[:3] == ["Timecode", "BlendShapeCount", "EyeBlinkLeft"]
+    assert header[16:20] == ["JawForward", "JawRight", "JawLeft", "JawOpen"]
+    assert header[-9:-5] == ["HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw"]
+    assert {len(row) for row in rows} == {63}
+    assert [row[0] for row in rows[49:51]] == ["00:00:00:58.800", "00:00:01:00.000"]
+    assert rows[0][1] == "61"
+
+
+def test_tables_have_the_phone_of_each_frame(tmp_path: Path) -> None:
+    path = tmp_path / "face.csv"
+    CURVE_EXPORTERS[".csv"](path, ExportOptions()).write(face_curves())
+    phones = [row["phone"] for row in csv.DictReader(path.read_text().splitlines())]
+    assert phones[4:16] == ["", *["a"] * 10, ""]
+
+
+@pytest.mark.parametrize(
+    ("codes", "times_s"),
+    [
+        (["13:13:04:31.652", "13:13:04:33.652"], [0, 2 / 60]),
+        (["10:00:00:28.0", "10:00:00:29.0", "10:00:01:00.0"], [0, 1 / 30, 2 / 30]),
+        (["23:59:59:59.0", "00:00:00:00.0"], [0, 1 / 60]),
+    ],
+)
+def test_time_codes(tmp_path: Path, codes: list[str], times_s: list[float]) -> None:
+    path = tmp_path / "take.csv"
+    rows = [f"{code},61,{number * 0.1}\n" for number, code in enumerate(codes)]
+    path.write_text("Timecode,BlendShapeCount,JawOpen\n" + "".join(rows))
+    animation = read_table(path)
+    assert 1 / animation.frame_rate_hz == pytest.approx(times_s[1])
+    assert len(animation.faps) == len(times_s)
+    assert animation.faps[-1, JAW] == pytest.approx(
+        ARKIT.basis[ARKIT.names.index("jawOpen"), JAW] * 0.1 * (len(codes) - 1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.csv", "frame,jawOpen\n0,0.5\n", "no times; add a column time_s or Timecode"),
+        ("a.csv", "time_s,nose\n0,0.5\n", "no column has the name of a FAP or of a shape"),
+        ("a.csv", "time_s,jawOpen\n0,nan\n", "frame 1: a value is missing or not a number"),
+        ("a.csv", "time_s,jawOpen\n0,0.1\n0.02\n", "frame 2: a value is missing"),
+        ("a.csv", "time_s,jawOpen\n0.1,0\n0,0\n", "frame 2: its time is earlier"),
+        ("a.csv", "time_s,jawOpen\nnow,0\n", "every line needs a time in seconds"),
+        ("a.csv", "time_s,jawOpen\n0,0\n40,0\n", "1 to 1000 frames per second"),
+        ("a.csv", "Timecode,JawOpen\n00:01,0\n", "every line needs a time code"),
+        ("a.csv", "", "no times"),
+        ("a.csv", "time_s,jawOpen\n", "every line needs"),
+        ("a.jsonl", '{"time_s": 0}\n', "line 1: expected an object with time_s"),
+        ("a.jsonl", '{"faps": [0]}\n', "line 1: expected an object with time_s"),
+        ("a.jsonl", "[" * 5000, "line 1: expected an object"),
+    ],
+)
+def test_rejects_an_unclear_table(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_table(tmp_path / name)
