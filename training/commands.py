@@ -134,29 +134,15 @@ def gmm(
 def neural(
     corpus: Corpora,
     output: Model,
-    aligner: Annotated[
-        Path | None, typer.Option(help="Model for the first alignment. Default: --start-from.")
-    ] = None,
-    whisper: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of Whisper base for faster-whisper: the teacher and the initial weights."
-        ),
-    ] = None,
-    start_from: Annotated[
-        Path | None,
-        typer.Option(help="Neural model to train further; without --whisper, with no teacher."),
-    ] = None,
+    aligner: Annotated[Path, typer.Option(help="Model that aligns the recordings.")],
+    whisper: Whisper,
     untranscribed: Untranscribed = None,
     phone_lm: PhoneLm = None,
     seed: Seed = 0,
-    look_ahead_ms: Annotated[
-        float, typer.Option(help="Look-ahead to train for, a multiple of 10 ms.")
-    ] = 10.0,
-    steps: Annotated[int, typer.Option(min=1, help="Number of batches of 30 s of audio.")] = 800,
+    steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 800,
     any_license: AnyLicense = False,
 ) -> None:
-    """Train the neural recognizer, and write its model card and training curves."""
+    """Train the neural recognizer, and write its model card."""
     with _neural_training(output):
         from kouxing.training.neural.recipe import train_neural
 
@@ -165,10 +151,8 @@ def neural(
         output,
         aligner=aligner,
         whisper=whisper,
-        start=start_from,
         untranscribed=untranscribed or [],
         phone_lm=phone_lm,
-        look_ahead_ms=look_ahead_ms,
         seed=seed,
         num_steps=steps,
         shipping=not any_license,

@@ -19,12 +19,11 @@ def write_card(
     examples: Sequence[Example],
     errors: RowErrors,
     chosen: SearchWeights | None,
-    measure: str = "phone error rate",
 ) -> None:
     """Write the card of the model in ``output``, with the suffix ``.md``.
 
     ``details`` describe the training as part of a sentence. ``chosen`` are the search weights, if
-    they were chosen on development data, and ``measure`` names their error rate.
+    they were chosen on development data.
     """
     by_license: dict[str, list[Example]] = defaultdict(list)
     for example in examples:
@@ -49,6 +48,6 @@ def write_card(
         lines += [
             "",
             f"Chosen on dev: acoustic scale {chosen.acoustic_scale}, phone penalty "
-            f"{chosen.phone_penalty}; {measure} there {100 * chosen.error_rate:.1f} %.",
+            f"{chosen.phone_penalty}; phone error rate there {100 * chosen.error_rate:.1f} %.",
         ]
     output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -19,12 +19,9 @@ from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.vtln import without_pitch
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.training_set import Example, Report, load_examples
 
 M = TypeVar("M", GmmModel, NeuralModel)
-# Computes the error rate of recordings from their scaled scores, (frames, states) each.
-ErrorRate = Callable[[Topology, Sequence[NDArray[np.float32]], Sequence[Example]], float]
 
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
 _PHONE_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)
@@ -45,7 +42,7 @@ class SearchWeights:
         return replace(model, topology=topology, acoustic_scale=self.acoustic_scale)
 
 
-def offline_error_rate(
+def _offline_error_rate(
     topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
 ) -> float:
     """Compute the phone error rate of offline decoding from scores, (frames, states) each."""
@@ -68,16 +65,23 @@ def choose_search_weights(
     scales: Sequence[float] = _SCALES,
     shipping: bool = True,
     with_samples: bool = False,
-    rate: ErrorRate = offline_error_rate,
     report: Report = print,
 ) -> SearchWeights | None:
     """Choose the weights with the lowest error rate on the split ``dev``; None if it is empty.
 
     ``model`` has an acoustic scale of 1. ``with_samples`` computes the features with the model's
-    front end instead of from cached log-mel features. ``rate`` is minimized.
+    front end instead of from cached log-mel features.
     """
-    dev = load_dev(corpora, model.inventory, shipping=shipping, with_samples=with_samples)
-    if not dev:
+    try:
+        dev = load_examples(
+            corpora,
+            RowErrors(),
+            model.inventory,
+            split="dev",
+            shipping=shipping,
+            with_samples=with_samples,
+        )
+    except UserError:
         report("no dev recordings; acoustic scale and phone penalty keep their defaults")
         return None
     scores = list(all_scores(model, dev))
@@ -85,7 +89,8 @@ def choose_search_weights(
     for scale in scales:
         scaled = [np.float32(scale) * rows for rows in scores]
         for phone_penalty in _PHONE_PENALTIES:
-            error_rate = rate(replace(model.topology, phone_penalty=phone_penalty), scaled, dev)
+            topology = replace(model.topology, phone_penalty=phone_penalty)
+            error_rate = _offline_error_rate(topology, scaled, dev)
             if best is None or error_rate < best.error_rate:
                 best = SearchWeights(scale, phone_penalty, error_rate)
                 report(
@@ -93,23 +98,6 @@ def choose_search_weights(
                     f"penalty {phone_penalty}"
                 )
     return best
-
-
-def load_dev(
-    corpora: Sequence[Path], inventory: PhoneInventory, *, shipping: bool, with_samples: bool
-) -> list[Example]:
-    """Load the recordings of the split ``dev``; empty if the corpora have none."""
-    try:
-        return load_examples(
-            corpora,
-            RowErrors(),
-            inventory,
-            split="dev",
-            shipping=shipping,
-            with_samples=with_samples,
-        )
-    except UserError:
-        return []
 
 
 def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
@@ -129,6 +117,6 @@ def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[ND
 
 
 def _features(model: AcousticModel, example: Example) -> NDArray[np.float32]:
-    if example.samples is None:
+    if not len(example.samples):
         return without_pitch(example.log_mel.astype(np.float32))
     return model.create_front_end().accept_waveform(as_floats(example.samples))

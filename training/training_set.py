@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,6 +40,7 @@ _MIN_FRAMES_PER_PHONE = 3
 _MARGIN_FRAMES = 25  # silence that is kept at both ends
 _MIN_PIECE_FRAMES = 20  # shorter recordings without text are skipped
 _MAX_PIECE_FRAMES = 2000  # longer recordings without text are cut
+_NO_SAMPLES = np.empty(0, np.int16)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +53,8 @@ class Example:
     weight: float  # weight of its frames in the estimates
     license: str = ""
     speaker: str = ""
-    samples: NDArray[np.int16] | None = None  # (n,) 16 kHz, the samples of the frames
+    # samples of the frames at 16 kHz, (n,), if they were loaded
+    samples: NDArray[np.int16] = field(default_factory=lambda: _NO_SAMPLES)
 
     @property
     def kind(self) -> str:
@@ -80,7 +82,7 @@ def load_examples(
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
-    sounds: list[NDArray[np.int16] | None] = []
+    sounds: list[NDArray[np.int16]] = []
     for corpus in corpora:
         rows = read_corpus(corpus, errors, inventory, split=split)
         for row in rows:
@@ -91,7 +93,7 @@ def load_examples(
         rows = [row for row in rows if not shipping or may_ship(row.license)]
         utterances += rows
         log_mels += log_mel_of(rows, errors)
-        sounds += samples_of(rows) if with_samples else [None] * len(rows)
+        sounds += samples_of(rows) if with_samples else [_NO_SAMPLES] * len(rows)
     weights = _weights(utterances, synthetic_weight)
     examples = []
     for utterance, weight, log_mel, sound in zip(
@@ -112,7 +114,7 @@ def load_examples(
                 weight=weight,
                 license=utterance.license,
                 speaker=utterance.speaker,
-                samples=None if sound is None else sound[_samples_of(span, len(trimmed))],
+                samples=sound[_samples_of(span, len(trimmed))],
             )
         )
     if not examples:

@@ -17,7 +17,7 @@ from kouxing.training.blocks.network import RIGHT_CONTEXT, BlockEncoder, BlockRe
 from kouxing.training.blocks.readout import encode_windows, train_readout
 from kouxing.training.blocks.recipe import train_blocks
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
-from kouxing.training.neural import teacher
+from kouxing.training.neural import optimizer, teacher
 from kouxing.training.neural.batches import Recording, Targets
 from kouxing.training.neural.network import Readout, ReadoutShape
 from kouxing.training.neural.teacher import WholeEncoder
@@ -112,13 +112,12 @@ def test_codecs_and_clipping_do_not_shift_the_audio(
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "BATCH_S", 2)
-    monkeypatch.setattr(batches, "_LENGTHS", (20, 40))
-    monkeypatch.setattr(trainer, "_SAVE_EVERY", 2)
+    monkeypatch.setattr(batches, "_LENGTHS", (30, 40))
+    monkeypatch.setattr(optimizer, "SAVE_EVERY", 2)
     monkeypatch.setattr(readout, "READOUT", SMALL_READOUT)
     monkeypatch.setattr(readout, "BATCH_S", 3)
     monkeypatch.setattr(readout, "MAX_WINDOW_FRAMES", 80)
     monkeypatch.setattr(readout, "_FIXED_FRAMES", 50)
-    monkeypatch.setattr(readout, "_SAVE_EVERY", 4)
 
 
 @pytest.mark.usefixtures("quick")
@@ -148,7 +147,7 @@ def test_the_readout_learns_tones_and_resumes(
     assert lines[-1].startswith("step 120: ")
 
     def interrupted(line: str) -> None:
-        if line.startswith("step 8:"):
+        if line.startswith("step 6:"):
             raise KeyboardInterrupt
 
     first = train(12, "first").state_dict()
@@ -184,7 +183,7 @@ def test_the_encoder_learns_and_resumes(tmp_path: Path, monkeypatch: pytest.Monk
         )  # fmt: skip
 
     train(20, "whole")
-    first, last = (float(lines[place].split()[2]) for place in (0, -1))
+    first, last = (float(lines[place].split()[3]) for place in (0, -1))
     assert last < first - 0.1
     begun = small_network().state_dict()
     done = train(4, "first").state_dict()

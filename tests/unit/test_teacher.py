@@ -122,7 +122,7 @@ def test_a_position_encodes_two_frames() -> None:
 
 
 def taught(num_steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Teacher, list[str]]:
-    monkeypatch.setattr(teacher, "_BATCH_POSITIONS", 200)
+    monkeypatch.setattr(teacher, "_NUM_CROPS", 7)
     monkeypatch.setattr(teacher, "_CROP_POSITIONS", 30)
     monkeypatch.setattr(teacher, "_NUM_STEPS", num_steps)
     lines: list[str] = []

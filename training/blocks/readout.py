@@ -49,7 +49,6 @@ _MIN_FRAMES = 10
 _READ_FRAMES, _EARLIER_WEIGHT = 40, 0.25
 _WARM_UP_STEPS = 30
 _FALLING = 0.6  # fraction of the steps, at the end, over which the rate falls to 0
-_SAVE_EVERY = 25  # steps
 
 Floats = NDArray[np.float32]
 
@@ -75,21 +74,19 @@ def train_readout(
     readout.standardize(some)
     groups = [{"params": list(readout.parameters()), "lr": 2e-3}]
     optimizer = Optimizer(readout, groups, weight_decay=0.02, max_norm=2.0, mean_exponent=8)
-    first_step = optimizer.load(checkpoint)
-    if first_step:
-        report(f"resuming after step {first_step}")
-    losses = []
-    for step in range(first_step, num_steps):
-        torch.manual_seed(seed + step)
+
+    def loss(step: int) -> Tensor:
         features, states, probs = batches.get(_batch(step))
-        loss = cross_entropy(readout(features), states, probs)
-        optimizer.step(loss, rise_and_fall(step, num_steps, _WARM_UP_STEPS, _FALLING))
-        losses.append(float(loss.detach()))
-        if (step + 1) % _SAVE_EVERY == 0 or step + 1 == num_steps:
-            report(f"step {step + 1}: {np.mean(losses):.3f} nats a frame")
-            losses = []
-            optimizer.save(checkpoint, step + 1)
-    return optimizer.mean.eval()
+        return cross_entropy(readout(features), states, probs)
+
+    return optimizer.train(
+        loss,
+        lambda step: rise_and_fall(step, num_steps, _WARM_UP_STEPS, _FALLING),
+        num_steps=num_steps,
+        seed=seed,
+        report=report,
+        checkpoint=checkpoint,
+    )
 
 
 class Batches:

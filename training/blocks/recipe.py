@@ -1,15 +1,12 @@
 """From corpora to the block model: labels, readout, tuned encoder, model card.
 
 A trained neural model supplies HMMs, phone language model, state prior and acoustic scale, and
-aligns the recordings with their texts. First a readout is trained on windows of Whisper's unchanged
-encoder. Then encoder and readout are tuned in blocks.
+aligns the recordings with their texts (:mod:`kouxing.training.neural.labels`). First a readout is
+trained on windows of Whisper's unchanged encoder. Then encoder and readout are tuned in blocks.
 
 Training can be interrupted. Labels and checkpoints are stored next to the output, as
 ``.labels.npz``, ``.readout.pt`` and ``.network.pt``. The same command resumes from them, and
 deletes them at the end.
-
-The teacher (:mod:`kouxing.training.neural.teacher`) learns the alignment and labels all recordings,
-clean and whole. A target is the average of both, or only the teacher's label if there is no text.
 """
 
 from __future__ import annotations
@@ -20,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
@@ -33,97 +29,20 @@ from kouxing.training.blocks.network import BlockEncoder, BlockReadout
 from kouxing.training.blocks.readout import train_readout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
 from kouxing.training.model_card import write_card
-from kouxing.training.neural.alignment import align_all, aligner_scores, samples_of
 from kouxing.training.neural.batches import Recording, Targets
 from kouxing.training.neural.initial_network import init_encoder, load_whisper
-from kouxing.training.neural.teacher import WholeEncoder, process_all, train_teacher
-from kouxing.training.training_set import (
-    FRAMES_PER_MINUTE,
-    Example,
-    Report,
-    load_examples,
-    load_untranscribed,
-)
-
-_FULL_FOLDER_MINUTES = 35  # longer folders get the weight of this much speech
-
-
-def label(
-    examples: Sequence[Example],
-    untranscribed: Sequence[Path],
-    *,
-    aligner: NeuralModel,
-    encoder: WholeEncoder,
-    errors: RowErrors,
-    seed: int,
-    report: Report,
-) -> list[Recording]:
-    """Align and label a random selection of recordings.
-
-    ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
-    folders of recordings without text. ``encoder`` is Whisper's, for the teacher.
-    """
-    rng = np.random.default_rng(seed)
-    drawn: list[Example] = []
-    for kind, (_, limit) in _KINDS.items():
-        of_kind = [example for example in examples if example.kind == kind]
-        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:limit]]
-    folders: list[list[NDArray[np.int16]]] = []
-    for folder in untranscribed:
-        pieces = load_untranscribed([folder], errors)
-        folders.append(
-            [pieces[place] for place in rng.permutation(len(pieces))[:_MAX_UNTRANSCRIBED]]
-        )
-    aligned = align_all(aligner_scores(aligner, drawn), aligner.topology, drawn, report)
-    frames = dict.fromkeys(_KINDS, 0.0)
-    for one in aligned:
-        frames[one.example.kind] += one.example.weight * len(one.states)
-    recordings = []
-    for one in aligned:
-        kind = one.example.kind
-        weight = _KINDS[kind][0] * one.example.weight * len(one.states) / frames[kind]
-        targets = Targets.hard(one.states)
-        recordings.append(
-            Recording(samples=samples_of(one.example), targets=targets, weight=weight)
-        )
-    teacher = train_teacher(encoder, recordings, seed=seed, report=report)
-    all_sounds = [
-        *(recording.samples for recording in recordings),
-        *(sound for sounds in folders for sound in sounds),
-    ]
-    labels = process_all(teacher.targets_of, all_sounds, "labeled by the teacher", report)
-    labeled = [
-        Recording(
-            samples=recording.samples,
-            targets=recording.targets.averaged_with(targets),
-            weight=recording.weight,
-        )
-        for recording, targets in zip(recordings, labels, strict=False)
-    ]
-    rest = iter(labels[len(recordings) :])
-    of_folders = [list(zip(sounds, rest, strict=False)) for sounds in folders]
-    sizes = [sum(len(targets) for _, targets in pairs) for pairs in of_folders]
-    counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
-    for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
-        for sound, targets in pairs:
-            weight = _UNTRANSCRIBED_SHARE * count / sum(counted) * len(targets) / size
-            labeled.append(Recording(samples=sound, targets=targets, weight=weight))
-    return labeled
+from kouxing.training.neural.labels import Mix, label
+from kouxing.training.training_set import FRAMES_PER_MINUTE, Report, load_examples
 
 
 def save_labels(path: Path, recordings: Sequence[Recording]) -> None:
     """Write labeled recordings, so that training can resume."""
-    width = max(recording.targets.states.shape[1] for recording in recordings)
-
-    def padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
-        return np.pad(rows, ((0, 0), (0, width - rows.shape[1])))
-
     np.savez(
         path,
         samples=np.concatenate([recording.samples for recording in recordings]),
         num_samples=[len(recording.samples) for recording in recordings],
-        states=np.concatenate([padded(recording.targets.states) for recording in recordings]),
-        probs=np.concatenate([padded(recording.targets.probs) for recording in recordings]),
+        states=np.concatenate([recording.targets.states for recording in recordings]),
+        probs=np.concatenate([recording.targets.probs for recording in recordings]),
         num_frames=[len(recording.targets) for recording in recordings],
         weights=[recording.weight for recording in recordings],
     )
@@ -142,14 +61,9 @@ def load_labels(path: Path) -> list[Recording]:
     ]
 
 
-NUM_READOUT_STEPS, NUM_STEPS = 450, 475
 BLOCK_LENGTH = 5  # positions, live
 _PHONE_PENALTY = 2.0  # most of the network's errors are deletions
-
-# of each kind of speech: share in training, and maximum number of recordings
-_KINDS = {"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)}
-_UNTRANSCRIBED_SHARE = 0.72
-_MAX_UNTRANSCRIBED = 3000  # pieces of each folder
+_MIX = Mix({"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)}, 0.72)
 
 
 def train_blocks(
@@ -160,8 +74,8 @@ def train_blocks(
     start: Path | None = None,
     untranscribed: Sequence[Path] = (),
     seed: int = 0,
-    num_readout_steps: int = NUM_READOUT_STEPS,
-    num_steps: int = NUM_STEPS,
+    num_readout_steps: int = 450,
+    num_steps: int = 475,
     shipping: bool = True,
     report: Report = print,
 ) -> None:
@@ -176,7 +90,7 @@ def train_blocks(
         raise UserError(f"{start} is not a neural model; give one from 'kouxing train neural'")
     torch.set_num_threads(1)  # the same sums on every machine
     torch.manual_seed(seed)
-    whole = init_encoder(whisper, before.topology.num_states).eval()
+    whole = init_encoder(whisper, before.topology.num_states)
     errors = RowErrors()
     examples = load_examples(
         corpora, errors, before.inventory, shipping=shipping, with_samples=True
@@ -185,9 +99,10 @@ def train_blocks(
         output.with_suffix(suffix) for suffix in (".labels.npz", ".readout.pt", ".network.pt")
     ]
     if not labels.exists():
-        labeled = label(
+        _, labeled = label(
             examples,
             untranscribed,
+            _MIX,
             aligner=before,
             encoder=whole,
             errors=errors,

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -41,7 +40,6 @@ _RATE, _READOUT_RATE = 1e-4, 6e-4  # of the last layer, of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above
 _WARM_UP_STEPS = 60
 _HIDDEN_WEIGHT, _RIGHT_WEIGHT = 0.5, 0.5  # of a loss
-_SAVE_EVERY = 25  # steps
 
 
 class BlockNetwork(nn.Module):
@@ -70,31 +68,19 @@ def train_network(
     """
     groups = _groups(network)
     optimizer = Optimizer(network, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=3)
-    first_step = optimizer.load(checkpoint)
-    if first_step:
-        report(f"resuming after step {first_step}")
     network.train()
-    recent = []
-    for step in range(first_step, num_steps):
-        torch.manual_seed(seed + step)
-        losses = losses_of(network, teacher, block_batch(recordings, seed, step))
-        weights = torch.tensor([1.0, _HIDDEN_WEIGHT])
-        loss = (losses @ weights) @ torch.tensor([1.0, _RIGHT_WEIGHT])
-        optimizer.step(loss, min(1.0, (step + 1) / _WARM_UP_STEPS))
-        recent.append(losses.detach().flatten().numpy())
-        if (step + 1) % _SAVE_EVERY == 0 or step + 1 == num_steps:
-            own, own_hidden, right, right_hidden = np.mean(recent, axis=0)
-            recent = []
-            report(
-                f"step {step + 1}: {own:.3f} nats a frame, {own_hidden:.3f} from the teacher; "
-                f"right context {right:.3f} nats, {right_hidden:.3f}"
-            )
-            optimizer.save(checkpoint, step + 1)
-    return optimizer.mean.eval()
+    return optimizer.train(
+        lambda step: _loss(network, teacher, block_batch(recordings, seed, step)),
+        lambda step: min(1.0, (step + 1) / _WARM_UP_STEPS),
+        num_steps=num_steps,
+        seed=seed,
+        report=report,
+        checkpoint=checkpoint,
+    )
 
 
-def losses_of(network: BlockNetwork, teacher: WholeEncoder, batch: BlockBatch) -> Tensor:
-    """Compute a batch's losses, (2, 2): cross-entropy and distance, of own and right positions."""
+def _loss(network: BlockNetwork, teacher: WholeEncoder, batch: BlockBatch) -> Tensor:
+    """Compute the loss of a batch."""
     num_positions = batch.states.shape[1]
     laid = layout(num_positions, batch.block_length)
     with mixed_precision():
@@ -107,8 +93,9 @@ def losses_of(network: BlockNetwork, teacher: WholeEncoder, batch: BlockBatch) -
     losses = []
     for part in (slice(num_positions), slice(num_positions, None)):
         entropy = cross_entropy(log_posteriors[:, part], states[:, part], probs[:, part])
-        losses.append(torch.stack([entropy, apart[:, part].square().mean()]))
-    return torch.stack(losses)
+        losses.append(entropy + _HIDDEN_WEIGHT * apart[:, part].square().mean())
+    result: Tensor = losses[0] + _RIGHT_WEIGHT * losses[1]
+    return result
 
 
 def _groups(network: BlockNetwork) -> list[dict[str, object]]:

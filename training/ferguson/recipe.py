@@ -227,7 +227,7 @@ def _least_squares(weights: Array, height: Array, start: Array) -> Array:
         np.concatenate([height, ridge * start]),
         (0.0, MAX_OPENING),
     )
-    return np.clip(result.x, 0.0, MAX_OPENING)
+    return np.asarray(np.clip(result.x, 0.0, MAX_OPENING))
 
 
 _MIN_SYLLABLES = 3  # isolated words are slower than connected speech

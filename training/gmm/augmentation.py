@@ -87,7 +87,7 @@ class Augmentation:
         if self.narrow:
             outside = (_NARROW_HZ[0] > BAND_HZ) | (_NARROW_HZ[1] < BAND_HZ)
             out[:, 1:][:, outside] -= _NARROW_LOSS
-        return np.maximum(out, LOG_FLOOR).astype(np.float32)
+        return np.asarray(np.maximum(out, LOG_FLOOR).astype(np.float32))
 
     def _noise(self, power: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw a noise relative to the recording's level, energies of shape (frames, 41)."""
@@ -104,4 +104,4 @@ class Augmentation:
         at = np.clip(np.interp(source, BAND_MEL, np.arange(NUM_BANDS)), 0, NUM_BANDS - 1)
         low = np.minimum(at.astype(int), NUM_BANDS - 2)
         fraction = (at - low).astype(np.float32)
-        return (1 - fraction) * bands[:, low] + fraction * bands[:, low + 1]
+        return np.asarray((1 - fraction) * bands[:, low] + fraction * bands[:, low + 1])

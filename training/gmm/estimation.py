@@ -204,7 +204,7 @@ def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> Hmm:
 
 def variance_floor(frames: FrameSet) -> NDArray[np.float32]:
     """Lowest variance of a component, shape (39,)."""
-    return _VARIANCE_FLOOR * frames.features.var(axis=0)
+    return np.asarray(_VARIANCE_FLOOR * frames.features.var(axis=0))
 
 
 def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:

@@ -152,4 +152,4 @@ def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
         cepstra_of_all(example.log_mel.astype(np.float32)).mean(axis=0)
         for example in examples[::step]
     ]
-    return np.mean(means, axis=0, dtype=np.float32)
+    return np.asarray(np.mean(means, axis=0, dtype=np.float32))

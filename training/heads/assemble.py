@@ -80,7 +80,7 @@ class Builder:
         for name, amount in face_units:
             vertices += amount * self._source.face_unit(name)
         joint = np.unique(self._mesh.quads[self._mesh.group("joint-head")])
-        return vertices - vertices[joint].mean(axis=0) + PIVOT
+        return np.asarray(vertices - vertices[joint].mean(axis=0) + PIVOT)
 
     def _skin(self, vertices: Float) -> Skin:
         skin = subdivided(vertices, self._face)

@@ -261,7 +261,7 @@ def _direction(azimuth: Float, polar: Float) -> Float:
     side = np.array([1.0, 0.0, 0.0])
     front = np.cross(side, up)
     level = np.cos(azimuth)[:, None] * front + np.sin(azimuth)[:, None] * side
-    return np.cos(polar)[:, None] * up + np.sin(polar)[:, None] * level
+    return np.asarray(np.cos(polar)[:, None] * up + np.sin(polar)[:, None] * level)
 
 
 def _about_crown(points: Float) -> tuple[Float, Float]:
@@ -283,7 +283,7 @@ def _radius(scalp: Float, direction: Float) -> Float:
     surface = interpolate.RBFInterpolator(
         away / length[:, None], length, neighbors=24, smoothing=1e-3, kernel="linear"
     )
-    return surface(direction)
+    return np.asarray(surface(direction))
 
 
 Hair = Bob | Crop

@@ -108,7 +108,8 @@ class MakeHuman:
 
     def _rig(self) -> dict[str, list[list[float]]]:
         text = self._archive.read(_DATA + "rigs/standard/weights.default.json")
-        return json.loads(text)["weights"]
+        weights: dict[str, list[list[float]]] = json.loads(text)["weights"]
+        return weights
 
     def bones(self) -> list[str]:
         """Return the names of the default rig's bones."""

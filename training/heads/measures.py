@@ -38,7 +38,7 @@ def measure_fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float
     """Measure the FAPU of the face, dm."""
 
     def at(name: str) -> Float:
-        return skin.vertices[skin.point(name)]
+        return np.asarray(skin.vertices[skin.point(name)])
 
     left, right = eye_centers(vertices, mesh)
     return {
@@ -56,7 +56,7 @@ def mouth_cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
     lining = mesh.group("body") & (islands[:, 1] < 0.137) & (islands[:, 0] > 0.7)
     is_lining = np.zeros(len(mesh.vertices))
     is_lining[mesh.quads[lining]] = 1.0
-    return skin.matrix @ is_lining[skin.base] > 0.5
+    return np.asarray(skin.matrix @ is_lining[skin.base] > 0.5)
 
 
 def eye_sockets(mesh: BaseMesh) -> Index:

@@ -29,7 +29,7 @@ def skin_uv(vertices: Float) -> Float:
     angle = np.abs(np.arctan2(np.abs(vertices[:, 0]), vertices[:, 2] - AXIS_Z))
     u = np.interp(angle, _ANGLES, _COLUMNS)
     v = (TOP_Y - vertices[:, 1]) / (TOP_Y - BOTTOM_Y)
-    return np.clip(np.stack([u, v], axis=1), 0.0, 1.0)
+    return np.asarray(np.clip(np.stack([u, v], axis=1), 0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +204,7 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     color = np.array(look.lip) * (1 + 0.022 * lines[..., None])
     image = image + (color - image) * (look.lip_strength * inside)[..., None]
     below = _spot(face, 0.0, 5.005, 0.15, 0.024) * (1 - inside)
-    return image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33])
+    return np.asarray(image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33]))
 
 
 def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, width: float) -> Float:

@@ -73,7 +73,7 @@ def pupil_growth(part: Part, center: Float) -> Float:
     weight = np.interp(angle, [0.0, PUPIL_ANGLE, IRIS_ANGLE], [0.0, 1.0, 0.0])
     outward = (part.vertices - center) * [1.0, 1.0, 0.0]
     length = np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    return weight[:, None] * outward / length
+    return np.asarray(weight[:, None] * outward / length)
 
 
 # widths in mm from the middle outward: incisors, canine, premolars, molars

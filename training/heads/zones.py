@@ -54,7 +54,7 @@ class Skin:
 
     def carry(self, target: Float) -> Float:
         """Transfer displacements (19158, 3) of the base mesh to the fine vertices."""
-        return self.matrix @ target[self.base]
+        return np.asarray(self.matrix @ target[self.base])
 
     def point(self, name: str) -> int:
         """Find the vertex of a feature point."""

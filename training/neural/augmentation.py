@@ -3,7 +3,7 @@
 Sources: Ko et al. 2015, "Audio augmentation for speech recognition" (speed by resampling, which
 also moves pitch and formants); Ko et al. 2017, "A study on data augmentation of reverberant speech
 for robust speech recognition" (rooms and noise); Polack 1988 (a room's response is a decaying
-noise); Park et al. 2019, "SpecAugment" (masks of frames and bands).
+noise).
 
 ======== ============================================================= ============
 symbol   meaning                                                       unit, shape
@@ -56,7 +56,6 @@ _KNOCK_SAMPLES = 160
 _KNOCK_RATE = 0.03  # fraction of the pieces of this length with a knock
 _MIN_PEAK_DB = -36.0  # relative to full scale
 _MIN_LOG_TEMPO, _MAX_LOG_TEMPO = -0.20, 0.25
-_MAX_MASKS, _MAX_MASKED_FRAMES, _MAX_MASKED_BANDS = 2, 12, 14
 
 
 def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples, float]:
@@ -99,7 +98,7 @@ def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
 def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.int64]:
     """Return the source frame of each frame after a change of speed, (num_frames,)."""
     at = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
-    return np.clip(np.rint(at), 0, num_source - 1).astype(np.int64)
+    return np.asarray(np.clip(np.rint(at), 0, num_source - 1).astype(np.int64))
 
 
 def change_tempo(
@@ -112,17 +111,6 @@ def change_tempo(
     fraction = (at - low)[:, None].astype(np.float32)
     changed = (1 - fraction) * frames[low] + fraction * frames[low + 1]
     return changed, np.rint(at).astype(np.int64)
-
-
-def mask(frames: NDArray[np.float32], rng: np.random.Generator) -> None:
-    """Replace some frames, and some bands of all frames, by the mean, in place."""
-    mean = frames.mean()
-    for _ in range(rng.integers(_MAX_MASKS + 1)):
-        at, width = rng.integers(len(frames)), rng.integers(1, _MAX_MASKED_FRAMES + 1)
-        frames[at : at + width] = mean
-    for _ in range(rng.integers(_MAX_MASKS + 1)):
-        at, width = rng.integers(frames.shape[1]), rng.integers(1, _MAX_MASKED_BANDS + 1)
-        frames[:, at : at + width] = mean
 
 
 def _room(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -155,8 +143,12 @@ def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
         knocks = (rng.random(num_pieces) < _KNOCK_RATE) * rng.uniform(1.0, 6.0, num_pieces)
         noise *= 1 + np.repeat(knocks, _KNOCK_SAMPLES)[:num_samples]
     below_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
-    return noise * (
-        np.sqrt(np.mean(np.square(samples)) / (np.mean(noise**2) + _TINY)) * 10 ** (-below_db / 20)
+    return np.asarray(
+        noise
+        * (
+            np.sqrt(np.mean(np.square(samples)) / (np.mean(noise**2) + _TINY))
+            * 10 ** (-below_db / 20)
+        )
     )
 
 
@@ -170,7 +162,7 @@ def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
         filters = butter(order, highest_hz, "low", fs=SAMPLE_RATE_HZ, output="sos")
     else:
         return samples
-    return sosfilt(filters, samples)
+    return np.asarray(sosfilt(filters, samples))
 
 
 def _color(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -188,4 +180,4 @@ def _random_curve(
     """Draw amplitudes over frequency; the spread of their logarithm is also drawn."""
     knots = rng.normal(0.0, rng.uniform(*spread), num_knots)
     at = np.linspace(0.0, _HALF_RATE_HZ, num_knots)
-    return np.exp(np.interp(frequency, at, knots))
+    return np.asarray(np.exp(np.interp(frequency, at, knots)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,6 @@ from kouxing.training.neural.augmentation import (
     source_frames,
 )
 
-_POOL_BATCHES = 8  # recordings of similar length are grouped within a pool of this many batches
 _MAX_FRAMES = 800  # in a batch; longer recordings are cropped
 _AUGMENT_PROB = 0.9
 _TEMPO_PROB = 0.5
@@ -51,6 +50,11 @@ class Targets:
             np.hstack([self.states, other.states]),
             np.hstack([self.probs, other.probs]) * np.float16(0.5),
         )
+
+    def widened(self, width: int) -> Targets:
+        """Add states with the probability 0, up to this number a frame."""
+        added = (0, 0), (0, width - self.states.shape[1])
+        return Targets(np.pad(self.states, added), np.pad(self.probs, added))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,32 +94,9 @@ def augment(recording: Recording, rng: np.random.Generator) -> tuple[NDArray[np.
     return frames, targets
 
 
-def batches_of(
-    draw: Callable[[], Sample], num_rows: int, rng: np.random.Generator
-) -> Iterator[Batch]:
-    """Yield batches of about ``num_rows`` rows, including padding; ``draw`` draws a sample.
-
-    The samples of a batch have similar lengths. ``rng`` draws the order of the batches.
-    """
-    while True:
-        pool: list[Sample] = []
-        size = 0
-        while size < _POOL_BATCHES * num_rows:
-            pool.append(draw())
-            size += len(pool[-1][0])
-        pool.sort(key=lambda pair: len(pair[0]))
-        groups: list[list[Sample]] = [[]]
-        for pair in pool:
-            if groups[-1] and (len(groups[-1]) + 1) * len(pair[0]) > num_rows:
-                groups.append([])
-            groups[-1].append(pair)
-        for at in rng.permutation(len(groups)):
-            yield _padded(groups[at])
-
-
-def _padded(group: Sequence[Sample]) -> Batch:
+def padded_batch(group: Sequence[Sample]) -> Batch:
     """Make a batch; short samples repeat their last row, without targets."""
-    num_rows = max(len(rows) for rows, _ in group) | 1  # odd: n positions take 2 n + 1 frames
+    num_rows = max(len(rows) for rows, _ in group)
     inputs = np.empty((len(group), num_rows, group[0][0].shape[1]), dtype=np.float32)
     num_frames = max(len(targets) for _, targets in group)
     num_states = max(targets.states.shape[1] for _, targets in group)

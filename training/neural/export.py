@@ -1,4 +1,4 @@
-"""Export a trained network to ONNX for the recognizer, and read it again.
+"""Export a trained network to ONNX for the recognizer.
 
 The graph computes ``training.neural.network.Network`` at one position for any number of sessions.
 Keys and values of earlier positions are inputs, those of this position are outputs.
@@ -26,66 +26,24 @@ Products use 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`), norms a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from kouxing.services.recognizer.acoustic.network import NUM_INPUTS, SEEN_FRAMES, WINDOW
-from kouxing.training.neural.network import Network, Shape
-from kouxing.training.neural.onnx_graph import (
-    DOMAIN,
-    Floats,
-    Graph,
-    arrays_of,
-    floats,
-    halves,
-    in_rows,
-    tensors_in,
-    weight_in,
-)
+from kouxing.training.neural.network import Network
+from kouxing.training.neural.onnx_graph import DOMAIN, Graph, arrays_of, floats, halves
 
 
-def onnx_of(network: Network, *, exact: bool = False) -> NDArray[np.uint8]:
-    """Export a network as the bytes of an ONNX file with the inputs and outputs above.
-
-    ``exact`` keeps the weights as floats. The file is then four times as large, and slower.
-    """
-    return _NetworkGraph(network, exact=exact).file_of_network()
-
-
-def network_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> Network:
-    """Read the network from an ONNX file of :func:`onnx_of`, to train it further.
-
-    ``look_aheads`` are those of the output layers, feature frames. Raises KeyError if
-    :func:`onnx_of` did not write the file.
-    """
-    stored = tensors_in(file)
-    biases = {name: array for name, array in stored.items() if name.endswith(".bias")}
-    shape = Shape(
-        num_states=len(biases["outputs.0.bias"]) // 2,
-        look_aheads=tuple(look_aheads),
-        width=len(biases["second.bias"]),
-        heads=int(stored["by_head"][1]) // 3,
-        layers=sum(name.endswith(".outer.bias") for name in biases),
-        inner=len(biases["layers.0.inner.bias"]),
-    )
-    network = Network(shape)
-    parameters = {
-        name: torch.from_numpy(weight_in(stored, name, tuple(tensor.shape)).copy())
-        for name, tensor in network.state_dict().items()
-    }
-    network.load_state_dict(parameters)
-    return network
+def onnx_of(network: Network) -> NDArray[np.uint8]:
+    """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
+    return _NetworkGraph(network).file_of_network()
 
 
 class _NetworkGraph(Graph):
-    def __init__(self, network: Network, *, exact: bool) -> None:
+    def __init__(self, network: Network) -> None:
         super().__init__()
         self._shape = network.shape
-        self._exact = exact
         self._parameters = arrays_of(network)
 
     def file_of_network(self) -> NDArray[np.uint8]:
@@ -172,13 +130,3 @@ class _NetworkGraph(Graph):
             ),
         }
         return self.node("If", [is_selected], **branches)
-
-    def product(
-        self, inputs: str, parameters: Mapping[str, Floats], name: str, rows: str = "positions"
-    ) -> str:
-        """Multiply rows with a weight, and add a bias."""
-        if not self._exact:
-            return super().product(inputs, parameters, name, rows)
-        weight = self.constant(f"{name}.turned", in_rows(parameters[f"{name}.weight"]).T)
-        bias = self.constant(f"{name}.bias", parameters[f"{name}.bias"])
-        return self.node("Add", [self.node("MatMul", [inputs, weight]), bias])

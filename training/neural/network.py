@@ -91,7 +91,8 @@ class Layer(nn.Module):
         attended = attended.transpose(1, 2).reshape(batch, num_positions, width)
         hidden = hidden + self.dropout(self.attended(attended))
         inner = gelu(self.inner(self.inner_norm(hidden)))
-        return hidden + self.dropout(self.outer(inner))
+        result: Tensor = hidden + self.dropout(self.outer(inner))
+        return result
 
 
 class Encoder(nn.Module):
@@ -144,7 +145,8 @@ class Network(Encoder):
         may_attend = (back >= 0) & (back < WINDOW)
         for layer in self.layers:
             hidden = layer(hidden, may_attend)
-        return self.norm(hidden)
+        result: Tensor = self.norm(hidden)
+        return result
 
     def log_posteriors(self, hidden: Tensor, output: int) -> Tensor:
         """Run an output layer: (batch, positions, width) to (batch, positions, 2, states)."""
@@ -215,7 +217,8 @@ class Readout(nn.Module):
         standard = standard.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
         if self.training:
             standard = self._add_noise(standard)
-        return self.dropout(gelu(self.inner(standard)))
+        result: Tensor = self.dropout(gelu(self.inner(standard)))
+        return result
 
     def log_posteriors(self, context: Tensor, inner: Tensor) -> Tensor:
         """Compute the output: (batch, positions, ...) to (batch, 2 positions, states)."""

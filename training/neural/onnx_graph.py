@@ -142,7 +142,7 @@ class Graph:
 
     def weight(self, parameters: Mapping[str, Floats], name: str) -> tuple[str, str]:
         """Store a weight as integers, (inputs, outputs), and scales of its outputs."""
-        weight = in_rows(parameters[f"{name}.weight"])
+        weight = _in_rows(parameters[f"{name}.weight"])
         scale = np.maximum(np.abs(weight).max(axis=1) / _MAX_INTEGER, _MIN_SCALE)
         integers = np.rint(weight / scale[:, None]).astype(np.int8).T
         return (
@@ -190,31 +190,11 @@ def arrays_of(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
     return {prefix + name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}
 
 
-def in_rows(weight: Floats) -> Floats:
+def _in_rows(weight: Floats) -> Floats:
     """Reshape a weight to (outputs, inputs), for a convolution place by place."""
     if weight.ndim == 3:
         weight = weight.transpose(0, 2, 1)
     return weight.reshape(len(weight), -1)
-
-
-def tensors_in(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """Return the constants of an ONNX file."""
-    graph = onnx.load_model_from_string(file.tobytes()).graph
-    return {constant.name: numpy_helper.to_array(constant) for constant in graph.initializer}
-
-
-def weight_in(stored: Mapping[str, NDArray[Any]], name: str, shape: Sequence[int]) -> Floats:
-    """Read a parameter of a given shape from the constants of a file; KeyError if it is missing."""
-    if name in stored:
-        return np.asarray(stored[name], dtype=np.float32)
-    product = name.removesuffix(".weight")
-    if f"{product}.turned" in stored:
-        rows = stored[f"{product}.turned"].T
-    else:
-        rows = (stored[f"{product}.integers"] * stored[f"{product}.scales"]).T
-    if len(shape) == 3:
-        rows = rows.reshape(shape[0], shape[2], shape[1]).transpose(0, 2, 1)
-    return np.asarray(rows, dtype=np.float32)
 
 
 def floats(name: str, *shape: int | str) -> onnx.ValueInfoProto:

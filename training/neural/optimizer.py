@@ -1,4 +1,4 @@
-"""AdamW with clipped gradients; the result is a running mean of the weights.
+"""The training loop: AdamW with clipped gradients; the result is a running mean of the weights.
 
 Sources: Loshchilov and Hutter 2019, "Decoupled weight decay regularization" (AdamW); Shamir and
 Zhang 2013, "Stochastic gradient descent for non-smooth optimization: convergence results and
@@ -15,9 +15,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
+
+from kouxing.training.training_set import Report
+
+SAVE_EVERY = 25  # steps
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -45,13 +50,39 @@ class Optimizer(Generic[N]):
         self._rates = [group["lr"] for group in self._adam.param_groups]
         self._max_norm = max_norm
 
-    @property
-    def mean(self) -> N:
-        """The network with the running mean of the weights."""
-        return cast(N, self._averaged.module)
+    def train(
+        self,
+        loss_of: Callable[[int], Tensor],
+        rate_factor_of: Callable[[int], float],
+        *,
+        num_steps: int,
+        seed: int,
+        report: Report,
+        checkpoint: Path | None = None,
+    ) -> N:
+        """Train, and return the network with the running mean of the weights.
 
-    def step(self, loss: Tensor, rate_factor: float) -> None:
-        """Step along the gradient of a loss, with the learning rates times a factor."""
+        ``loss_of`` computes the loss of a step, ``rate_factor_of`` the factor of its learning
+        rates. Each step has its own random state. The state is saved in ``checkpoint``, and
+        training resumes from this file if it exists.
+        """
+        first_step = self._load(checkpoint) if checkpoint and checkpoint.exists() else 0
+        if first_step:
+            report(f"resuming after step {first_step}")
+        losses = []
+        for step in range(first_step, num_steps):
+            torch.manual_seed(seed + step)
+            loss = loss_of(step)
+            self._step(loss, rate_factor_of(step))
+            losses.append(float(loss.detach()))
+            if (step + 1) % SAVE_EVERY == 0 or step + 1 == num_steps:
+                report(f"step {step + 1}: loss {np.mean(losses):.3f}")
+                losses = []
+                if checkpoint:
+                    self._save(checkpoint, step + 1)
+        return cast(N, self._averaged.module).eval()
+
+    def _step(self, loss: Tensor, rate_factor: float) -> None:
         for group, rate in zip(self._adam.param_groups, self._rates, strict=True):
             group["lr"] = rate_factor * rate
         self._adam.zero_grad()
@@ -60,17 +91,14 @@ class Optimizer(Generic[N]):
         self._adam.step()
         self._averaged.update_parameters(self._network)
 
-    def save(self, checkpoint: Path, num_steps: int) -> None:
-        """Write the state after some steps to a file."""
+    def _save(self, checkpoint: Path, num_steps: int) -> None:
         state = {name: part.state_dict() for name, part in self._parts().items()}
         unfinished = checkpoint.with_suffix(".part")
         torch.save(state | {"num_steps": num_steps}, unfinished)
         unfinished.replace(checkpoint)
 
-    def load(self, checkpoint: Path) -> int:
-        """Restore the state from a file, if it exists; return the number of steps taken."""
-        if not checkpoint.exists():
-            return 0
+    def _load(self, checkpoint: Path) -> int:
+        """Restore the state; return the number of steps taken."""
         state = torch.load(checkpoint, weights_only=True)
         for name, part in self._parts().items():
             part.load_state_dict(state[name])

@@ -42,13 +42,19 @@ from torch import Tensor
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
-from kouxing.training.neural.batches import Recording, Sample, Targets, batches_of, sampling_probs
+from kouxing.training.neural.batches import (
+    Recording,
+    Sample,
+    Targets,
+    padded_batch,
+    sampling_probs,
+)
 from kouxing.training.neural.network import Encoder, Readout, ReadoutShape, Shape, mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, rise_and_fall
 from kouxing.training.training_set import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder
-_NUM_STEPS = 300  # batches of 70 s of sound
+_NUM_STEPS = 300  # batches of up to 70 s of sound
 KEPT_LAYERS = (-3, -2, -1)  # indices of the layers that are read
 _PIECE_FRAMES = 2960  # with the padding, less than 30 s
 _PADDING = np.zeros(4800, np.float32)  # appended to a piece
@@ -61,7 +67,7 @@ READOUT = ReadoutShape(
 )
 _NUM_STANDARDIZED = 250  # recordings that mean and deviation are computed from
 
-_BATCH_POSITIONS = 3500
+_NUM_CROPS = 14  # in a batch
 _CROP_POSITIONS = 250
 _WARM_UP_STEPS = 30
 _FALLING = 0.5  # fraction of the steps, at the end, over which the rate falls to 0
@@ -125,8 +131,7 @@ def train_teacher(
 ) -> Teacher:
     """Train a readout on recordings whose targets are the states of an alignment.
 
-    Their features stay in memory, 150 KB a second with Whisper base. ``seed`` determines the order.
-    New weights, dropout and noise draw from PyTorch's own generator.
+    Their features stay in memory, 150 KB a second with Whisper base.
     """
     rng = np.random.default_rng(seed)
     sampling = sampling_probs(recordings)
@@ -146,14 +151,19 @@ def train_teacher(
     readout.standardize(torch.cat([torch.from_numpy(features[one]).float() for one in drawn]))
     groups = [{"params": list(readout.parameters()), "lr": 2e-3}]
     optimizer = Optimizer(readout, groups, weight_decay=0.02, max_norm=2.0, mean_exponent=8)
-    batches = batches_of(draw, _BATCH_POSITIONS, rng)
-    for step in range(_NUM_STEPS):
-        inputs, states, probs = next(batches)
-        loss = cross_entropy(readout(inputs)[:, : states.shape[1]], states, probs)
-        optimizer.step(loss, rise_and_fall(step, _NUM_STEPS, _WARM_UP_STEPS, _FALLING))
-        if (step + 1) % math.ceil(_NUM_STEPS / 5) == 0:
-            report(f"teacher, step {step + 1}: {float(loss.detach()):.3f} nats a frame")
-    return Teacher(encoder.eval(), optimizer.mean.eval())
+
+    def loss(_step: int) -> Tensor:
+        inputs, states, probs = padded_batch([draw() for _ in range(_NUM_CROPS)])
+        return cross_entropy(readout(inputs)[:, : states.shape[1]], states, probs)
+
+    trained = optimizer.train(
+        loss,
+        lambda step: rise_and_fall(step, _NUM_STEPS, _WARM_UP_STEPS, _FALLING),
+        num_steps=_NUM_STEPS,
+        seed=seed,
+        report=lambda line: report(f"teacher, {line}"),
+    )
+    return Teacher(encoder.eval(), trained)
 
 
 def centered_mel(samples: NDArray[np.float32]) -> Tensor:

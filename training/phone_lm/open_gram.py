@@ -53,7 +53,7 @@ class _Level:
     def has(self, code: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which n-grams are counted."""
         at = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
-        return self.code[at] == code
+        return np.asarray(self.code[at] == code)
 
 
 def draw_phones(
@@ -93,7 +93,7 @@ def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInve
     all_phones = np.concatenate([np.array(one, np.uint8) for one in phones])
     stream = all_phones[np.arange(ends[-1]) - shift]
     repeated = (stream[1:] == silence) & (stream[:-1] == silence)
-    return stream[np.concatenate([[True], ~repeated])]
+    return np.asarray(stream[np.concatenate([[True], ~repeated])])
 
 
 def _next_words(

@@ -185,13 +185,13 @@ class _Tree:
 
 def _remainder(total: NDArray[Any]) -> NDArray[np.float64]:
     """Return what a sum of probabilities leaves of 1, at least a little."""
-    return np.maximum(1 - total, _MIN_REMAINDER)
+    return np.asarray(np.maximum(1 - total, _MIN_REMAINDER))
 
 
 def _logs(values: _Probs) -> NDArray[np.float32]:
     """Return the logarithms of all levels in order, the root's (0) first."""
     logs = np.log(np.concatenate([[1.0], *(values[n] for n in range(1, len(values) + 1))]))
-    return logs.astype(np.float32)
+    return np.asarray(logs.astype(np.float32))
 
 
 _CORPUS_WEIGHT = 0.012  # corpus phones per phone of other texts

@@ -60,7 +60,7 @@ def usual_levels(
                 if quieter_db > -_SPOKEN_DB:  # a lower one is a pause
                     total[viseme] += quieter_db
                     count[viseme] += 1.0
-    return total / count
+    return np.asarray(total / count)
 
 
 def closure_reach(

@@ -1,0 +1,205 @@
+"""Align recordings with their texts, and let a teacher label them.
+
+The teacher (:mod:`kouxing.training.neural.teacher`) learns the alignment and labels all recordings,
+clean and whole. A target is the average of both, or only the teacher's label if there is no text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.forced_path import (
+    segments_of_path,
+    utterance_graph,
+    viterbi_path,
+)
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.errors import UserError
+from kouxing.training.durations import PhoneDurations
+from kouxing.training.neural.batches import Recording, Targets
+from kouxing.training.neural.teacher import WholeEncoder, process_all, train_teacher
+from kouxing.training.search_weights import all_scores
+from kouxing.training.training_set import (
+    FRAMES_PER_MINUTE,
+    Example,
+    Report,
+    load_untranscribed,
+    with_progress,
+)
+
+STATES_PER_PHONE = 3
+_LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; those with more are trained less
+_MIN_STAY, _MAX_STAY = 0.05, 0.98
+_LM_SCALE = 2.0  # chosen on development data
+_PRIOR_SCALE = 0.5  # of the states' log priors; chosen on development data
+_TEACHER_SET = 1000  # recordings of each kind that the teacher is trained on
+_MAX_UNTRANSCRIBED = 3000  # pieces of each folder
+_FULL_FOLDER_MINUTES = 35  # longer folders get the weight of this much speech
+
+
+@dataclass(frozen=True, slots=True)
+class Mix:
+    """Composition of a training set."""
+
+    kinds: Mapping[str, tuple[float, int]]  # share of a kind of speech, and its most recordings
+    untranscribed: float  # share of recordings without text
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedExample:
+    """A recording with the state of each frame."""
+
+    example: Example
+    states: NDArray[np.int64]  # (frames,) STATES_PER_PHONE for each phone
+    phones: list[Segment]
+
+
+def label(
+    examples: Sequence[Example],
+    untranscribed: Sequence[Path],
+    mix: Mix,
+    *,
+    aligner: AcousticModel,
+    encoder: WholeEncoder,
+    errors: RowErrors,
+    seed: int,
+    report: Report,
+) -> tuple[list[AlignedExample], list[Recording]]:
+    """Align and label a random selection of recordings; those with text come first.
+
+    ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
+    folders of recordings without text. ``encoder`` is Whisper's, for the teacher.
+    """
+    rng = np.random.default_rng(seed)
+    drawn: list[Example] = []
+    for kind, (_, limit) in mix.kinds.items():
+        of_kind = [example for example in examples if example.kind == kind]
+        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:limit]]
+    folders: list[list[NDArray[np.int16]]] = []
+    for folder in untranscribed:
+        pieces = load_untranscribed([folder], errors)
+        folders.append(
+            [pieces[place] for place in rng.permutation(len(pieces))[:_MAX_UNTRANSCRIBED]]
+        )
+    aligned = _align_all(aligner, drawn, report)
+    recordings = _recordings(aligned, mix)
+    num_of_kind = dict.fromkeys(mix.kinds, 0)
+    teacher_set = []
+    for one, recording in zip(aligned, recordings, strict=True):
+        num_of_kind[one.example.kind] += 1
+        if num_of_kind[one.example.kind] <= _TEACHER_SET:
+            teacher_set.append(recording)
+    teacher = train_teacher(encoder, teacher_set, seed=seed, report=report)
+    sounds = [sound for pieces in folders for sound in pieces]
+    all_sounds = [*(recording.samples for recording in recordings), *sounds]
+    labels = process_all(teacher.targets_of, all_sounds, "labeled by the teacher", report)
+    labeled = [
+        replace(recording, targets=recording.targets.averaged_with(targets))
+        for recording, targets in zip(recordings, labels, strict=False)
+    ]
+    rest = iter(labels[len(recordings) :])
+    of_folders = [list(zip(pieces, rest, strict=False)) for pieces in folders]
+    sizes = [sum(len(targets) for _, targets in pairs) for pairs in of_folders]
+    counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
+    for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
+        for sound, targets in pairs:
+            weight = mix.untranscribed * count / sum(counted) * len(targets) / size
+            labeled.append(Recording(samples=sound, targets=targets, weight=weight))
+    width = max(recording.targets.states.shape[1] for recording in labeled)
+    return aligned, [
+        replace(recording, targets=recording.targets.widened(width)) for recording in labeled
+    ]
+
+
+def _recordings(aligned: Sequence[AlignedExample], mix: Mix) -> list[Recording]:
+    """Weight aligned recordings: kinds of speech have fixed shares, rare speakers count more."""
+    frames = dict.fromkeys(mix.kinds, 0.0)
+    for one in aligned:
+        frames[one.example.kind] += one.example.weight * len(one.states)
+    recordings = []
+    for one in aligned:
+        kind = one.example.kind
+        weight = mix.kinds[kind][0] * one.example.weight * len(one.states) / frames[kind]
+        targets = Targets.hard(one.states)
+        recordings.append(Recording(samples=one.example.samples, targets=targets, weight=weight))
+    return recordings
+
+
+def _align_all(
+    aligner: AcousticModel, examples: Sequence[Example], report: Report
+) -> list[AlignedExample]:
+    """Align each recording with its text; drop recordings that do not fit.
+
+    Raises UserError if no recording fits its text.
+    """
+    aligned = []
+    topology = aligner.topology
+    inventory = topology.inventory
+    silence = inventory.index[inventory.silence]
+    num_states = np.diff(topology.first_state)
+    phone = np.repeat(np.arange(len(inventory)), num_states)
+    place = np.arange(len(phone)) - topology.first_state[phone]
+    # the middle of a phone's n-th state, among STATES_PER_PHONE
+    new_place = (2 * place + 1) * STATES_PER_PHONE // (2 * num_states[phone])
+    tracked = with_progress(examples, "aligned", report)
+    for rows, example in zip(_scores(aligner, examples), tracked, strict=True):
+        graph = utterance_graph(
+            example.phones, example.syllables, topology.first_state, silence=silence
+        )
+        path, _ = viterbi_path(rows[:, graph.states], graph, topology.log_stay, topology.log_leave)
+        if len(path):
+            on_path = graph.states[path]
+            states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
+            aligned.append(AlignedExample(example, states, segments_of_path(path, graph)))
+    if not aligned:
+        raise UserError("no recording fits its text; check the texts and the aligner")
+    return aligned
+
+
+def _scores(aligner: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
+    """Yield the aligner's scores; an output layer that sees a little more aligns best."""
+    if isinstance(aligner, NeuralModel):
+        layer = int(np.abs(aligner.look_aheads - _LOOK_AHEAD_FRAMES).argmin())
+        aligner = replace(aligner, output_layer=layer, acoustic_scale=1.0)
+    return all_scores(aligner, examples)
+
+
+def statistics_of(
+    aligned: Sequence[AlignedExample], weights: Sequence[float], phone_lm: PhoneLanguageModel
+) -> tuple[Topology, NDArray[np.float32]]:
+    """Count transitions and durations, and the states' log priors, (states,).
+
+    ``weights`` are the relative sampling weights of the recordings in training.
+    """
+    num_states = STATES_PER_PHONE * len(phone_lm.inventory)
+    counts = np.ones(num_states)
+    occupied, left = np.full(num_states, 2.0), np.ones(num_states)
+    durations = PhoneDurations(phone_lm.inventory)
+    for one, weight in zip(aligned, weights, strict=True):
+        in_states = np.bincount(one.states, minlength=num_states)
+        counts += weight * len(aligned) / len(one.states) * in_states
+        occupied += in_states
+        ends = np.append(np.flatnonzero(np.diff(one.states)), len(one.states) - 1)
+        np.add.at(left, one.states[ends], 1.0)
+        durations.add(one.phones, one.example.weight)
+    stay = np.clip(1 - left / occupied, _MIN_STAY, _MAX_STAY)
+    mean_s, spread_s = durations.mean_and_spread_s()
+    topology = Topology(
+        phone_lm=phone_lm,
+        first_state=np.arange(len(phone_lm.inventory) + 1) * STATES_PER_PHONE,
+        log_stay=np.log(stay).astype(np.float32),
+        log_leave=np.log(1 - stay).astype(np.float32),
+        lm_scale=_LM_SCALE,
+        duration_mean_s=mean_s,
+        duration_spread_s=spread_s,
+    )
+    return topology, (_PRIOR_SCALE * np.log(counts / counts.sum())).astype(np.float32)
