@@ -1,4 +1,4 @@
-"""Peers that say anything to a service's sockets: it goes on and answers the next one."""
+"""Peers send anything to a service's sockets: it continues and answers the next request."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import contextlib
 import dataclasses
 import math
 import time
+from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 import zmq
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
@@ -21,6 +21,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import SynthesizerService
+from kouxing.shared import connections, sockets
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.service import Service
@@ -39,9 +40,8 @@ from tests.system import free_port
 
 pytestmark = pytest.mark.property
 
-AnyMessage = TypeVar("AnyMessage", bound=Message)
-
 LOCAL = "tcp://127.0.0.1:*"
+NO_CONTROL = f"tcp://127.0.0.1:{free_port()}"
 MAX_SESSIONS = 4
 WORKERS = [
     Heartbeat(
@@ -90,7 +90,7 @@ def values_like(value: object) -> st.SearchStrategy[Any]:
 
 @st.composite
 def messages(draw: st.DrawFn) -> Message:
-    """Draw a message of any kind in which some fields hold what they should not."""
+    """Draw a message of any kind, of which up to three fields have invalid values."""
     sample = draw(st.sampled_from(SAMPLES))
     names = [field.name for field in dataclasses.fields(sample)]
     changed = draw(st.lists(st.sampled_from(names), max_size=3, unique=True))
@@ -98,59 +98,75 @@ def messages(draw: st.DrawFn) -> Message:
     return dataclasses.replace(sample, **values)
 
 
-class Peers(RuleBasedStateMachine):
-    """Peers of one ROUTER socket and, as subscribers, of one XPUB socket of a service."""
+PARTS = st.lists(st.binary(max_size=300), min_size=1, max_size=6)
+ACTIONS = st.lists(
+    st.one_of(
+        st.tuples(st.just("send"), st.one_of(messages().map(encode), PARTS)),
+        st.tuples(st.just("subscribe"), st.builds(lambda on, topic: [bytes([on]) + topic],
+                                                  st.booleans(), st.binary(max_size=140))),
+        st.tuples(st.just("subscribe"), PARTS),
+        st.tuples(st.just("rename"), st.binary(min_size=1, max_size=4)),
+        st.tuples(st.just("start"), st.builds(
+            lambda token, epoch, endpoint: dataclasses.replace(
+                START, token=token, epoch=epoch, endpoints={"phone_input": endpoint}),
+            st.sampled_from(["t", "7"]), st.integers(0, 2),
+            st.one_of(st.just(START.endpoints["phone_input"]), TEXTS))),
+    ),
+    max_size=20,
+)  # fmt: skip
 
-    service: Service
-    router: Socket
-    publisher: Socket
 
-    def __init__(self) -> None:
-        super().__init__()
+@pytest.fixture(autouse=True, scope="module")
+def _no_penalties() -> Iterator[None]:
+    """Let disconnected peers connect again at once: the honest peer has the same address."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (connections, sockets):
+            patch.setattr(module, "PENALTY_S", 0.0)
+            patch.setattr(module, "LONG_PENALTY_S", 0.0)
+        yield
+
+
+class Peers:
+    """A hostile and an honest peer of a ROUTER socket and of an XPUB socket of a service."""
+
+    def __init__(self, service: Service, router: Socket, publisher: Socket) -> None:
+        self.service, self.router = service, router
         self.bus, self.context = Bus(), zmq.Context()
-        self.num_asked = 0
+        self.honest = self.bus.connect_dealer(router.endpoint)
+        self.subscriber = self._connect(zmq.XSUB, publisher.endpoint)
+        self.hostile = self._connect(zmq.DEALER, router.endpoint)
 
-    def begin(self) -> None:
-        self.honest = self.bus.connect_dealer(self.router.endpoint)
-        self.hostile: zmq.Socket[bytes] = self.context.socket(zmq.DEALER)
-        self.subscriber: zmq.Socket[bytes] = self.context.socket(zmq.XSUB)
-        for socket in (self.hostile, self.subscriber):
-            socket.setsockopt(zmq.LINGER, 0)
-        self.hostile.connect(self.router.endpoint)
-        self.subscriber.connect(self.publisher.endpoint)
+    def _connect(self, kind: int, endpoint: str, routing_id: bytes = b"") -> zmq.Socket[bytes]:
+        socket = self.context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 100)
+        if routing_id:
+            socket.setsockopt(zmq.ROUTING_ID, routing_id)
+        socket.connect(endpoint)
+        return socket
 
-    def teardown(self) -> None:
+    def close(self) -> None:
         self.bus.close()
         self.context.destroy(linger=0)
 
-    @rule(message=messages())
-    def send_a_message(self, message: Message) -> None:
-        self.hostile.send_multipart(encode(message))
-
-    @rule(parts=st.lists(st.binary(max_size=300), min_size=1, max_size=6))
-    def send_parts(self, parts: list[bytes]) -> None:
+    def send(self, parts: list[bytes]) -> None:
         self.hostile.send_multipart(parts)
 
-    @rule(topic=st.binary(max_size=140), begins=st.booleans())
-    def subscribe(self, topic: bytes, begins: bool) -> None:
-        self.subscriber.send(bytes([begins]) + topic)
-
-    @rule(parts=st.lists(st.binary(max_size=140), min_size=1, max_size=6))
-    def send_to_the_publisher(self, parts: list[bytes]) -> None:
+    def subscribe(self, parts: list[bytes]) -> None:
         self.subscriber.send_multipart(parts)
 
-    @rule(name=st.binary(min_size=1, max_size=4))
-    def come_by_another_name(self, name: bytes) -> None:
-        self.hostile.close(linger=100)
-        self.hostile = self.context.socket(zmq.DEALER)
-        self.hostile.setsockopt(zmq.ROUTING_ID, b"x" + name)
-        self.hostile.connect(self.router.endpoint)
+    def rename(self, name: bytes) -> None:
+        self.hostile.close()
+        self.hostile = self._connect(zmq.DEALER, self.router.endpoint, b"x" + name)
 
-    def answer(self, kind: type[AnyMessage]) -> AnyMessage:
-        """Ask as an honest peer; return what comes of a kind."""
-        self.num_asked += 1
-        self.honest.send(StatusRequest(request=f"ask-{self.num_asked}"))
-        end_s = time.monotonic() + 20
+    def start(self, message: StartSession) -> None:
+        """Start a session, perhaps at the endpoint of a hostile worker."""
+        with contextlib.suppress(UserError):  # control gets the reason
+            self.service.start_session(message)
+
+    def check_answer(self, kind: type[Message]) -> Any:
+        """Send a request as the honest peer; return the answer."""
+        self.honest.send(StatusRequest(request="is there an answer?"))
+        end_s = time.monotonic() + 60
         while time.monotonic() < end_s:
             self.service.step(0.001)
             for received in self.honest.receive():
@@ -158,95 +174,58 @@ class Peers(RuleBasedStateMachine):
                     return received.message
         raise AssertionError("the service does not answer")
 
+    def attack(self, actions: list[tuple[str, Any]]) -> None:
+        for name, argument in actions:
+            getattr(self, name)(argument)
+            self.service.step(0.001)
 
-class PeersOfControl(Peers):
-    @initialize()
-    def start(self) -> None:
-        config = ControlConfig(
-            control=LOCAL, events=LOCAL, insecure=True, max_sessions=MAX_SESSIONS
+
+@settings(max_examples=40)
+@given(ACTIONS, st.booleans())
+def test_control_answers_after_anything(actions: list[tuple[str, Any]], as_worker: bool) -> None:
+    config = ControlConfig(control=LOCAL, events=LOCAL, insecure=True, max_sessions=MAX_SESSIONS)
+    service = ControlService(config)
+    peers = Peers(service, service._commands, service._events)
+    for message in (*WORKERS, OpenSession(session="demo", request="open")):
+        (peers.send(encode(message)) if as_worker else peers.honest.send(message))
+    peers.check_answer(StatusReport)
+    for action in actions:
+        if action[0] == "start":
+            peers.honest.send(SessionStarted(session="demo", request="start-demo-1"))
+        else:
+            peers.attack([action])
+    assert len(peers.check_answer(StatusReport).sessions) <= MAX_SESSIONS
+    peers.close()
+    service.bus.close()
+
+
+@cache
+def recognizer() -> tuple[Service, Socket, Socket]:
+    service = RecognizerService(
+        RecognizerConfig(
+            audio=LOCAL, phones=LOCAL, unpaced_audio=LOCAL, control=NO_CONTROL, insecure=True
         )
-        service = ControlService(config)
-        self.service, self.router, self.publisher = service, service._commands, service._events
-        self.begin()
-        for worker in WORKERS:
-            self.honest.send(worker)
-        self.honest.send(OpenSession(session="demo", request="open"))
-
-    @rule(message=messages())
-    def send_as_a_worker(self, message: Message) -> None:
-        for each in (*WORKERS, message):
-            self.hostile.send_multipart(encode(each))
-
-    @rule()
-    def start_sessions(self) -> None:
-        self.honest.send(SessionStarted(session="demo", request="start-demo-1"))
-
-    @invariant()
-    def it_tells_the_status(self) -> None:
-        assert len(self.answer(StatusReport).sessions) <= MAX_SESSIONS
-
-    def teardown(self) -> None:
-        self.service.bus.close()
-        super().teardown()
-
-
-@cache
-def recognizer() -> RecognizerService:
-    control = f"tcp://127.0.0.1:{free_port()}"
-    config = RecognizerConfig(
-        audio=LOCAL, phones=LOCAL, unpaced_audio=LOCAL, control=control, insecure=True
     )
-    return RecognizerService(config)
+    return service, service._audio, service._phones
 
 
 @cache
-def synthesizer() -> SynthesizerService:
-    control = f"tcp://127.0.0.1:{free_port()}"
-    config = SynthesizerConfig(phone_input=LOCAL, faps=LOCAL, control=control, insecure=True)
-    return SynthesizerService(config)
+def synthesizer() -> tuple[Service, Socket, Socket]:
+    service = SynthesizerService(
+        SynthesizerConfig(phone_input=LOCAL, faps=LOCAL, control=NO_CONTROL, insecure=True)
+    )
+    return service, service._input, service._faps
 
 
-class PeersOfAWorker(Peers):
-    @rule(sequence=NUMBERS, epoch=st.sampled_from([0, 1, 2]))
-    def start_the_session_anew(self, sequence: int, epoch: int) -> None:
-        start = dataclasses.replace(START, epoch=epoch, token=f"t{sequence}"[:1])
-        self.service.start_session(start)
-
-    @rule(endpoint=TEXTS, epoch=st.sampled_from([1, 2]))
-    def start_with_an_endpoint_of_a_hostile_worker(self, endpoint: str, epoch: int) -> None:
-        endpoints = {"phone_input": endpoint}
-        with contextlib.suppress(UserError):  # which control is told
-            self.service.start_session(dataclasses.replace(START, epoch=epoch, endpoints=endpoints))
-
-    @invariant()
-    def it_answers(self) -> None:
-        self.answer(Error)
-
-    def teardown(self) -> None:
-        self.service.stop_session("demo")
-        super().teardown()
-
-
-class PeersOfTheRecognizer(PeersOfAWorker):
-    @initialize()
-    def start(self) -> None:
-        self.service = recognizer()
-        self.router, self.publisher = self.service._audio, self.service._phones
-        self.service.start_session(START)
-        self.begin()
-
-
-class PeersOfTheSynthesizer(PeersOfAWorker):
-    @initialize()
-    def start(self) -> None:
-        self.service = synthesizer()
-        self.router, self.publisher = self.service._input, self.service._faps
-        self.service.start_session(START)
-        self.begin()
-
-
-for machine in (PeersOfControl, PeersOfTheRecognizer, PeersOfTheSynthesizer):
-    machine.TestCase.settings = settings(max_examples=25, stateful_step_count=20)
-TestPeersOfControl = PeersOfControl.TestCase
-TestPeersOfTheRecognizer = PeersOfTheRecognizer.TestCase
-TestPeersOfTheSynthesizer = PeersOfTheSynthesizer.TestCase
+@pytest.mark.parametrize("worker", [recognizer, synthesizer])
+@settings(max_examples=40)
+@given(actions=ACTIONS)
+def test_a_worker_answers_after_anything(
+    worker: Callable[[], tuple[Service, Socket, Socket]], actions: list[tuple[str, Any]]
+) -> None:
+    peers = Peers(*worker())
+    peers.start(START)
+    peers.attack(actions)
+    peers.check_answer(Error)
+    peers.service.stop_session("demo")
+    peers.close()

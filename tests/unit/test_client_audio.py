@@ -6,7 +6,7 @@ from array import array
 
 import numpy as np
 import pytest
-from kouxing_client.audio import NEAREST_MS, RESEND_S, AudioStream, to_pcm
+from kouxing_client.audio import RESEND_S, AudioStream, to_pcm
 
 pytestmark = pytest.mark.unit
 CHUNK = 1600  # samples: 100 ms
@@ -74,19 +74,6 @@ def test_resends_audio_that_was_lost_before_the_first_acknowledgement() -> None:
     assert sent(stream) == [1, 2, 3]
 
 
-def test_the_shortest_round_trip_limits_new_connections() -> None:
-    stream = stream_of(1)
-    assert stream.connect_ms(300) == 300
-    stream.acknowledge(1, 0.1)
-    assert stream.connect_ms(300) == 200
-    stream.add({}, CHUNK, 1.0)
-    stream.acknowledge(2, 1.001)
-    assert stream.connect_ms(300) == NEAREST_MS
-    for _ in range(3):
-        stream.resend(2.0)
-    assert stream.connect_ms(300) == 300, "the recognizer may be further away now"
-
-
 def test_flushed_audio_is_not_sent_but_the_end_is() -> None:
     stream = stream_of(3)
     stream.add({}, CHUNK, 0.3)
@@ -109,18 +96,11 @@ INTEGERS = array("h", [0, 16384, -32767, 32767])
         INTEGERS.tobytes(),
         INTEGERS,
         FLOATS,
-        array("f", FLOATS),
-        np.array(FLOATS),
         np.array(FLOATS, np.float32).reshape(2, 2),
-        np.array(INTEGERS, np.int16)[::1],
+        np.array(INTEGERS, np.int16),
     ],
     ids=lambda audio: type(audio).__name__,
 )
 def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
     assert to_pcm(audio, "s16le") == INTEGERS.tobytes()
-
-
-def test_floats_stay_floats_on_a_wire_of_floats() -> None:
     assert to_pcm(FLOATS, "f32le") == array("f", FLOATS).tobytes()
-    scaled = array("f", to_pcm(INTEGERS, "f32le"))
-    assert scaled == pytest.approx([0.0, 0.5, -1.0, 1.0], abs=1e-4)

@@ -46,15 +46,15 @@ def test_an_added_command_runs_and_is_listed(added: list[str]) -> None:
     assert all(name in listed for name in KINDS)
     assert set(added) == {"kouxing.commands"}
 
-
-def test_suggests_an_added_command_for_a_misspelled_one(added: list[str]) -> None:
     result = CliRunner().invoke(command_line.app, ["wafe"])
     assert result.exit_code == 2
-    assert "wave" in result.output
+    assert "wave" in result.output, "a suggestion"
 
 
 def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> None:
     assert CliRunner().invoke(command_line.app, ["phones", "--help"]).exit_code == 0
+    result = CliRunner().invoke(command_line.app, ["--version"])
+    assert result.output == f"kouxing {version('kouxing')}\n"
     assert added == []
 
 
@@ -63,11 +63,6 @@ def test_h_prints_help(added: list[str], command: list[str]) -> None:
     result = CliRunner().invoke(command_line.app, [*command, "-h"])
     assert result.exit_code == 0
     assert "Usage:" in result.output
-
-
-def test_prints_the_version() -> None:
-    result = CliRunner().invoke(command_line.app, ["--version"])
-    assert result.output == f"kouxing {version('kouxing')}\n"
 
 
 def test_the_command_line_imports_neither_training_nor_evaluation_nor_services() -> None:

@@ -30,6 +30,10 @@ def test_the_output_is_a_file_with_the_same_values(
     text = "[driver]\nout = 'a \"b\" 口'\n[gateway]\nport = 0\nsenders = ['vmc://']\n"
     file.write_text(text, encoding="utf-8")
     expected = [read_settings(file).load(config_type) for config_type in TABLES.values()]
+    config("driver", config=file, assignments=["camera=mouth"])
+    printed = capsys.readouterr().out
+    assert "[gateway]" not in printed
+    assert 'camera = "mouth"  # --set' in printed
     config(config=file)
     printed = capsys.readouterr().out
     assert f"port = 0  # {file}" in printed
@@ -38,16 +42,6 @@ def test_the_output_is_a_file_with_the_same_values(
     monkeypatch.undo()
     file.write_text(printed, encoding="utf-8")
     assert [read_settings(file).load(kind) for kind in TABLES.values()] == expected
-
-
-def test_values_of_the_command_line_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    config("recognizer", assignments=["min_confidence=0.5"])
-    printed = capsys.readouterr().out
-    assert "min_confidence = 0.5  # --set" in printed
-    assert 'log_level = "info"  # default' in printed
-    assert "[driver]" not in printed
-    config(assignments=["gateway.port=1"])
-    assert "port = 1  # --set" in capsys.readouterr().out
 
 
 def test_an_unknown_service_or_key_is_an_error() -> None:

