@@ -109,13 +109,8 @@ test("chunks are dropped and reported while the network is too slow", () => {
   uplink.send(100, 100, chunk());
   assert.deepEqual(socket.sent, [640, { skip: 640 }, 640, 640]);
   assert.equal(uplink.ageMs(100, 100 * 16), 0, "media time continues");
-});
-
-test("chunks that a busy page sends too late are dropped", () => {
-  const socket = new FakeSocket();
-  const uplink = new AudioUplink(socket, 16000);
-  for (const recordedMs of [20, 40, 1000]) uplink.send(1020, recordedMs, new Int16Array(320));
-  assert.deepEqual(socket.sent, [{ skip: 640 }, 640]);
+  for (const recordedMs of [120, 140, 1000]) uplink.send(1020, recordedMs, chunk());
+  assert.deepEqual(socket.sent.slice(4), [{ skip: 640 }, 640], "a busy page sent them too late");
 });
 
 test("the age of sound counts from its recording, even if chunks are late", () => {
@@ -134,4 +129,3 @@ test("sound that the sound card loses affects the age only for a while", () => {
   }
   assert.equal(uplink.ageMs(40700, 40000 * 16), 0);
 });
-

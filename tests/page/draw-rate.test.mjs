@@ -22,13 +22,8 @@ test("a slow processor draws fewer pixels until it draws 20 images a second", ()
   draw(drawRate, { fullMs: 100, minMs: 12 });
   assert.ok(draw(drawRate, { fullMs: 100, minMs: 12, fromMs: 10000 }) > 19.5);
   assert.ok(drawRate.ratio < 0.5 && drawRate.ratio > 0.3, `${drawRate.ratio}`);
-});
-
-test("a processor draws more pixels again when it has the time", () => {
-  const drawRate = new DrawRate(0.5, 1, true);
-  draw(drawRate, { fullMs: 300 });
-  draw(drawRate, { fullMs: 12, fromMs: 10000 });
-  assert.equal(drawRate.ratio, 1);
+  draw(drawRate, { fullMs: 12, fromMs: 20000 });
+  assert.equal(drawRate.ratio, 1, "it has the time again");
 });
 
 test("a processor pauses as long as it drew, or less to draw 20 images a second", () => {
@@ -45,9 +40,7 @@ test("the delay of an image includes half of the time for which it is visible", 
   const drawRate = new DrawRate(2, 2, false);
   for (let nowMs = 0; nowMs < 5000; nowMs += 40) drawRate.recordVisible(nowMs, nowMs + 30);
   assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
-  drawRate.recordVisible(5000, 5400);
-  assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, "one slow image changes nothing");
-  drawRate.recordVisible(5500, 60000);
-  assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, "time while the page is hidden does not count");
+  drawRate.recordVisible(5000, 5400); // a slow image
+  drawRate.recordVisible(5500, 60000); // the page is hidden
+  assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
 });
-

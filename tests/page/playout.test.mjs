@@ -19,13 +19,10 @@ test("sound waits for its image and one more FAP frame", () => {
   const playout = new Playout();
   stream(playout, { forMs: 20000, frameMs: 180 });
   assert.ok(Math.abs(playout.delayMs - 200) <= 30, `${playout.delayMs}`);
-});
-
-test("a constant difference between the clocks has no effect", () => {
-  const [here, there] = [new Playout(), new Playout()];
-  stream(here, { forMs: 5000 });
-  stream(there, { forMs: 5000, clockMs: 1e6 });
-  assert.equal(there.mediaAt(1e6 + 6000), here.mediaAt(6000));
+  const silent = new Playout();
+  silent.isAudible = false;
+  stream(silent, { forMs: 20000, frameMs: 180 });
+  assert.ok(Math.abs(silent.delayMs - 180) <= 5, "without sound, the face waits only for most frames");
 });
 
 test("a small error is corrected by gliding", () => {
@@ -59,21 +56,17 @@ test("a burst after a network stall does not leave a lasting delay", () => {
   }
   stream(playout, { fromMs: 5000, forMs: 2000 });
   assert.ok(Math.abs(playout.delayMs - beforeMs) <= 30, `${playout.delayMs}`);
-});
-
-test("the delay is as before after the sender paused", () => {
-  const playout = new Playout();
-  stream(playout, { forMs: 3000 });
-  const delayMs = playout.delayMs;
-  stream(playout, { fromMs: 3000, forMs: 3000, clockMs: 5000 });
-  assert.ok(Math.abs(playout.delayMs - delayMs) <= 30, `${playout.delayMs}`);
+  stream(playout, { fromMs: 7000, forMs: 3000, clockMs: 5000 }); // the sender paused
+  assert.ok(Math.abs(playout.delayMs - beforeMs) <= 30, `${playout.delayMs}`);
 });
 
 test("faces between two frames are interpolated", () => {
   const track = new FapTrack();
   const out = new Float32Array(2);
   assert.equal(track.sample(0, out), null);
-  track.push(320, Float32Array.of(10, 0));
+  assert.equal(track.push(320, Float32Array.of(7, 7)), true);
+  assert.equal(track.push(320, Float32Array.of(10, 0)), false, "it replaces the last one");
+  assert.equal(track.push(160, Float32Array.of(3, 3)), false, "older frames are ignored");
   track.push(640, Float32Array.of(20, 100));
   assert.equal(track.sample(400, out), 400);
   assert.deepEqual([...out], [12.5, 25]);
@@ -82,21 +75,3 @@ test("faces between two frames are interpolated", () => {
   assert.equal(track.sample(9999, out), 640);
   assert.deepEqual([...out], [20, 100], "after the last frame");
 });
-
-test("a frame with the same media time replaces the last one, older frames are ignored", () => {
-  const track = new FapTrack();
-  const out = new Float32Array(1);
-  assert.equal(track.push(320, Float32Array.of(1)), true);
-  assert.equal(track.push(320, Float32Array.of(2)), false);
-  assert.equal(track.push(160, Float32Array.of(3)), false);
-  track.sample(320, out);
-  assert.equal(out[0], 2);
-});
-
-test("without sound, the face waits only for most frames", () => {
-  const playout = new Playout();
-  playout.isAudible = false;
-  stream(playout, { forMs: 20000, frameMs: 180 });
-  assert.ok(Math.abs(playout.delayMs - 180) <= 5, `${playout.delayMs}`);
-});
-

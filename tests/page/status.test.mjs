@@ -29,13 +29,8 @@ test("the phone at a media time is shown with the phones before it", () => {
   assert.deepEqual(phones.at(-1), { current: "", past: [] });
   assert.deepEqual(phones.at(0), { current: "", past: ["·"] });
   assert.deepEqual(phones.at(3300), { current: "i", past: ["·", "n"] });
-});
-
-test("a phone can be removed", () => {
-  const phones = track("n", "i", "u");
   phones.add({ index: 1, symbol: "sil", media_time: 1600, duration: 0, final: true });
-  phones.add({ index: 9, symbol: "sil", media_time: 1600, duration: 0, final: true });
-  assert.deepEqual(phones.at(3300), { current: "u", past: ["n"] });
+  assert.deepEqual(phones.at(3300), { current: "i", past: ["·"] }, "a phone was removed");
 });
 
 test("the level is that of the sound that is audible", () => {
@@ -61,15 +56,10 @@ test("the face fades in with frames and fades to rest when they stall", () => {
   assert.equal(share, 1, "too short for a stall");
   for (let ms = 1496; ms <= 2600; ms += 16) share = activity.update(ms, true);
   assert.equal(share, 0);
-});
-
-test("a busy page does not count as a stall", () => {
-  const activity = new StreamActivity();
-  activity.update(0, true);
-  activity.frameArrived(0);
-  activity.soundArrived(0);
-  activity.update(5000, true);
-  assert.ok(activity.isLive(5000));
+  activity.frameArrived(2600);
+  activity.soundArrived(2600);
+  activity.update(9000, true);
+  assert.ok(activity.isLive(9000), "a busy page does not count as a stall");
 });
 
 test("an idle face without sound is not live", () => {
@@ -115,11 +105,7 @@ test("hints say what does not work and what to do", () => {
     /recognizer, synthesizer.*kouxing recognizer; kouxing synthesizer/,
   );
   assert.match(hintText({ ...well, isMicrophoneInterrupted: true }), /microphone was interrupted/);
-});
-
-test("errors are translated by their code, others are shown as they are", () => {
   assert.equal(errorText({ code: "refused", text: "no" }), "no");
-  assert.equal(errorText({ code: "timeout", text: "no answer" }), "no answer");
   assert.match(errorText({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
 });
 
@@ -132,36 +118,24 @@ test("reduced quality and the head's rotation are described", () => {
   assert.equal(turnText({ left: 69, up: -9.8 }), "turned 69° to the left, 10° down");
 });
 
-const SESSION = { session: "one", epoch: 1, sample: false, lips: "learnt" };
-
-test("a greater epoch of the same session is a restart", () => {
-  const state = new GatewayState();
-  assert.deepEqual(state.setSession(SESSION), { isOther: true, isRestart: false });
-  assert.deepEqual(state.setSession({ ...SESSION, epoch: 2 }), { isOther: false, isRestart: true });
-  assert.deepEqual(state.setSession({ ...SESSION, session: "two" }), { isOther: true, isRestart: false });
-});
-
-test("the lips of a session that has ended stay known", () => {
-  const state = new GatewayState();
-  state.setSession(SESSION);
+test("sessions restart, end and lose their connection", () => {
+  const [session, state] = [{ session: "one", epoch: 1, sample: false, lips: "learnt" }, new GatewayState()];
+  state.setConnected(false);
+  assert.deepEqual([state.isRefused, state.wasConnected], [true, false], "the first connection failed");
+  state.setConnected(true);
+  assert.deepEqual(state.setSession(session), { isOther: true, isRestart: false });
+  assert.deepEqual(state.setSession({ ...session, epoch: 2 }), { isOther: false, isRestart: true });
+  assert.deepEqual(state.setSession({ ...session, session: "two" }), { isOther: true, isRestart: false });
   state.setSession({ session: null, epoch: 0, sample: false, lips: "" });
   assert.deepEqual([state.session, state.lips], [null, "learnt"]);
-});
-
-test("a failed first connection counts as refused", () => {
-  const state = new GatewayState();
-  state.setConnected(false);
-  assert.deepEqual([state.isRefused, state.wasConnected], [true, false]);
-  state.setConnected(true);
-  state.setSession(SESSION);
+  state.setSession(session);
   state.setConnected(false);
   assert.deepEqual([state.isRefused, state.wasConnected, state.session], [false, true, null]);
 });
 
-test("the state of a sender is its contents and rate, or its problem", () => {
-  const sender = { contents: "VRM shapes", rate_hz: 49.8, delay_ms: 0, problem: "" };
-  assert.equal(senderText(sender), "VRM shapes, 50 frames/s");
-  assert.equal(senderText({ ...sender, delay_ms: 90 }), "VRM shapes, 50 frames/s, delayed 90 ms");
+test("a sender shows its contents and rate, or its problem", () => {
+  const sender = { contents: "VRM shapes", rate_hz: 49.8, delay_ms: 90, problem: "" };
+  assert.equal(senderText(sender), "VRM shapes, 50 frames/s, delayed 90 ms");
   assert.equal(senderText({ ...sender, problem: "no program is listening" }), "no program is listening");
 });
 

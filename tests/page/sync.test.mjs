@@ -1,4 +1,4 @@
-// Sync of sound and image over an hour: the real Playout, Sound and worklet with a simulated sound
+// Sync of sound and image over ten minutes: the real Playout, Sound and worklet with a simulated sound
 // card and network. Simulated time runs as fast as the machine can.
 
 import assert from "node:assert/strict";
@@ -149,10 +149,10 @@ function mean(values) {
   return values.reduce((sum, value) => sum + value, 0) / values.length;
 }
 
-test("sound and image stay in sync for an hour with clocks that differ by 200 ppm", async () => {
-  const clicks = await simulate({ forS: 3600, senderPpm: 100, cardPpm: -100 });
+test("sound and image stay in sync for ten minutes with clocks that differ by 200 ppm", async () => {
+  const clicks = await simulate({ forS: 600, senderPpm: 100, cardPpm: -100 });
   const settled = clicks.filter(({ atS }) => atS > SETTLE_S);
-  assert.ok(settled.length >= 3600 - SETTLE_S - 1, `${settled.length}: a click is lost`);
+  assert.ok(settled.length >= 600 - SETTLE_S - 1, `${settled.length}: a click is lost`);
   const levels = settled.map(({ level }) => level);
   assert.ok(Math.min(...levels) > 0.3, `${Math.min(...levels)}: a click was faded by a leap`);
   const lates = settled.map(({ lateMs }) => lateMs);

@@ -81,18 +81,9 @@ test("it reconnects with increasing delays, to the session chosen last", (t) => 
   FakeWebSocket.instances[2].onclose();
   t.mock.timers.tick(300);
   assert.equal(FakeWebSocket.instances.length, 4, "a connection resets the delay");
-  assert.deepEqual(calls.map(([, connected]) => connected), [true, false, false, true, false]);
-});
-
-test("it does not reconnect after close", (t) => {
-  t.mock.timers.enable({ apis: ["setTimeout"] });
-  const { calls, handlers } = record();
-  const viewer = new ViewerSocket(toViewer, "", handlers);
-  const [socket] = FakeWebSocket.instances;
-  socket.open();
   viewer.close();
-  assert.equal(socket.onclose, null);
   t.mock.timers.tick(5000);
-  assert.equal(FakeWebSocket.instances.length, 1);
-  assert.deepEqual(calls.at(-1), ["state", false]);
+  assert.equal(FakeWebSocket.instances.length, 4, "closed");
+  const states = calls.map(([, connected]) => connected);
+  assert.deepEqual(states, [true, false, false, true, false, false]);
 });

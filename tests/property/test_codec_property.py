@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +17,6 @@ from kouxing.shared.phones.events import (
     SoundEvent,
     SpeechChange,
 )
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.events import event_of, message_of
 from kouxing.shared.wire.message import Message
@@ -53,18 +54,6 @@ def test_rejects_a_damaged_message_or_reads_it_the_same_twice(
             except BadMessage:
                 continue
             assert encode(decode(read)) == read
-
-
-@given(st.binary(max_size=1000), st.integers(0, 2**53), st.integers(0, 2**53))
-def test_decodes_encoded_audio(pcm: bytes, sequence: int, media_time: int) -> None:
-    chunk = AudioChunk(
-        session="s",
-        token="t",
-        pcm=pcm,
-        sequence=sequence,
-        media_time=media_time,
-    )
-    assert decode(encode(chunk)) == chunk
 
 
 TIMES = st.integers(0, 2**40).map(to_seconds)  # two years
@@ -109,9 +98,4 @@ def test_converts_a_lip_frame_to_a_message_and_back(frame: LipFrame) -> None:
     read = event_of(message)
     assert isinstance(read, LipFrame)
     np.testing.assert_array_equal(read.faps, frame.faps)
-    assert (read.time_s, read.delay_s, read.closure, read.lip_to_teeth) == (
-        frame.time_s,
-        frame.delay_s,
-        frame.closure,
-        frame.lip_to_teeth,
-    )
+    assert replace(read, faps=frame.faps) == frame

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import tracemalloc
 from pathlib import Path
 
@@ -11,20 +12,13 @@ import soundfile
 
 from kouxing.shared.audio_file import open_audio, raw_audio, read_audio
 from kouxing.shared.errors import UserError
-from tests.system import DEMO, VOWELS_FILE
+from kouxing.shared.wav_header import WavHeader, read_wav_header
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
 
-def test_blocks_contain_the_whole_file(tmp_path: Path) -> None:
-    samples = np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 2)).astype(np.float32)
-    soundfile.write(tmp_path / "a.wav", samples, 22050, subtype="FLOAT")
-    source = open_audio(tmp_path / "a.wav")
-    assert (source.sample_rate_hz, source.num_channels) == (22050, 2)
-    np.testing.assert_array_equal(np.concatenate(list(source.blocks)), samples)
-
-
-@pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"])
+@pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_24", "FLOAT", "DOUBLE"])
 def test_scales_every_sample_format_to_one(tmp_path: Path, subtype: str) -> None:
     sine = 0.5 * np.sin(np.arange(4000) * 0.1)
     soundfile.write(tmp_path / "a.wav", sine, 16000, subtype=subtype)
@@ -56,25 +50,20 @@ def test_reads_an_hour_in_little_memory(tmp_path: Path) -> None:
     assert peak_bytes < 5e6
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "empty"),
-        (b"this is not audio", "cannot read audio"),
-        (VOWELS_FILE.read_bytes()[:44], "no samples"),
-    ],
-    ids=["empty", "text", "header only"],
-)
-def test_rejects_a_file_without_samples(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "bad.wav").write_bytes(content)
-    with pytest.raises(UserError, match=rf"bad\.wav.*{message}"):
-        open_audio(tmp_path / "bad.wav")
-
-
-def test_rejects_a_sample_rate_below_8_khz(tmp_path: Path) -> None:
+def test_rejects_a_file_without_samples(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "low.wav", np.zeros(4000, np.float32), 4000)
-    with pytest.raises(UserError, match="too low"):
-        open_audio(tmp_path / "low.wav")
+    for name, content, error in (
+        ("empty.wav", b"", "empty"),
+        ("text.wav", b"this is not audio", "cannot read audio"),
+        ("header.wav", VOWELS_FILE.read_bytes()[:44], "no samples"),
+        ("list.m3u8", b"#EXTM3U\n#EXTINF:5,\n" + bytes(VOWELS_FILE), "cannot read audio"),
+        ("low.wav", (tmp_path / "low.wav").read_bytes(), "too low"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError, match=rf"{name}.*{error}"):
+            open_audio(tmp_path / name)
+    with pytest.raises(UserError, match="folder"):
+        open_audio(tmp_path)
 
 
 def test_rejects_nan_and_reports_its_time(tmp_path: Path) -> None:
@@ -85,22 +74,24 @@ def test_rejects_nan_and_reports_its_time(tmp_path: Path) -> None:
         read_audio(tmp_path / "a.wav")
 
 
-@pytest.mark.parametrize("suffix", ["wav", "mp3"])
+@pytest.mark.parametrize("suffix", ["wav", "mp3", "mkv"])
 def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, suffix: str) -> None:
-    sine = 0.5 * np.sin(2 * np.pi * 440 * np.arange(32000) / 16000)
-    whole, cut = tmp_path / f"whole.{suffix}", tmp_path / f"cut.{suffix}"
-    soundfile.write(whole, sine, 16000)
-    data = whole.read_bytes()
-    cut.write_bytes(data[: len(data) // 2 + 1])
-    remarks = {}
-    for path in (whole, cut):
+    sine = (0.5 * np.sin(2 * np.pi * 440 * np.arange(32000) / 16000)).astype(np.float32)
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "mkv":
+        _write_media(path, "pcm_s16le", sine, 16000)
+    else:
+        soundfile.write(path, sine, 16000)
+    remarks = []
+    for _ in range(2):
         source = open_audio(path)
         assert sum(len(block) for block in source.blocks) > 0
-        remarks[path] = source.remarks
-    assert remarks[whole] == []
-    (remark,) = remarks[cut]
-    assert "cut off" in remark
-    assert "of 2.0 s" in remark
+        remarks.append([*source.remarks])
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 1])
+    whole, (cut,) = remarks
+    assert whole == []
+    assert "cut off" in cut
+    assert suffix == "mkv" or "of 2.0 s" in cut
 
 
 def test_ignores_the_unknown_length_of_a_pipe(tmp_path: Path) -> None:
@@ -112,11 +103,6 @@ def test_ignores_the_unknown_length_of_a_pipe(tmp_path: Path) -> None:
     source = open_audio(path)
     assert sum(len(block) for block in source.blocks) == 1600
     assert source.remarks == []
-
-
-def test_rejects_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="folder"):
-        open_audio(tmp_path)
 
 
 def test_reads_raw_audio_in_odd_pieces() -> None:
@@ -154,19 +140,17 @@ def _write_media(path: Path, codec: str, samples: np.ndarray, rate_hz: int) -> N
         container.mux(stream.encode(None))
 
 
-def test_reading_mp3_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    speech, rate_hz = read_audio(DEMO / "hello-male.wav")
-    _write_media(tmp_path / "a.mp3", "libmp3lame", speech[:, 0], rate_hz)
-    assert len(read_audio(tmp_path / "a.mp3")[0]) >= len(speech)
-    assert capfd.readouterr().err == ""
-
-
 @pytest.mark.parametrize(
     ("name", "codec", "rate_hz"),
-    [("a.m4a", "aac", 44100), ("a.webm", "libopus", 48000), ("a.mkv", "pcm_s16le", 22050)],
+    [
+        ("a.mp3", "libmp3lame", 32000),
+        ("a.m4a", "aac", 44100),
+        ("a.webm", "libopus", 48000),
+        ("a.mkv", "pcm_s16le", 22050),
+    ],
 )
 def test_reads_the_formats_of_phones_and_browsers(
-    tmp_path: Path, name: str, codec: str, rate_hz: int
+    tmp_path: Path, name: str, codec: str, rate_hz: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
     sine = (0.5 * np.sin(2 * np.pi * 440 * np.arange(rate_hz) / rate_hz)).astype(np.float32)
     _write_media(tmp_path / name, codec, sine, rate_hz)
@@ -181,16 +165,6 @@ def test_reads_the_formats_of_phones_and_browsers(
     assert source.remarks == []
 
 
-def test_remarks_on_media_that_is_cut_off(tmp_path: Path) -> None:
-    sine = (0.5 * np.sin(np.arange(96000) / 17)).astype(np.float32)
-    _write_media(tmp_path / "a.mkv", "pcm_s16le", sine, 48000)
-    data = (tmp_path / "a.mkv").read_bytes()
-    (tmp_path / "a.mkv").write_bytes(data[: len(data) // 2])
-    source = open_audio(tmp_path / "a.mkv")
-    assert sum(len(block) for block in source.blocks) > 0
-    assert "cut off" in source.remarks[0]
-
-
 def test_rejects_media_without_audio_and_playlists(tmp_path: Path) -> None:
     with av.open(tmp_path / "mute.mp4", "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
@@ -202,6 +176,15 @@ def test_rejects_media_without_audio_and_playlists(tmp_path: Path) -> None:
         container.mux(stream.encode(None))
     with pytest.raises(UserError, match="has no audio"):
         open_audio(tmp_path / "mute.mp4")
-    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:5,\n{VOWELS_FILE}\n")
-    with pytest.raises(UserError, match="cannot read audio"):
-        open_audio(tmp_path / "list.m3u8")
+
+
+def test_reads_the_header_of_a_stream() -> None:
+    assert read_wav_header(bytes(100)) is None
+    extensible = struct.pack("<HHIIHHHHI", 0xFFFE, 1, 48000, 0, 4, 32, 22, 32, 4) + b"\3\0"
+    chunks = b"LIST\3\0\0\0abc\0fmt " + struct.pack("<I", 40) + extensible.ljust(40, b"\0")
+    header = b"RIFF\0\0\0\0WAVE" + chunks + b"data\xff\xff\xff\xff"
+    assert read_wav_header(header + bytes(4)) == WavHeader(
+        sample_rate_hz=48000, num_channels=1, encoding="f32le", num_bytes=len(header)
+    )
+    with pytest.raises(UserError, match="incomplete"):
+        read_wav_header(header[:30])

@@ -126,16 +126,22 @@ def test_an_error_in_a_file_is_located(tmp_path: Path, text: str, message: str) 
 
 
 @pytest.mark.parametrize(
-    ("name", "error"),
+    ("environment", "assignments", "error"),
     [
-        ("KOUXING_HEAD", r"\$KOUXING_HEAD: .* the nearest is KOUXING_DRIVER_HEAD;"),
-        ("KOUXING_CONTROLL", "the nearest is KOUXING_CONTROL;"),
-        ("recognizer__acustic", r"--set: .* recognizer.acustic; .* recognizer.acoustic;"),
+        ({"KOUXING_HEAD": "1"}, {}, r"\$KOUXING_HEAD: .* the nearest is KOUXING_DRIVER_HEAD;"),
+        ({"KOUXING_CONTROLL": "1"}, {}, "the nearest is KOUXING_CONTROL;"),
+        (
+            {},
+            {"recognizer.acustic": "gmm"},
+            "--set: .*; the nearest is .*acoustic;",
+        ),
     ],
 )
-def test_an_unknown_key_is_an_error_with_the_nearest_name(name: str, error: str) -> None:
+def test_an_unknown_key_is_an_error_with_the_nearest_name(
+    environment: dict[str, str], assignments: dict[str, str], error: str
+) -> None:
     with pytest.raises(UserError, match=error):
-        settings(environment={name: "1"}) if name.isupper() else settings(**{name: "1"})
+        Settings(TYPES, environment=environment, assignments=assignments)
 
 
 @pytest.mark.parametrize("name", ["docker-compose.yml", "docs/hosts.md"])

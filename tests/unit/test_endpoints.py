@@ -32,7 +32,6 @@ class Probe(socket.socket):
     [
         ("tcp://10.77.0.1:5550", "tcp://0.0.0.0:5571", "tcp://10.77.0.2:5571"),
         ("tcp://[fd77::1]:5550", "tcp://[::]:5571", "tcp://[fd77::2]:5571"),
-        ("tcp://10.99.0.1:5550", "tcp://0.0.0.0:5571", "tcp://10.88.0.2:5571"),
         ("tcp://localhost:5550", "tcp://0.0.0.0:5571", "tcp://10.88.0.2:5571"),
     ],
 )
@@ -41,9 +40,5 @@ def test_advertises_the_address_on_the_way_to_control(
 ) -> None:
     monkeypatch.setattr(socket, "socket", Probe)
     assert SynthesizerConfig(control=control).reachable(bound) == advertised
-
-
-def test_a_host_without_network_reaches_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(socket, "socket", Probe)
     monkeypatch.setattr(Probe, "routes", {})
-    assert own_address("10.77.0.1") == "127.0.0.1"
+    assert own_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"

@@ -37,23 +37,10 @@ def test_reads_an_xface_frame(tmp_path: Path) -> None:
     assert got.name == "C:\\some where\\file"
     assert got.frame_rate_hz == 25.0
     assert got.faps[0, [0, 1, 2, 50]].tolist() == [5.0, 2.0, 120.0, -7.0]
-    assert got.visemes is not None
-    assert got.expressions is not None
+    assert got.visemes is not None and got.expressions is not None  # noqa: PT018
     assert got.visemes.tolist() == [[5, 0, 63, 0], [0, 0, 0, 0]]
     assert got.expressions.tolist() == [[2, 40, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0]]
     assert got.faps[1, 2] == 150.0
-
-
-def test_reads_a_greta_frame(tmp_path: Path) -> None:
-    path = write(
-        tmp_path, "2.1 AU Interpolation_1111.fap 25 1", mask(1, 3, 48, digits=69), "12 0 80 -900"
-    )
-    got = read_fap(path)
-    assert got.name == "AU Interpolation_1111.fap"
-    assert got.faps[0, [0, 2, 47]].tolist() == [0.0, 80.0, -900.0]
-    assert got.visemes is not None
-    assert got.visemes.tolist() == [[0, 0, 63, 0]]
-    assert got.expressions is None
 
 
 def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
@@ -69,35 +56,18 @@ def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.expressions, expressions)
 
 
-def test_reads_joined_masks_and_infinite_values(tmp_path: Path) -> None:
-    path = write(tmp_path, "2.1 x 25 1", mask(3, 5, 6, 7).replace(" ", ""), "0 inf nan -inf 1e60")
-    assert not read_fap(path).faps.any()
-
-
-def test_outer_lips_follow_inner_lips_if_not_set(tmp_path: Path) -> None:
-    got = read_fap(write(tmp_path, "2.1 x 25 1", mask(4, 5, 57, 52), "0 -10 -20 -30 -40")).faps[0]
-    assert got[[3, 50, 4, 51, 56, 9]].tolist() == [-10.0, -10.0, -20.0, -30.0, -40.0, -40.0]
-
-
 @pytest.mark.parametrize(
     ("lines", "complaint"),
     [
         ([], "line 1: expected '2.1 NAME FPS NFRAMES', found nothing"),
         (["2.0 x 25 1"], "line 1: .* found version '2.0'"),
-        (["2.1 25 1"], "line 1"),
         (["2.1 x 25 many"], "line 1: 'many' is not a number of frames"),
         (["2.1 x fast 1"], "line 1: frame rate 'fast'"),
-        (["2.1 x nan 1"], "line 1: frame rate"),
         (["2.1 x 0.0001 1"], "line 1: frame rate '0.0001' is not between 1 and 1000"),
         (["2.1 x 25 -1"], "number of frames is -1"),
-        (["2.1 x 25 1"], "ends after 0 of 1 frames"),
         (["2.1 x 25 2", mask(3), "0 1"], "line 3: the file ends after 1 of 2 frames"),
-        (["2.1 x 25 1", mask(3)], "ends after 0"),
         (["2.1 x 25 1", mask(1), "0 15 0 63 0"], "line 3: FAP 1 is 15; .* from 0 to 14"),
-        (["2.1 x 25 1", mask(1), "0 1 0 64 0"], "line 3: FAP 1 is 64; .* from 0 to 63"),
-        (["2.1 x 25 1", mask(1), "0 nan"], "line 3: FAP 1 is nan"),
         (["2.1 x 25 1", mask(2), "0 1.5"], "line 3: FAP 2 is 1.5; give a whole number from 0 to 6"),
-        (["2.1 x 25 1", mask(1, 3), "0 1 2 3"], "line 3: found 3 values, the mask sets 2"),
         (["2.1 x 25 1", "0 1 0", "0"], "line 2: expected a mask of 68"),
         (["2.1 x 25 1", mask(69, digits=69), "0 1"], "line 2: the mask sets a 69th"),
         (["2.1 x 25 1", mask(3, 4), "0 1"], "line 3: found 1 values, the mask sets 2"),
@@ -115,8 +85,26 @@ def test_error_names_line_and_reason(tmp_path: Path, lines: list[str], complaint
 def test_errors_of_missing_paths(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="absent"):
         read_fap(tmp_path / "absent.fap")
+    animation = FapAnimation("", 50.0, np.zeros((1, 68), dtype=np.float32))
     with pytest.raises(UserError, match="absent"):
-        write_fap(
-            tmp_path / "absent" / "x.fap",
-            FapAnimation("", 50.0, np.zeros((1, 68), dtype=np.float32)),
-        )
+        write_fap(tmp_path / "absent" / "x.fap", animation)
+
+
+@pytest.mark.parametrize(
+    ("bits", "values", "faps"),
+    [
+        (mask(1, 3, 48, digits=69), "12 0 80 -900", {1: 0, 3: 80, 48: -900}),  # Greta
+        (mask(3, 5, 6, 7).replace(" ", ""), "0 inf nan -inf 1e60", {3: 0, 5: 0, 6: 0, 7: 0}),
+        # The outer lips follow the inner ones if they are not set.
+        (
+            mask(4, 5, 57, 52),
+            "0 -10 -20 -30 -40",
+            {51: -10, 52: -30, 57: -40, 10: -40},
+        ),
+    ],
+)
+def test_reads_variants(tmp_path: Path, bits: str, values: str, faps: dict[int, float]) -> None:
+    animation = read_fap(write(tmp_path, "2.1 AU Interpolation_1111.fap 25 1", bits, values))
+    assert animation.name == "AU Interpolation_1111.fap"
+    row = animation.faps[0]
+    assert {number: row[number - 1] for number in faps} == faps

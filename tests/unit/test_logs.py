@@ -39,9 +39,6 @@ def test_warnings_and_a_crash_name_the_session(capsys: pytest.CaptureFixture[str
     assert (second["level"], second["session"]) == ("critical", "second")
     assert "ZeroDivisionError" in second["traceback"]
     assert first["service"] == second["service"] == "failing"
-
-
-def test_lines_below_the_level_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     configure("quiet", "warning")
     LOG.info("ready")
     assert capsys.readouterr().err == ""

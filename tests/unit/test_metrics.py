@@ -1,15 +1,17 @@
-"""Snapshots of metrics, and the busy share of a loop."""
+"""Snapshots of metrics, their page for Prometheus, and the busy share of a loop."""
 
 from __future__ import annotations
 
 import pytest
+from prometheus_client import CollectorRegistry
 
 from kouxing.shared.metrics import WINDOW, BusyShare, Metrics
+from kouxing.shared.prometheus import MetricsCollector
 
 pytestmark = pytest.mark.unit
 
 
-def test_counts_and_percentiles() -> None:
+def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
     metrics = Metrics()
     metrics.count("in_audio")
     metrics.count("in_audio", 2)
@@ -19,10 +21,6 @@ def test_counts_and_percentiles() -> None:
     assert snapshot["in_audio"] == 3
     assert snapshot["chunk_ms_p50"] == pytest.approx(50.0, abs=1.0)
     assert snapshot["chunk_ms_p99"] <= 100.0
-
-
-def test_rates_are_taken_between_snapshots() -> None:
-    metrics = Metrics()
     metrics.count("frames", 100)
     metrics.snapshot(10.0)
     metrics.count("frames", 25)
@@ -53,3 +51,42 @@ def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None
     assert last == 0.0
     busy.works(7.0)
     assert busy.share(9.0) == 1.0
+
+
+class Page:
+    """A page for Prometheus."""
+
+    def __init__(self) -> None:
+        self.metrics = Metrics()
+        self._registry = CollectorRegistry()
+        self._registry.register(MetricsCollector(self.metrics, "tester"))
+
+    def value(self, name: str, **labels: str) -> float | None:
+        return self._registry.get_sample_value(name, {"service": "tester", **labels})
+
+
+def test_the_page_has_counters_gauges_and_values_of_the_process() -> None:
+    page = Page()
+    page.metrics.count("in_audio_chunk", 3)
+    page.metrics.count("dropped_bad-audio")
+    page.metrics.count("dropped_old_epoch", 2)
+    page.metrics.count("video_ms", 1500)
+    page.metrics.set("sessions", 4)
+    page.metrics.set("sessions", 7)
+    assert page.value("kouxing_messages_received_total", kind="audio-chunk") == 3
+    assert page.value("kouxing_messages_dropped_total", reason="bad-audio") == 1
+    assert page.value("kouxing_messages_dropped_total", reason="old-epoch") == 2
+    assert page.value("kouxing_video_seconds_total") == 1.5
+    assert page.value("kouxing_sessions") == 7 == page.metrics.snapshot(0.0)["sessions"]
+    assert (page.value("process_resident_memory_bytes") or 0) > 2**20
+
+
+def test_the_page_has_histograms_of_latencies_in_seconds() -> None:
+    page = Page()
+    for value_ms in (0.4, 5.0, 5.1, 60_000.0):
+        page.metrics.observe("chunk_ms", value_ms)
+    limits = ("0.0005", "0.005", "0.01", "5.0", "+Inf")
+    counts = [page.value("kouxing_chunk_seconds_bucket", le=limit) for limit in limits]
+    assert counts == [1, 2, 3, 3, 4]
+    assert page.value("kouxing_chunk_seconds_count") == 4
+    assert page.value("kouxing_chunk_seconds_sum") == pytest.approx(60.0105)

@@ -106,7 +106,7 @@ def test_prefers_the_worker_with_the_least_load(system: System) -> None:
     placed = [open_at(system, 0.0) for _ in range(6)]
     assert placed.count("recognizer-1") == placed.count("recognizer-2") == 3, "not measured yet"
     measure(system, "recognizer-1", 0.2, 5.0)
-    measure(system, "recognizer-2", 0.5, 5.0)
+    measure(system, "recognizer-2", 0.3, 5.0)
     assert open_at(system, 5.0) == "recognizer-1"
     system.add(worker("recognizer", "recognizer-1", state="draining"))
     assert open_at(system, 5.0) == "recognizer-2"

@@ -60,20 +60,8 @@ class Link:
             self.sender.acknowledge(self.router.sent.popleft().sequence, 0.0)
 
 
-@pytest.fixture
-def link() -> Link:
-    return Link()
-
-
-def test_delivers_each_message_once_and_in_order(link: Link) -> None:
-    link.send(5)
-    link.deliver()
-    assert link.received == [1, 2, 3, 4, 5]
-    link.acknowledge()
-    assert not link.sender.unacknowledged
-
-
-def test_resends_lost_messages(link: Link) -> None:
+def test_resends_lost_messages_and_delivers_each_once_and_in_order() -> None:
+    link = Link()
     link.send(5)
     link.deliver(lose=(3,))
     assert link.received == [1, 2]
@@ -83,9 +71,12 @@ def test_resends_lost_messages(link: Link) -> None:
     assert link.sender.tick(RESEND_AFTER_S) == 3
     link.deliver()
     assert link.received == [1, 2, 3, 4, 5]
+    link.acknowledge()
+    assert not link.sender.unacknowledged
 
 
-def test_a_new_epoch_starts_again_and_old_ones_are_ignored(link: Link) -> None:
+def test_a_new_epoch_starts_again_and_old_ones_are_ignored() -> None:
+    link = Link()
     link.send(3)
     link.deliver()
     link.make_sender(epoch=2).send(Progress(level_db=0.0), now_s=0.0)
@@ -94,7 +85,8 @@ def test_a_new_epoch_starts_again_and_old_ones_are_ignored(link: Link) -> None:
     assert link.received == [1, 2, 3, 1]
 
 
-def test_every_acknowledgement_carries_the_newest_frame(link: Link) -> None:
+def test_every_acknowledgement_carries_the_newest_frame() -> None:
+    link = Link()
     link.receiver.acknowledge()
     assert not link.router.sent, "no sender is known yet"
     link.send(1)

@@ -56,7 +56,6 @@ def test_finds_the_newest_running_system_even_if_others_were_killed() -> None:
 
 
 def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    default = control_address("")
     with announce("tcp://127.0.0.1:1"):
         assert control_address("") == "tcp://127.0.0.1:1"
         key = user_key().control
@@ -65,9 +64,6 @@ def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.Monkey
         assert control_address("") == f"tcp://127.0.0.1:5 {key}"
         monkeypatch.setenv("KOUXING_INSECURE", "true")
         assert control_address("") == "tcp://127.0.0.1:5"
-        monkeypatch.delenv("KOUXING_INSECURE")
-    monkeypatch.delenv("KOUXING_CONTROL")
-    assert control_address("") == default
 
 
 def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
