@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
-from kouxing.services.cli.inputs import does_not_fit, read_mono_16k, read_text
+from kouxing.services.cli.inputs import read_mono_16k
+from kouxing.services.cli.spoken_text import does_not_fit, read_text
 from kouxing.services.driver.video import film
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel

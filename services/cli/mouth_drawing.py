@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from kouxing.services.cli.inputs import does_not_fit, read_mono_16k, read_text
+from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import Timing
+from kouxing.services.cli.spoken_text import does_not_fit, read_text
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables

@@ -193,7 +193,8 @@ def align(
     output: Output = None,
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
-    from kouxing.services.cli.inputs import does_not_fit, read_mono_16k, read_text
+    from kouxing.services.cli.inputs import read_mono_16k
+    from kouxing.services.cli.spoken_text import does_not_fit, read_text
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ

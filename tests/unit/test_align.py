@@ -116,7 +116,7 @@ def test_rejects_a_text_that_does_not_fit(
         align(DEMO / "hello-female.wav", str(tmp_path / "wrong.txt"), output=output)
     assert ended.value.exit_code == 1
     errors = capsys.readouterr().err
-    assert "ignored in the text: 'Mike'" in errors
+    assert "ignored: 'Mike'" in errors
     assert "does not fit" in errors
     assert output.is_file()
 

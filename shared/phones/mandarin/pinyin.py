@@ -62,9 +62,17 @@ _SPELLED_AFTER = {"ii": "i", "iii": "i", "iou": "iu", "uei": "ui", "uen": "un"}
 _SPELLED_AFTER |= {phone: "ü" + phone[1:] for phone in _V_ROW.values()}
 _SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
 
-_PINYIN_LETTERS = "üāáǎàēéěèīíǐìōóǒòūúǔùǖǘǚǜ"
+_CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
+_PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
+_LATIN = "A-Za-z\u00c0-\u04ff"
+_SPACE_BESIDE_CHARACTER = re.compile(f"(?<![{_LATIN}]) | (?![{_LATIN}])")
+# Numbers are read sentence by sentence: time and memory grow with the square of the length.
+_SENTENCE = re.compile(
+    r"[^。！？]{1,500}(?![^。！？])[。！？]*|.{1,500}(?<!\d)|.{1,500}", re.DOTALL
+)
+_HALF_WIDTH = str.maketrans("０１２３４５６７８９．％", "0123456789.%")
+_KEYCAP = re.compile("[0-9#*]\ufe0f?\u20e3")  # emoji of a key, a bullet
 _TONES = {"\u0304": 1, "\u0301": 2, "\u030c": 3, "\u0300": 4}  # combining marks
-_PUNCTUATION = ',.;!?"()“”，。！？、；：…—'
 
 
 def phones_of_syllable(syllable: str) -> tuple[str, ...]:
@@ -135,32 +143,36 @@ def spell(phones: tuple[str, ...]) -> str:
 
 
 def transcribe(text: str) -> Transcript:
-    """Convert a text to syllables: characters or pinyin, with numbers and dates.
+    """Convert a text to syllables: characters with numbers and dates, or else pinyin.
 
-    Punctuation, and spaces between Chinese characters, are ignored. Letters and symbols among the
-    characters are dropped.
-
-    Raises
-    ------
-    UserError
-        If a syllable of pinyin is unknown.
+    Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
+    dropped: letters among characters, and unknown syllables of pinyin.
 
     Examples
     --------
     >>> [syllable.spelling for syllable in transcribe("10月1日").syllables]
     ['shi2', 'yue4', 'yi1', 'ri4']
+    >>> transcribe("ni3 hao3, Tom").dropped
+    ('Tom',)
     """
-    has_letters = any(letter.isalpha() for letter in text)
-    if has_letters and (text.isascii() or any(mark in text.lower() for mark in _PINYIN_LETTERS)):
-        written = [word.strip(_PUNCTUATION) for word in text.split()]
-        return Transcript(
-            tuple(
-                SpokenSyllable(word, _with_tone_digit(word), phones_of_syllable(word))
-                for word in written
-                if word
-            )
-        )
-    characters = _read_numbers("".join(text.split()))
+    text = _KEYCAP.sub(" ", text)
+    if _CHINESE.search(text) or not any(letter.isalpha() for letter in text):
+        return _read_characters(text)
+    syllables, dropped = [], []
+    for word in _PINYIN_WORD.findall(unicodedata.normalize("NFKC", text)):
+        try:
+            phones = phones_of_syllable(word)
+        except UserError:
+            dropped.append(word)
+        else:
+            syllables.append(SpokenSyllable(word, _with_tone_digit(word), phones))
+    return Transcript(tuple(syllables), tuple(dropped))
+
+
+def _read_characters(text: str) -> Transcript:
+    text = re.sub(r"(?<=\d)：(?=\d)", ":", text.translate(_HALF_WIDTH))
+    without_spaces = _SPACE_BESIDE_CHARACTER.sub("", " ".join(text.split()))
+    characters = "".join(map(_read_numbers, _SENTENCE.findall(without_spaces)))
     syllables = tuple(
         SpokenSyllable(character, spelling.replace("v", "ü"), phones_of_syllable(spelling))
         for character, spelling in zip(characters, _pinyin_of(characters), strict=True)
@@ -198,8 +210,8 @@ def _read_numbers(text: str) -> str:
 
 
 def _is_spoken(letter: str) -> bool:
-    """Whether a character is neither punctuation, a separator nor a control character."""
-    return unicodedata.category(letter)[0] not in "PZC"
+    """Whether a character is neither punctuation, a separator, a mark nor a control character."""
+    return unicodedata.category(letter)[0] not in "PZCM" and letter not in "~～"
 
 
 def _with_tone_digit(syllable: str) -> str:

@@ -1,0 +1,102 @@
+"""Reads the spoken texts of commands: given directly, or as a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text
+from kouxing.services.recognizer.alignment import MIN_FIT, Alignment
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.transcript import Transcript
+from kouxing.shared.terminal import print_message
+
+_MAX_BYTES = 16 * 1024 * 1024
+_MAX_NAMED = 20  # words in a message
+_TEXT_SUFFIXES = {
+    *(".txt", ".text", ".md", ".markdown", ".html", ".htm", ".xml", ".ssml", ".json", ".textgrid"),
+    *(".srt", ".vtt", ".lrc", ".ass", ".ssa", ".sbv", ".sub", ".ttml", ".dfxp", ".smi", ".tsv"),
+    *(".pdf", ".rtf", ".doc", ".docx", ".odt", ".csv", ".xlsx"),
+}
+_TABLE_SUFFIXES = {".csv", ".xlsx"}
+_MARKDOWN_SUFFIXES = {".md", ".markdown"}
+
+
+def read_text(text: str, inventory: PhoneInventory) -> Transcript:
+    """Return the syllables of a text or of a text file.
+
+    Prints a message about words that cannot be read, and about a format with more than the text.
+    Raises ``UserError`` if the file or the text cannot be read, or the text has no syllables.
+    """
+    transcript = inventory.read(text_of(text))
+    words = [repr(word) for word in dict.fromkeys(transcript.dropped)]
+    named = ", ".join(words[:_MAX_NAMED])
+    if len(words) > _MAX_NAMED:
+        named += f" and {len(words) - _MAX_NAMED} more"
+    if not transcript.syllables:
+        if words:
+            raise UserError(f"no word of the text can be read: {named}; write them in characters")
+        raise UserError("the text is empty; give the spoken words")
+    if words:
+        print_message(
+            f"words that cannot be read were ignored: {named}; write them as they are spoken, in"
+            " characters"
+        )
+    return transcript
+
+
+def does_not_fit(audio: Path, alignment: Alignment) -> str:
+    """Return the message that a text does not fit a recording."""
+    return (
+        f"{audio}: the text does not fit the sound (fit {alignment.fit:.2f}, normally at least"
+        f" {MIN_FIT}); check that the text is complete and is what was said"
+    )
+
+
+def text_of(text: str) -> str:
+    """Return the spoken text of a text, or of the file of that name.
+
+    Prints the format if it is not plain text. Raises ``UserError`` if the file cannot be read, or
+    its format is not supported.
+    """
+    path = _path_of(text)
+    if path is None:
+        spoken, encoding = extract_text(text), ""
+    else:
+        try:
+            spoken, encoding = _read_file(path)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
+    forms = [form for form in (spoken.form, encoding) if form]
+    if forms:
+        name = "the text" if path is None else str(path)
+        print_message(f"{name} was read as {' in '.join(forms)}")
+    return spoken.text
+
+
+def _path_of(text: str) -> Path | None:
+    """Return the file that a text names; ``UserError`` if it does not exist."""
+    try:
+        path = Path(text)
+        if path.is_file():
+            return path
+        if path.suffix.lower() in _TEXT_SUFFIXES:
+            raise UserError(f"{path}: no such file")
+    except (OSError, ValueError):  # too long for a file name
+        pass
+    return None
+
+
+def _read_file(path: Path) -> tuple[SpokenText, str]:
+    suffix = path.suffix.lower()
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise UserError(f"a text file must not be larger than {_MAX_BYTES >> 20} MiB")
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"cannot be read: {error.strerror}") from None
+    if suffix in _TABLE_SUFFIXES:
+        raise UserError(f"this is a table ({suffix}); save the spoken text as a plain text file")
+    decoded = decode_text(content)
+    is_markdown = suffix in _MARKDOWN_SUFFIXES
+    return extract_text(decoded.text, is_markdown=is_markdown), decoded.form

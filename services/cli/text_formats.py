@@ -1,0 +1,328 @@
+"""Extracts the spoken text from subtitles, markup and other files with more than the text.
+
+A format is recognized by its content, because a text may come without a file name. Times and tags
+are left out. A format whose text cannot be extracted is rejected by its name.
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import json
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from typing import NamedTuple
+
+from kouxing.shared.errors import UserError
+
+_BINARY = {  # by their first bytes
+    b"%PDF": "a PDF document",
+    b"{\\rtf": "an RTF document",
+    b"PK\x03\x04": "a Word, OpenDocument, EPUB or zip file",
+    b"\xd0\xcf\x11\xe0": "a Word or Office document",
+    b"\x1f\x8b": "a gzip file",
+    b"RIFF": "a sound or video file",
+    b"ID3": "a sound file",
+    b"fLaC": "a sound file",
+    b"OggS": "a sound file",
+    b"\x1aE\xdf\xa3": "a video file",
+    b"\x89PNG": "a picture",
+    b"\xff\xd8\xff": "a picture",
+}
+_TEXTUAL = {  # text files without an extractor, by their first characters
+    "Scenarist_SCC": "SCC captions",
+    "#!MLF!#": "an HTK label file",
+    "@UTF8": "a CHAT transcript",
+    "@Begin": "a CHAT transcript",
+    "\\documentclass": "a LaTeX document",
+    "\\version": "a LilyPond file",
+}
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+_MIN_COMMON = 0.8  # share of common characters in a text that was decoded correctly
+
+_TIME = r"(?:\d{1,3}:)?\d{1,2}:\d{2}(?:[.,:]\d{1,3})?"
+_LRC_TIME = r"\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
+_FRAMES = r"(?:\{\d+\}\{\d*\}|\[\d+\]\[\d*\])"
+_LABEL = r"\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t"
+_TIMED_LINE = rf"[(\[]?{_TIME}[)\]]?(?:[ \t]+|$)"
+
+_CUE_TIMES = re.compile(rf"^[ \t]*{_TIME}[ \t]*-->[ \t]*{_TIME}", re.MULTILINE)
+_SBV_TIMES = re.compile(r"^\d+:\d{2}:\d{2}\.\d{3},\d+:\d{2}:\d{2}\.\d{3}[ \t]*$", re.MULTILINE)
+_LRC_FIELD = re.compile(r"\[[A-Za-z#]+:[^\]]*\]")
+_LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
+_BRACES = re.compile(r"\{[^{}]*\}")
+_INLINE_TIME = re.compile(r"<\d{1,3}:[\d:.]+>")
+_TAG = re.compile(r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--")
+_STRING = re.compile(r'"((?:[^"]|"")*)"')
+_CHINESE = re.compile("[〇\u3400-\u9fff]")
+
+_UNSPOKEN_ELEMENTS = {
+    *("script", "style", "title", "template", "rt", "rp"),
+    *("metadata", "desc", "copyright", "lexicon", "styling", "layout"),
+}
+_LINE_ELEMENTS = {"br", "div", "h1", "h2", "h3", "h4", "li", "p", "s", "td", "text", "tr"}
+_UNSPOKEN_LABELS = {"sil", "sp", "spn", "pau", "silence", "<sil>", "<eps>", "#"}
+
+
+class SpokenText(NamedTuple):
+    """The spoken part of a text."""
+
+    text: str
+    form: str = ""  # format that the rest of the text has; empty: plain text
+
+
+def decode_text(content: bytes) -> SpokenText:
+    """Decode a text file. ``form`` is its encoding, unless it is UTF-8.
+
+    Raises
+    ------
+    UserError
+        If the file is not a text; the message names its format.
+    """
+    for beginning, name in _BINARY.items():
+        if content.startswith(beginning):
+            raise UserError(f"this is {name}; save the spoken text as a plain text file")
+    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "")
+    if not encoding and b"\0" in content:
+        encoding = "utf-16-be" if content[::2].count(0) > content[1::2].count(0) else "utf-16-le"
+    texts: dict[str, str] = {}
+    for name in [encoding] if encoding else ["utf-8", "gb18030", "big5"]:
+        with contextlib.suppress(UnicodeDecodeError):
+            texts[name] = content.decode(name)
+    # bytes in Big5 are mostly valid in GB 18030 too, but give rare characters
+    candidates = [name for name in texts if name != "gb18030" or _is_common(texts[name])]
+    name = next(iter(candidates or texts), "")
+    if not name or any(ord(letter) < 32 and not letter.isspace() for letter in texts[name]):
+        raise UserError("this is not a text file; save the spoken text as plain text in UTF-8")
+    return SpokenText(texts[name], "" if name.startswith("utf-8") else name.upper())
+
+
+def _is_common(text: str) -> bool:
+    """Return whether most characters of a text are among the 7000 that GB 2312 has."""
+    characters = [letter for letter in text if not letter.isascii()]
+    common = sum(bool(letter.encode("gb2312", "ignore")) for letter in characters)
+    return common >= _MIN_COMMON * len(characters)
+
+
+def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
+    """Extract the spoken text from a text of any format.
+
+    Raises
+    ------
+    UserError
+        If the text has a format whose spoken text cannot be extracted; the message names it.
+    """
+    text = text.lstrip("\ufeff \t\r\n").replace("\r\n", "\n").replace("\r", "\n")
+    for beginning, name in _TEXTUAL.items():
+        if text.startswith(beginning):
+            raise UserError(f"this is {name}; give the spoken text alone")
+    for form, pattern, extract in _FORMATS:
+        if (is_markdown and form == "Markdown") or pattern.search(text):
+            try:
+                spoken = extract(text)
+            except (ValueError, RecursionError):
+                raise UserError(f"this is not valid {form}; give the spoken text alone") from None
+            break
+    else:
+        form, spoken = "", text
+    if _LEFT_TIME.search(spoken):
+        raise UserError("the text has times of an unknown format; give the spoken text alone")
+    return SpokenText(spoken, form)
+
+
+def _read_cues(text: str) -> str:
+    """Extract the text from SubRip or WebVTT."""
+    spoken: list[str] = []
+    for block in re.split(r"\n[ \t]*\n", text):
+        lines = block.strip("\n").split("\n")
+        if re.match(r"WEBVTT|NOTE\b|STYLE$|REGION$", lines[0]):
+            continue
+        for number, line in enumerate(lines):
+            if not _CUE_TIMES.match(line):
+                spoken.append(_BRACES.sub("", line))
+            elif number == 1 or (number and lines[number - 1].strip().isdigit()):
+                spoken.pop()  # the name of the cue
+    return _read_markup("\n".join(spoken))
+
+
+def _read_sbv(text: str) -> str:
+    return _SBV_TIMES.sub("", text).replace("[br]", "\n")
+
+
+def _read_lrc(text: str) -> str:
+    """Extract the lines in the order of their times. A line with several times is repeated."""
+    timed: list[tuple[float, str]] = []
+    for line in text.split("\n"):
+        if _LRC_FIELD.fullmatch(line.strip()):
+            continue
+        times_s = [
+            60 * int(minutes) + float(seconds.replace(":", "."))
+            for minutes, seconds in re.findall(_LRC_TIME, line)
+        ]
+        words = _INLINE_TIME.sub("", re.sub(_LRC_TIME, "", line))
+        timed += [(time_s, words) for time_s in times_s or [timed[-1][0] if timed else 0.0]]
+    return "\n".join(words for _, words in sorted(timed, key=lambda item: item[0]))
+
+
+def _read_frame_numbers(text: str) -> str:
+    words = re.sub(rf"^{_FRAMES}", "", text, flags=re.MULTILINE)
+    return _BRACES.sub("", words).replace("|", "\n")
+
+
+def _read_events(text: str) -> str:
+    """Extract the dialogue from ASS or SSA, in the order of its times."""
+    fields = ["layer", "start", "end", "style", "name", "l", "r", "v", "effect", "text"]
+    events = []
+    for line in text.split("\n"):
+        kind, _, rest = line.partition(":")
+        if kind.strip() == "Format" and "text" in rest.lower():
+            fields = [name.strip().lower() for name in rest.split(",")]
+        if kind.strip() == "Dialogue":
+            values = dict(zip(fields, rest.strip().split(",", len(fields) - 1), strict=False))
+            said = values.get("text", "")
+            if not re.search(r"\{[^}]*\\p[1-9]", said):  # a drawing
+                start = [float(part) for part in values.get("start", "0").split(":")]
+                events.append((start, re.sub(r"\\[Nnh]", "\n", _BRACES.sub("", said))))
+    return "\n".join(said for _, said in sorted(events, key=lambda event: event[0]))
+
+
+def _read_labels(text: str) -> str:
+    """Extract the labels of Audacity or Whisper: start, end and label, separated by tabs."""
+    return "\n".join(re.findall(rf"^{_LABEL}(.*)", text, re.MULTILINE))
+
+
+def _read_timed_lines(text: str) -> str:
+    return re.sub(rf"^{_TIMED_LINE}", "", text, flags=re.MULTILINE)
+
+
+def _read_text_grid(text: str) -> str:
+    """Extract the labels of the first tier with Chinese characters, or of the only tier.
+
+    The long and the short form have the same strings: two of the header, then the class, the name
+    and the labels of each tier.
+    """
+    tiers: list[list[str]] = []
+    for match in _STRING.finditer(text):
+        string = match[1].replace('""', '"').strip()
+        if string in ("IntervalTier", "TextTier"):
+            tiers.append([])
+        elif tiers:
+            tiers[-1].append(string)
+    chosen = [tier for tier in tiers if _CHINESE.search("".join(tier[1:]))] or tiers
+    if len(chosen) > 1 and chosen is tiers:
+        names = ", ".join(repr(tier[0]) for tier in tiers if tier)
+        raise UserError(
+            f"this TextGrid has the tiers {names}, none with Chinese characters; give the spoken"
+            " text alone"
+        )
+    labels = chosen[0][1:] if chosen else []
+    return "\n".join(label for label in labels if label.lower() not in _UNSPOKEN_LABELS)
+
+
+def _read_json(text: str) -> str:
+    return _json_text(json.loads(text))
+
+
+def _json_text(value: object) -> str:
+    """Extract the text of a transcript: of Whisper, of players, or of ``kouxing align``."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list) and value:
+        return "\n".join(map(_json_text, value))
+    if isinstance(value, dict):
+        for name in ("text", "content", "segments", "body", "syllables"):
+            if name in value:
+                return _json_text(value[name])
+    raise UserError("this is JSON without the text of a transcript; give the spoken text alone")
+
+
+def _read_markdown(text: str) -> str:
+    text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)  # metadata
+    text = re.sub(r"^(```|~~~).*?^\1[^\n]*$", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)  # pictures
+    text = re.sub(r"\[([^\]]*)\](?:\([^)]*\)|\[[^\]]*\])", r"\1", text)  # links
+    text = re.sub(r"^\s*\|?[\s:|-]*-[\s:|-]*$", "", text, flags=re.MULTILINE)  # rules
+    text = re.sub(r"^\s*(?:#{1,6}|>+|[-*+]|\d+[.)])\s+", "", text, flags=re.MULTILINE)
+    return _read_markup(re.sub(r"[*`|]|~~", "", text))
+
+
+def _read_markup(text: str) -> str:
+    """Extract the text from SSML, TTML, HTML and subtitles with tags."""
+    parser = _MarkupParser()
+    parser.feed(_INLINE_TIME.sub("", text))
+    parser.close()
+    return "".join(parser.spoken)
+
+
+class _MarkupParser(HTMLParser):
+    """Collects the spoken text. It resolves no entities of a document, so they cannot grow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spoken: list[str] = []
+        self._unspoken: list[str] = []  # open elements whose text is not spoken
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        name = tag.rpartition(":")[2]
+        if name in _LINE_ELEMENTS:
+            self.spoken.append("\n")
+        alias = dict(attrs).get("alias") if name == "sub" else None
+        if alias and not self._unspoken:
+            self.spoken.append(alias)
+        if name in _UNSPOKEN_ELEMENTS or alias:
+            self._unspoken.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag.rpartition(":")[2] in _LINE_ELEMENTS:
+            self.spoken.append("\n")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in self._unspoken:
+            del self._unspoken[self._unspoken.index(tag) :]
+
+    def handle_data(self, data: str) -> None:
+        if not self._unspoken:
+            self.spoken.append(data)
+
+    def unknown_decl(self, data: str) -> None:
+        if data.startswith("CDATA["):
+            self.handle_data(data.removeprefix("CDATA["))
+
+
+def _reject_xml(text: str) -> str:
+    root = re.search(r"<([A-Za-z][\w:.-]*)", text)
+    name = f" with the root element {root[1]!r}" if root else ""
+    raise UserError(f"this is XML{name}; give the spoken text alone")
+
+
+_FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (
+    ("WebVTT", re.compile(r"\AWEBVTT"), _read_cues),
+    ("TextGrid", re.compile(r'\AFile type = "ooTextFile'), _read_text_grid),
+    ("ASS or SSA", re.compile(r"\A\[(Script Info|V4\+? Styles|Events)\]", re.I), _read_events),
+    ("JSON", re.compile(r'\A(\{\s*"|\[\s*[{"])'), _read_json),
+    ("SubRip (SRT)", _CUE_TIMES, _read_cues),
+    ("SBV", _SBV_TIMES, _read_sbv),
+    ("LRC", re.compile(rf"^[ \t]*{_LRC_TIME}", re.MULTILINE), _read_lrc),
+    ("MicroDVD or MPL2", re.compile(rf"\A{_FRAMES}"), _read_frame_numbers),
+    ("a table of labels", re.compile(rf"\A([^\n]*\n)?{_LABEL}"), _read_labels),
+    ("SSML", re.compile(r"<speak\b", re.I), _read_markup),
+    ("TTML", re.compile(r"<(\w+:)?tt\b", re.I), _read_markup),
+    ("HTML", re.compile(r"<(!DOCTYPE html|html|body)\b", re.I), _read_markup),
+    ("SAMI", re.compile(r"<sami\b", re.I), _read_markup),
+    ("a transcript in XML", re.compile(r"<(transcript|timedtext)\b", re.I), _read_markup),
+    ("XML", re.compile(r"\A<\?xml"), _reject_xml),
+    ("Markdown", re.compile(r"^#{1,6} |^```|\]\([^)\s]+\)", re.MULTILINE), _read_markdown),
+    ("text with tags", _TAG, _read_markup),
+    (
+        "a transcript with times",
+        re.compile(rf"\A[(\[]?0?0:.*\n(.*\n)?{_TIMED_LINE}", re.MULTILINE),
+        _read_timed_lines,
+    ),
+)

@@ -1,0 +1,249 @@
+"""Spoken texts in subtitles, markup and other encodings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from kouxing.services.cli.spoken_text import read_text, text_of
+from kouxing.services.cli.text_formats import decode_text, extract_text
+from kouxing.shared.errors import UserError
+from tests.languages import MANDARIN
+
+pytestmark = pytest.mark.unit
+
+ONE, TWO = "大家好，我是人。", "请看我的嘴唇。"
+SAID = "大家好我是人请看我的嘴唇"
+
+TEXTS = {
+    "": f"{ONE}{TWO}",
+    "SubRip (SRT)": f"""\ufeff1\r
+00:00:00,400 --> 00:00:03,000 X1:40\r
+{{\\an8}}<i>{ONE}</i>\r
+2\r
+00:00:03,200 --> 00:00:06,000\r
+<font color="#fff">请看</font>\r
+我的嘴唇。\r
+""",
+    "WebVTT": f"""WEBVTT - title 12
+
+STYLE
+::cue {{ color: red }}
+
+NOTE 3 lines
+
+intro
+00:00.400 --> 00:03.000 align:start position:10%
+<v Anna 2>{ONE}</v>
+
+00:00:03.200 --> 00:00:06.000
+请<00:00:03.500><c.red>看</c>我的嘴唇&nbsp;。
+""",
+    "LRC": f"""[ti:greeting]
+[by:2024]
+[00:03.20]请看<00:04.00>我的嘴唇。
+[00:00.40]{ONE}
+""",
+    "ASS or SSA": """[Script Info]
+Title: 7
+[V4+ Styles]
+Style: Default,Arial,20
+[Events]
+Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
+Comment: 0,0:00:00.00,0:00:03.00,Default,,0,0,0,,3
+Dialogue: 0,0:00:03.20,0:00:06.00,Default,,0,0,0,,{\\pos(9,9)}请看\\N我的嘴唇。
+Dialogue: 0,0:00:00.40,0:00:03.00,Default,,0,0,0,,大家好,我是人。
+Dialogue: 0,0:00:00.40,0:00:03.00,Default,,0,0,0,,{\\p1}m 0 0 l 9 9{\\p0}
+""",
+    "SBV": f"""0:00:00.400,0:00:03.000
+{ONE}
+
+0:00:03.200,0:00:06.000
+请看[br]我的嘴唇。
+""",
+    "MicroDVD or MPL2": f"{{10}}{{75}}{{y:i}}{ONE}\n{{80}}{{150}}请看|我的嘴唇。\n",
+    "a table of labels": f"start\tend\ttext\n400\t3000\t{ONE}\n3200\t6000\t{TWO}\n",
+    "SSML": """<?xml version="1.0"?>
+<!-- 1 2 3 -->
+<speak version="1.0" xml:lang="zh-CN"><metadata><a>9</a></metadata>大家好，<break time="2s"/>
+我是<sub alias="人">R2</sub>。
+<prosody rate="90%">请看<mark name="4"/>我的嘴唇。</prosody></speak>""",
+    "TTML": f"""<?xml version="1.0"?><tt xmlns="http://www.w3.org/ns/ttml" xmlns:ttm="x"><head>
+<metadata><ttm:title>5</ttm:title></metadata></head><body><div>
+<p begin="00:00:00.400" end="3s">{ONE}</p><p begin="3.2s">请看<br/>我的<span>嘴唇。</span></p>
+</div></body></tt>""",
+    "HTML": f"""<!DOCTYPE html><html><head><title>5</title><style>a {{ top: 4 }}</style></head>
+<body><p>{ONE}<p>请看我的<ruby>嘴<rt>zuǐ</rt></ruby>唇。<script>1 < 2</script></body></html>""",
+    "Markdown": """---
+date: 2024
+---
+# 大家好，
+
+![5](a1.png)
+1. **我是人**。
+> 请看[我的](https://example.com/1)嘴唇。
+
+```
+x = 1
+```
+""",
+    "JSON": '{"text": "大家好，我是人。请看我的嘴唇。", "segments": [{"text": "大"}]}',
+    "text with tags": '大家好，<break time="200ms"/>我是<b>人</b>。请看我的嘴唇。',
+    "a transcript with times": f"0:00\n{ONE}\n0:03\n{TWO}\n",
+    "TextGrid": f"""File type = "ooTextFile"
+Object class = "TextGrid"
+xmin = 0
+xmax = 6
+tiers? <exists>
+size = 2
+item []:
+    item [1]:
+        class = "IntervalTier"
+        name = "phones"
+        intervals: size = 1
+        intervals [1]:
+            xmin = 0
+            xmax = 6
+            text = "sh"
+    item [2]:
+        class = "IntervalTier"
+        name = "words"
+        intervals: size = 3
+        intervals [1]:
+            xmin = 0
+            xmax = 3
+            text = "{ONE}"
+        intervals [2]:
+            text = "sil"
+        intervals [3]:
+            text = "请看我的""嘴唇""。"
+""",
+}  # fmt: skip
+SHORT_TEXT_GRID = f"""File type = "ooTextFile"
+"TextGrid"
+0
+6
+<exists>
+1
+"IntervalTier"
+"5"
+0
+6
+1
+0
+6
+"{ONE}{TWO}"
+"""
+
+
+@pytest.mark.parametrize("form", TEXTS)
+def test_extracts_the_spoken_text(form: str) -> None:
+    spoken = extract_text(TEXTS[form])
+    assert spoken.form == form
+    transcript = MANDARIN.read(spoken.text)
+    assert "".join(syllable.text for syllable in transcript.syllables) == SAID
+    assert transcript.dropped == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (SHORT_TEXT_GRID, SAID),
+        (
+            '[{"from": 0.4, "content": "大家好"}, {"from": 3.2, "content": "我是人"}]',
+            "大家好我是人",
+        ),
+        ("[00:01.00][00:03.00]你好\n[00:02.00]大家", "你好大家你好"),
+        ("下午3:30见，8:00到", "下午三点三十分见八点到"),
+        ("１２：３０，２个", "十二点三十分两个"),
+    ],
+)
+def test_reads_times_only_where_they_are_spoken(text: str, said: str) -> None:
+    transcript = MANDARIN.read(extract_text(text).text)
+    assert "".join(syllable.text for syllable in transcript.syllables) == said
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<?xml version="1.0"?><ANNOTATION_DOCUMENT>你</ANNOTATION_DOCUMENT>', "ANNOTATION_DOC"),
+        ("Scenarist_SCC V1.0\n\n00:00:00:00 9420", "SCC captions"),
+        ('{"phones": []}', "JSON without"),
+        ('{"text": ', "not valid JSON"),
+        ("大家好 at 00:00:03.200 请看", "times of an unknown format"),
+        (
+            TEXTS["TextGrid"].replace(ONE, "da").replace('"请看我的""嘴唇""。"', '"jia"'),
+            "'phones', 'w",
+        ),
+        ("[Events]\nDialogue: 0,x,0:00:03.00,Default,,0,0,0,,你", "not valid ASS"),
+    ],
+)
+def test_rejects_a_format_by_its_name(text: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        extract_text(text)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "form"),
+    [
+        ("utf-8", ""),
+        ("utf-8-sig", ""),
+        ("utf-16", "UTF-16"),
+        ("utf-16-le", "UTF-16-LE"),
+        ("utf-16-be", "UTF-16-BE"),
+        ("gb18030", "GB18030"),
+        ("big5", "BIG5"),
+    ],
+)
+def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
+    text = "歡迎收聽，我們會請你看嘴唇怎麼動。" if encoding == "big5" else f"\n{ONE}{TWO} 123"
+    assert decode_text(text.encode(encoding)) == (text, form)
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (b"%PDF-1.7", "PDF"),
+        (b"{\\rtf1 ", "RTF"),
+        (b"PK\3\4word/document.xml", "Word"),
+        (b"RIFF1234WAVE", "sound"),
+        (b"\x01\x02\xff\xfe\xfd", "not a text file"),
+    ],
+)
+def test_rejects_a_file_that_is_not_text(content: bytes, name: str, tmp_path: Path) -> None:
+    (tmp_path / "said.txt").write_bytes(content)
+    with pytest.raises(UserError, match=rf"said\.txt: this is .*{name}"):
+        text_of(str(tmp_path / "said.txt"))
+
+
+def test_reads_a_subtitle_file_and_names_its_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "said.srt"
+    path.write_bytes(TEXTS["SubRip (SRT)"].encode("gb18030", "ignore"))
+    assert len(read_text(str(path), MANDARIN).syllables) == len(SAID)
+    assert "said.srt was read as SubRip (SRT) in GB18030" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["no.srt", "no.TextGrid", "no.docx"])
+def test_rejects_a_missing_file(name: str) -> None:
+    with pytest.raises(UserError, match=f"{re.escape(name)}: no such file"):
+        text_of(name)
+
+
+def test_reports_each_word_that_cannot_be_read(capsys: pytest.CaptureFixture[str]) -> None:
+    for text in ("大家好 hello world，café Tom，Tom", "da4 jia1 hao3 hello, world! café Tom"):
+        assert MANDARIN.read(text).dropped[:4] == ("hello", "world", "café", "Tom")
+        assert len(read_text(text, MANDARIN).syllables) == 3
+        assert "ignored: 'hello', 'world', 'café', 'Tom'; write" in capsys.readouterr().err
+    with pytest.raises(UserError, match="no word of the text can be read: 'hello', 'world'"):
+        read_text("hello world", MANDARIN)
+
+
+@pytest.mark.parametrize(
+    "text", ["Nǐ hǎo，nǚ’ér！", "ni3 hao3, nu:3…er2", "ｎｉ３　ｈａｏ３，nv3-er2", "nǐ hǎo nü er"]
+)
+def test_reads_pinyin_with_any_punctuation(text: str) -> None:
+    assert MANDARIN.read(text).phones == [("n", "i"), ("h", "ao"), ("n", "v"), ("er",)]
