@@ -34,7 +34,7 @@ from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import EndOfSound, LipPositions, Phone, SoundEvent, SpeechChange
 
 # Tuned on the same held-out clips as the rule of the live chain. If the sound has one closure and
 # the phones have two, the vowel between them counts. No clip has such a place.
@@ -86,7 +86,7 @@ def analyze_recording(
         duration_s=len(samples) / MEDIA_RATE_HZ,
         events=[
             *(phone if aligned is None else replace(phone, confidence=1.0) for phone in phones),
-            *(event for event in events if isinstance(event, LipFrame) and event.time_s >= 0.0),
+            *(event for event in events if isinstance(event, LipPositions) and event.time_s >= 0.0),
             *(
                 SpeechChange(
                     active=isinstance(event, SpeechStart), time_s=frame_time_s(event.frame)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import AcknowledgePhones
+from kouxing.shared.wire.speech import Acknowledge
 
 RESEND_AFTER_S = 0.5
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
@@ -70,7 +70,7 @@ class ReliableReceiver:
         self,
         socket: Socket,
         session: str,
-        make_acknowledgement: Callable[[], AcknowledgePhones] = AcknowledgePhones,
+        make_acknowledgement: Callable[[], Acknowledge] = Acknowledge,
     ) -> None:
         self._socket = socket
         self._session = session

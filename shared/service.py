@@ -38,10 +38,9 @@ from kouxing.shared.wire.control import (
     SessionInput,
     SessionStarted,
     StartSession,
-    StopSession,
 )
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, ErrorCode, FlushSession, SessionFacts
+from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession, SessionFacts
 
 TICK_S = 0.01
 HEARTBEAT_S = 0.25
@@ -115,7 +114,7 @@ class Service(MessageLoop):
         return {
             HeartbeatReply: self._on_heartbeat_reply,
             StartSession: self._on_start_session,
-            StopSession: lambda message, _: self.stop_session(message.session),
+            CloseSession: lambda message, _: self.stop_session(message.session),
             FlushSession: lambda message, _: self.flush_session(message.session),
             Error: self.on_error,
         }

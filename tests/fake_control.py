@@ -10,7 +10,7 @@ from typing import Self
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.sockets import Poller, Socket
-from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
+from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
@@ -25,6 +25,7 @@ from kouxing.shared.wire.session import (
     StatusReport,
     StatusRequest,
 )
+from kouxing.shared.wire.speech import Acknowledge
 
 LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls it
@@ -145,7 +146,7 @@ class FakeControl:
                     elif isinstance(message, AudioChunk):
                         self.audio_messages.append(message)
                         self.audio_sender = received.sender
-                        taken = AcknowledgeAudio(session=message.session, sequence=message.sequence)
+                        taken = Acknowledge(session=message.session, sequence=message.sequence)
                         self.audio.send(taken, to=received.sender)
 
     def _status(self, request: StatusRequest) -> StatusReport:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.phones.events import LipPositions
 
 JAW = MOUTH_FAPS.index(3)
 
@@ -44,7 +44,7 @@ class LoudLipStream:
         known_s: float,
         frames: NDArray[np.float32],
         values: NDArray[np.float32],
-    ) -> list[LipFrame]:
+    ) -> list[LipPositions]:
         self._num_positions += 1
         assert frames.shape == (2, 80)
         assert values.ndim == 3
@@ -53,7 +53,7 @@ class LoudLipStream:
         faps[JAW] = 400.0 * loudness + 0.2 * values.mean()
         faps[JAW + 1] = self._num_positions
         return [
-            LipFrame(
+            LipPositions(
                 time_s=known_s - delay_s,
                 delay_s=delay_s,
                 faps=faps,

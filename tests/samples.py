@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
+from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import (
     AllowedKey,
     Event,
@@ -13,7 +13,6 @@ from kouxing.shared.wire.control import (
     SessionInput,
     SessionStarted,
     StartSession,
-    StopSession,
 )
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
@@ -33,21 +32,20 @@ from kouxing.shared.wire.session import (
     StatusRequest,
 )
 from kouxing.shared.wire.speech import (
-    AcknowledgePhones,
-    Lips,
+    Acknowledge,
+    LipPositions,
     NewestFrame,
     Phone,
     Progress,
-    ResumeFace,
     Speech,
 )
 
 COMMON = {"session": "demo", "epoch": 1, "sequence": 7, "media_time": 16000}
 FAPS = np.arange(68, dtype="<f4").tobytes()
 MOUTH = np.arange(28, dtype="<f4").tobytes()
-FACTS = SessionFacts(language="mandarin", frame_rate_hz=50.0, delay_ms=160.0, lips="learnt")
+FACTS = SessionFacts(language="mandarin", frame_rate_hz=50.0, delay_ms=160.0, lip_model="learnt")
 FACE = FaceSettings(
-    lips="learnt",
+    lip_model="learnt",
     expressiveness=1.25,
     expressions={"joy": 0.5, "squint": 1.0},
     hold_s=2.5,
@@ -128,7 +126,6 @@ SAMPLES: tuple[Message, ...] = (
     Done(session="demo", request="r2"),
     Error(session="demo", code="busy", text="no worker has room", request="r2", retry_after_s=5.0),
     AudioChunk(**COMMON, token="t", pcm=b"\x00\x01\xff\x7f", last=True),  # type: ignore[arg-type]
-    AcknowledgeAudio(**COMMON),  # type: ignore[arg-type]
     Sound(**COMMON, pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
     Speech(**COMMON, active=True),  # type: ignore[arg-type]
     Phone(
@@ -139,7 +136,7 @@ SAMPLES: tuple[Message, ...] = (
         confidence=0.5,
         final=False,
     ),
-    Lips(**COMMON, values=MOUTH, delay=960, closure=0.75, lip_to_teeth=0.125),  # type: ignore[arg-type]
+    LipPositions(**COMMON, values=MOUTH, delay=960, closure=0.75, lip_to_teeth=0.125),  # type: ignore[arg-type]
     FapFrame(
         **COMMON,  # type: ignore[arg-type]
         values=FAPS,
@@ -149,9 +146,8 @@ SAMPLES: tuple[Message, ...] = (
     EndOfFaps(**COMMON),  # type: ignore[arg-type]
     Joined(session="demo", publisher="p1"),
     Event(session="demo", sequence=4, name="recorded", detail="out/demo.mp4"),
-    Progress(**COMMON, level_db=-20.5, zero_crossing_rate=0.25, pitch_hz=220.0),  # type: ignore[arg-type]
-    ResumeFace(**COMMON, newest_frame=FRAME),  # type: ignore[arg-type]
-    AcknowledgePhones(**COMMON, newest_frame=FRAME),  # type: ignore[arg-type]
+    Progress(**COMMON, level_db=-20.5, zero_crossing_rate=0.25, pitch_hz=220.0, newest_frame=FRAME),  # type: ignore[arg-type]
+    Acknowledge(**COMMON, newest_frame=FRAME),  # type: ignore[arg-type]
     Heartbeat(
         service="recognizer",
         instance="recognizer-1",
@@ -176,5 +172,4 @@ SAMPLES: tuple[Message, ...] = (
     ),
     START,
     SessionStarted(session="demo", request="start-demo-1", media_time=16000, start=START),
-    StopSession(session="demo", epoch=1),
 )

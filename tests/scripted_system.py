@@ -80,7 +80,7 @@ class ScriptedSynthesizer(Service):
         self.input = self.bus.bind_router(local, "synthesizer.phones")
         self.faps = self.bus.bind_publisher(local, "synthesizer.faps")
         self.endpoints = {"phone_input": self.input.endpoint, "faps": self.faps.endpoint}
-        self.facts = SessionFacts(lips="dynamic-visemes")
+        self.facts = SessionFacts(lip_model="dynamic-visemes")
         self.changes: list[tuple[str, FaceSettings]] = []  # by session
         self.register(self.input, {})
         self.register(self.faps, {})

@@ -36,7 +36,7 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ def live_events(
         delay_s: [
             event
             for event in events
-            if not isinstance(event, LipFrame)
+            if not isinstance(event, LipPositions)
             or math.isclose(event.delay_s, lip_delay_s, abs_tol=1e-4)
         ]
         for delay_s, lip_delay_s in lip_delays_s.items()

@@ -38,7 +38,6 @@ from kouxing.shared.wire.control import (
     Heartbeat,
     HeartbeatReply,
     SessionStarted,
-    StopSession,
 )
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
@@ -154,9 +153,11 @@ class ControlService(Service):
         self._send_start(record, record.waiting_for)
         return None
 
-    def _close_session(self, message: CloseSession, _sender: Peer) -> Message:
-        record = self._sessions.find_owned(message.session, message.token)
+    def _close_session(self, message: CloseSession, _sender: Peer) -> Message | None:
+        record = self._sessions.find_owned(message.session, message.token or "")
         self._end_session(record, "closed by its client")
+        if message.request is None:
+            return None
         return Done(session=message.session, request=message.request)
 
     def _flush_session(self, message: FlushSession, _sender: Peer) -> Message:
@@ -259,7 +260,7 @@ class ControlService(Service):
             if record is not None and heartbeat.instance in record.lost:
                 continue  # the session has not moved yet
             if record is None or not self._sessions.takes_part(record, heartbeat.instance):
-                self._commands.send(StopSession(session=name), to=sender)
+                self._commands.send(CloseSession(session=name), to=sender)
             elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:
                 self._end_session(record, f"no audio for {self._idle_limit_s:g} s")
 
@@ -389,8 +390,8 @@ class ControlService(Service):
             self._send_start(record, record.waiting_for - record.deferred)
 
     def _end_session(self, record: SessionRecord, reason: str) -> None:
-        stop = StopSession(session=record.name, epoch=record.epoch)
-        self._send_to_participants(record, stop)
+        close = CloseSession(session=record.name, epoch=record.epoch)
+        self._send_to_participants(record, close)
         self._sessions.remove(record, time.monotonic())
         self._publish(EventName.SESSION_CLOSED, record.name, detail=reason)
         LOG.info("session closed: %s", reason, extra={"session": record.name})

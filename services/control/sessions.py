@@ -129,7 +129,7 @@ class Sessions:
             workers=workers,
             endpoints=self._registry.endpoints(workers),
             facts=facts,
-            face=CurrentFace(FaceSettings(lips=facts.lips).updated(opening.face), now_s),
+            face=CurrentFace(FaceSettings(lip_model=facts.lip_model).updated(opening.face), now_s),
             waiting_for={*workers.values()} | self._registry.observers(),
         )
         self._add(record, now_s)

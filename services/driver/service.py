@@ -1,6 +1,6 @@
 """The driver as a service: FAP frames in, a face in a window or a video out.
 
-Reacts to: start-session, stop-session (control), fap-frame, end-of-faps (synthesizer), sound
+Reacts to: start-session, close-session (control), fap-frame, end-of-faps (synthesizer), sound
 (recognizer).
 Emits: recorded, error (control).
 """

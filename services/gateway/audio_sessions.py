@@ -55,7 +55,7 @@ class AudioSession:
 
     async def set_lips(self, lips: str) -> None:
         """Let another lip model move the mouth."""
-        await self._session.set_face(lips=lips)
+        await self._session.set_face(lip_model=lips)
 
     def errors(self) -> list[Refused]:
         """Return the recognizer's errors since the last call.

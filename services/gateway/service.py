@@ -1,6 +1,6 @@
 """The gateway service: it shows sessions in browsers and streams microphones into sessions.
 
-Receives start-session, stop-session, flush-session, set-face and status-report from control,
+Receives start-session, close-session, flush-session, set-face and status-report from control,
 fap-frame and end-of-faps from synthesizers, sound, phone and speech from recognizers, and the
 browsers' messages. Sends status-request and set-face to control, messages to browsers, and
 audio-chunk to recognizers, as any client does.
@@ -203,7 +203,7 @@ class GatewayService(Service):
             session = self._sessions[start.session] = self._make_session(start)
         session.start = start
         session.follower.start(start.epoch, start.endpoints)
-        self._viewers.add_session(start.session, start.epoch, start.face.lips or "")
+        self._viewers.add_session(start.session, start.epoch, start.face.lip_model or "")
         return False
 
     def stop_session(self, session: str) -> None:
@@ -226,9 +226,9 @@ class GatewayService(Service):
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
         """Notify a session's viewers that its lip model has changed."""
         session = self._sessions.get(message.session)
-        if session is not None and message.face.lips is not None:
+        if session is not None and message.face.lip_model is not None:
             session.start = replace(session.start, face=session.start.face.updated(message.face))
-            self._viewers.set_lips(message.session, message.face.lips)
+            self._viewers.set_lips(message.session, message.face.lip_model)
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Name the subscribed sessions, so that control can report which have ended."""
@@ -294,7 +294,7 @@ class GatewayService(Service):
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
         start = session.start
-        self._viewers.add_session(start.session, session.follower.epoch, start.face.lips or "")
+        self._viewers.add_session(start.session, session.follower.epoch, start.face.lip_model or "")
 
     def _on_frame(self, frame: FapFrame) -> None:
         self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values)

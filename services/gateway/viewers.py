@@ -186,7 +186,7 @@ class Viewers:
             command = wire.parse_object(message)
             session = command.get("follow")
             settings = wire.parse_face_settings(command)
-            lips = settings.lips if settings is not None else None
+            lips = settings.lip_model if settings is not None else None
             if command.get("play") == "sample":
                 self._sample = viewer.chosen = self._play_sample(lips or "")
             elif lips:

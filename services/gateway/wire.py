@@ -139,7 +139,7 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     expressions, hold_s = fields.get("express"), fields.get("hold_s", DEFAULT_HOLD_S)
     settings: dict[str, Any] = {}
     if lips := _parse_lips(fields):
-        settings["lips"] = lips
+        settings["lip_model"] = lips
     if expressions is not None:
         if not isinstance(expressions, dict):
             raise UserError("express must be an object that maps names to strengths")

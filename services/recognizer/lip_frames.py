@@ -12,7 +12,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.phones.events import LipPositions
 
 # Face frames are due every 20 ms of audio. The network's positions end this long before them: a
 # window of 25 ms in steps of 20 ms cannot end closer.
@@ -24,7 +24,7 @@ class LipFrameStream(Protocol):
 
     def process_position(
         self, known_s: float, frames: NDArray[np.float32], values: NDArray[np.float32]
-    ) -> list[LipFrame]:
+    ) -> list[LipPositions]:
         """Return the lip frames that follow from what the network computes at a position.
 
         Parameters

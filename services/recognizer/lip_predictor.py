@@ -51,7 +51,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.mouth_profile import MouthProfile, parse_mouth_profile
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.phones.events import LipPositions
 
 LIPS_PATH = Path(__file__).parent / "models" / "lips.npz"
 FORMAT = "lips 2"
@@ -182,11 +182,13 @@ class LipPredictorStream:
         self._state = np.zeros(len(self._model.state_weights), np.float32)
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
-    def process_position(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
+    def process_position(
+        self, known_s: float, frames: Floats, values: Floats
+    ) -> list[LipPositions]:
         """Return the lip frames that follow from a position; see ``LipFrameStream``."""
         outputs = self.step(features_at(frames, values))
         return [
-            LipFrame(
+            LipPositions(
                 time_s=known_s - delay_s,
                 delay_s=delay_s,
                 faps=mouth_faps(row[: len(LIP_FAPS)]),

@@ -19,7 +19,7 @@ from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.phones.events import (
     EndOfSound,
-    LipFrame,
+    LipPositions,
     Phone,
     Progress,
     SoundEvent,
@@ -115,7 +115,7 @@ class Resumption:
                 return self._new_waveform(result)
             case Progress() if result.time_s <= self._time_s:
                 return None
-            case LipFrame() if result.time_s < self._time_s:
+            case LipPositions() if result.time_s < self._time_s:
                 return None
         return result
 

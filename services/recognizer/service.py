@@ -1,10 +1,9 @@
 """The recognizer as a service: audio chunks in, phones and speech events out.
 
-Handles: audio-chunk (clients), start-session, stop-session, flush-session, set-face (control),
-acknowledge-phones (synthesizer).
-Sends: phone, lips, speech, progress, resume-face (synthesizer, acknowledged), the same phones, lips
-and speech with the audio itself (subscribers), speech (control), acknowledge-audio, error
-(clients).
+Handles: audio-chunk (clients), start-session, close-session, flush-session, set-face (control),
+acknowledge (synthesizer).
+Sends: phone, lip-positions, speech, progress (synthesizer, acknowledged), the same without progress
+but with the audio itself (subscribers), speech (control), acknowledge, error (clients).
 """
 
 from __future__ import annotations
@@ -32,13 +31,13 @@ from kouxing.shared.metrics import give_back_memory
 from kouxing.shared.phones.events import SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
+from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
-from kouxing.shared.wire.speech import AcknowledgePhones, AudioState, Progress
+from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
 
 MAX_BACKLOG = 2000  # unacknowledged messages to a synthesizer before audio must wait
 MAX_OVERDUE_S = 5.0  # then the session stops sending phones, for the sake of other sessions
@@ -377,7 +376,7 @@ class RecognizerService(Service):
     def _acknowledge(self, session: RecognizerSession, now_s: float) -> None:
         """Report to the client which audio it need not resend."""
         session.acknowledge_due_s, session.acknowledged_s = None, now_s
-        acknowledgement = AcknowledgeAudio(
+        acknowledgement = Acknowledge(
             session=session.name, epoch=session.start.epoch, sequence=session.received_sequence
         )
         session.socket.send(acknowledgement, to=session.client)
@@ -398,7 +397,7 @@ class RecognizerService(Service):
         if endpoint not in self._synthesizers:
             socket = self.bus.connect_dealer(endpoint)
             self._synthesizers[endpoint] = socket
-            self.register(socket, {AcknowledgePhones: self._on_acknowledge, Error: self.on_error})
+            self.register(socket, {Acknowledge: self._on_acknowledge, Error: self.on_error})
         return self._synthesizers[endpoint]
 
     def _close_unused_synthesizers(self) -> None:
@@ -406,7 +405,7 @@ class RecognizerService(Service):
         for endpoint in self._synthesizers.keys() - used:
             self.unregister(self._synthesizers.pop(endpoint))
 
-    def _on_acknowledge(self, ack: AcknowledgePhones, _sender: Peer) -> None:
+    def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
         session = self._sessions.get(ack.session)
         if session is not None:
             session.on_acknowledge(ack, time.monotonic())

@@ -15,7 +15,7 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
-from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange, Waveform
+from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange, Waveform
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import StartSession
@@ -23,7 +23,7 @@ from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
-from kouxing.shared.wire.speech import AcknowledgePhones, AudioState, Progress
+from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
@@ -171,7 +171,7 @@ class RecognizerSession:
         message: Message
         if isinstance(result, Waveform):
             message = Sound(media_time=to_samples(result.time_s), pcm=pcm16_of(result.samples))
-        elif isinstance(result, Phone | LipFrame | SpeechChange):
+        elif isinstance(result, Phone | LipPositions | SpeechChange):
             message = message_of(result)
         else:
             return None
@@ -180,7 +180,7 @@ class RecognizerSession:
             message, session=self.name, epoch=self.start.epoch, sequence=self.sequence_out
         )
 
-    def on_acknowledge(self, ack: AcknowledgePhones, now_s: float) -> None:
+    def on_acknowledge(self, ack: Acknowledge, now_s: float) -> None:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
             is_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED

@@ -23,7 +23,7 @@ from kouxing.services.recognizer.speech_scorer import SpeechScorer, frame_at
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones.events import (
     EndOfSound,
-    LipFrame,
+    LipPositions,
     Phone,
     Progress,
     SpeechChange,
@@ -216,13 +216,13 @@ class _Segment:
         return [
             self._place(result)
             for result in self._decoder.decode(self.scorer.get_events())
-            if not (isinstance(result, LipFrame) and result.time_s < 0.0)
+            if not (isinstance(result, LipPositions) and result.time_s < 0.0)
         ]
 
     def _place(self, result: StreamOutput) -> StreamOutput:
         """Count the time from the session's first sample, in whole samples."""
         match result:
-            case LipFrame():
+            case LipPositions():
                 delay_s = to_seconds(duration_to_samples(result.delay_s))
                 return replace(result, time_s=self._media_s(result.time_s), delay_s=delay_s)
             case SpeechChange():

@@ -12,7 +12,7 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, ResumeFace, Speech
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
 KEPT = to_samples(3.0)  # media time of the messages that a new synthesizer gets, samples
 
@@ -37,11 +37,11 @@ class SynthesizerLink:
         self._kept.clear()
         self._sender = ReliableSender(socket, session, epoch)
         if (frame := self._newest_frame) is not None:
-            self._sender.send(ResumeFace(media_time=frame.media_time, newest_frame=frame), now_s)
+            self._sender.send(Progress(media_time=frame.media_time, newest_frame=frame), now_s)
         if self._speech is not None:
             self._sender.send(self._speech, now_s)
         for message in messages:
-            if not isinstance(message, ResumeFace):
+            if not _is_resumption(message):
                 self._sender.send(message, now_s)
 
     def disconnect(self) -> None:
@@ -54,13 +54,13 @@ class SynthesizerLink:
         if self._sender is not None:
             self._sender.send(message, now_s)
 
-    def acknowledge(self, ack: AcknowledgePhones, now_s: float) -> list[Message]:
+    def acknowledge(self, ack: Acknowledge, now_s: float) -> list[Message]:
         """Return the messages that the synthesizer has newly acknowledged."""
         if self._sender is None or ack.epoch != self._sender.epoch:
             return []
         self._newest_frame = ack.newest_frame or self._newest_frame
         messages = self._sender.acknowledge(ack.sequence, now_s)
-        self._kept.extend(message for message in messages if not isinstance(message, ResumeFace))
+        self._kept.extend(message for message in messages if not _is_resumption(message))
         while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
             oldest = self._kept.popleft()
             if isinstance(oldest, Speech):
@@ -75,3 +75,8 @@ class SynthesizerLink:
     def tick(self, now_s: float) -> int:
         """Resend messages that were not acknowledged in time; return their number."""
         return self._sender.tick(now_s) if self._sender is not None else 0
+
+
+def _is_resumption(message: Message) -> bool:
+    """Return whether a message only has the frame after which a new synthesizer continues."""
+    return isinstance(message, Progress) and message.newest_frame is not None

@@ -1,8 +1,8 @@
 """The synthesizer service: phones and lip frames in, FAP frames out.
 
-Reacts to: phone, lips, speech, progress, resume-face (recognizer), start-session, stop-session,
+Reacts to: phone, lip-positions, speech, progress (recognizer), start-session, close-session,
 flush-session, set-face (control).
-Emits: fap-frame, end-of-faps (followers), acknowledge-phones (recognizer).
+Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
 
 Processed audio clocks the frames. A system under load is late but makes the same frames, and so
 does audio faster than real time. Only while a live stream is stalled, the wall clock leads the face
@@ -36,23 +36,22 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones import events
-from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent
+from kouxing.shared.phones.events import EndOfSound, LipPositions, Phone, SoundEvent
 from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.reliable import ReliableReceiver
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
-from kouxing.shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
+from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import (
-    AcknowledgePhones,
+    Acknowledge,
     AudioState,
     NewestFrame,
     Progress,
-    ResumeFace,
 )
 
 RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
@@ -100,15 +99,13 @@ class _Session:
         """Media time of the newest frame, samples at 16 kHz."""
         return self.newest.media_time if self.newest is not None else 0
 
-    def _acknowledge(self) -> AcknowledgePhones:
-        if self.newest is None:
-            return AcknowledgePhones()
-        frame = NewestFrame(
-            sequence=self.newest.sequence,
-            media_time=self.newest.media_time,
-            values=self.newest.values,
+    def _acknowledge(self) -> Acknowledge:
+        if (frame := self.newest) is None:
+            return Acknowledge()
+        newest = NewestFrame(
+            sequence=frame.sequence, media_time=frame.media_time, values=frame.values
         )
-        return AcknowledgePhones(newest_frame=frame)
+        return Acknowledge(newest_frame=newest)
 
 
 class SynthesizerService(Service):
@@ -121,7 +118,7 @@ class SynthesizerService(Service):
         self._config = config
         self.frame_rate_hz = config.frame_rate_hz
         self.facts = SessionFacts(
-            frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lips=config.lips
+            frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lip_model=config.lips
         )
         self._sessions: dict[str, _Session] = {}
         self._turn = 0  # round robin of sessions with queued events
@@ -135,7 +132,7 @@ class SynthesizerService(Service):
             "faps": config.reachable(self._faps.endpoint),
         }
         load_lip_model(name=config.lips)  # no delay for the first session
-        self.register(self._input, dict.fromkeys(LINK_MESSAGES, self._on_input))
+        self.register(self._input, dict.fromkeys(SPEECH_MESSAGES, self._on_input))
         self.register(self._faps, {})
 
     def control_handlers(self) -> dict[type[Message], Handler]:
@@ -157,7 +154,7 @@ class SynthesizerService(Service):
     def _new_face(self, start: StartSession, settings: FaceSettings) -> FaceAnimator:
         face = FaceAnimator(
             load_lip_model(
-                start.facts.language or DEFAULT_LANGUAGE, settings.lips or self._config.lips
+                start.facts.language or DEFAULT_LANGUAGE, settings.lip_model or self._config.lips
             ),
             frame_rate_hz=self.frame_rate_hz,
             delay_s=self._config.delay_ms / 1e3,
@@ -180,7 +177,7 @@ class SynthesizerService(Service):
         flushed = self._sessions.get(session)
         if flushed is not None:
             flushed.queue = deque(
-                event for event in flushed.queue if not isinstance(event, Phone | LipFrame)
+                event for event in flushed.queue if not isinstance(event, Phone | LipPositions)
             )
             flushed.face.flush()
 
@@ -190,9 +187,9 @@ class SynthesizerService(Service):
         if session is None:
             return
         settings = self._known_settings(message.session, message.face)
-        if settings.lips is not None:
+        if settings.lip_model is not None:
             language = session.start.facts.language or DEFAULT_LANGUAGE
-            session.face.set_lip_model(load_lip_model(language, settings.lips))
+            session.face.set_lip_model(load_lip_model(language, settings.lip_model))
         if settings.expressiveness is not None:
             session.face.set_expressiveness(settings.expressiveness)
         if settings.expressions is not None:
@@ -201,7 +198,7 @@ class SynthesizerService(Service):
 
     def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
         """Return the settings without unknown names; report unknown names."""
-        unknown = {settings.lips} - {None, *lip_models()}
+        unknown = {settings.lip_model} - {None, *lip_models()}
         unknown |= (settings.expressions or {}).keys() - EXPRESSIONS
         unknown |= {*(settings.shapes or ())} - SHAPE_SETS.keys()
         if not unknown:
@@ -212,7 +209,7 @@ class SynthesizerService(Service):
         strengths = (settings.expressions or {}).items()
         return replace(
             settings,
-            lips=None if settings.lips in unknown else settings.lips,
+            lip_model=None if settings.lip_model in unknown else settings.lip_model,
             expressions=settings.expressions
             and {name: strength for name, strength in strengths if name not in unknown},
             shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
@@ -262,31 +259,36 @@ class SynthesizerService(Service):
 
     # --- from the recognizer ---------------------------------------------------------------------
 
-    def _on_input(self, message: LinkMessage, sender: Peer) -> None:
+    def _on_input(self, message: SpeechMessage, sender: Peer) -> None:
         session = self._admit(message, sender)
         if session is None:
             return
         now_s = time.monotonic()
-        has_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED
+        has_stalled, newest_frame = False, None
+        if isinstance(message, Progress):
+            has_stalled = message.state == AudioState.STALLED
+            newest_frame = message.newest_frame
         session.relax_at_s = now_s if has_stalled else now_s + RECOGNIZER_TIMEOUT_S
         if message.epoch != session.epoch_in:
-            self._enter_epoch(session, message)
-        if not has_stalled and not isinstance(message, ResumeFace):
+            self._enter_epoch(session, message, newest_frame)
+        if not has_stalled and newest_frame is None:
             self._queue_event(session, message)
 
-    def _enter_epoch(self, session: _Session, message: LinkMessage) -> None:
+    def _enter_epoch(
+        self, session: _Session, message: SpeechMessage, newest_frame: NewestFrame | None
+    ) -> None:
         """Continue a face with another recognizer, or after another synthesizer's frames."""
         if session.epoch_in:
             session.face.change_recognizer()
-        elif isinstance(message, ResumeFace):
-            frame = message.newest_frame
-            session.resume(frame.media_time, frame.sequence, np.frombuffer(frame.values, "<f4"))
+        elif newest_frame is not None:
+            faps = np.frombuffer(newest_frame.values, "<f4")
+            session.resume(newest_frame.media_time, newest_frame.sequence, faps)
         elif message.epoch > 1:  # both workers were lost, so the other face's frame is unknown
             time_s = to_seconds(message.media_time)
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
         session.epoch_in = message.epoch
 
-    def _admit(self, message: LinkMessage, sender: Peer) -> _Session | None:
+    def _admit(self, message: SpeechMessage, sender: Peer) -> _Session | None:
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:

@@ -34,7 +34,7 @@ class Phone:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LipFrame:
+class LipPositions:
     """The mouth as predicted from the audio."""
 
     time_s: float  # seconds from the session's first sample
@@ -77,4 +77,4 @@ class Waveform:
     samples: NDArray[np.float32]  # (n,) 16 kHz mono
 
 
-SoundEvent = Phone | LipFrame | SpeechChange | Progress | EndOfSound
+SoundEvent = Phone | LipPositions | SpeechChange | Progress | EndOfSound

@@ -17,12 +17,7 @@ class AudioChunk(Message):
     token: Name
     pcm: Annotated[bytes, Meta(max_length=MAX_AUDIO_BYTES)] = b""  # interleaved, little-endian
     last: bool = False  # no more audio follows: finish the session
-    acknowledge: bool = False  # the client reads acknowledge-audio and resends lost messages
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AcknowledgeAudio(Message):
-    """The recognizer has received every audio message up to ``sequence``."""
+    acknowledge: bool = False  # the client reads acknowledge messages and resends lost messages
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -136,11 +136,6 @@ class SessionStarted(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StopSession(Message):
-    """Control tells a service to forget a session."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Event(Message):
     """Something happened. A service sends it to control, which numbers and publishes it."""
 

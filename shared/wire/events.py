@@ -8,12 +8,11 @@ import numpy as np
 
 from kouxing.shared.clock import duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones import events
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import AudioState, Lips, Phone, Progress, ResumeFace, Speech
+from kouxing.shared.wire.speech import AudioState, LipPositions, Phone, Progress, Speech
 
-SpeechMessage: TypeAlias = Phone | Lips | Speech | Progress
-LinkMessage: TypeAlias = SpeechMessage | ResumeFace  # from recognizer to synthesizer
-LINK_MESSAGES: tuple[type[Message], ...] = get_args(LinkMessage)
+# From the recognizer to the synthesizer
+SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress
+SPEECH_MESSAGES: tuple[type[SpeechMessage], ...] = get_args(SpeechMessage)
 
 
 def message_of(event: events.SoundEvent) -> SpeechMessage:
@@ -28,8 +27,8 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 confidence=event.confidence,
                 final=event.final,
             )
-        case events.LipFrame():
-            return Lips(
+        case events.LipPositions():
+            return LipPositions(
                 media_time=to_samples(event.time_s),
                 values=event.faps.astype("<f4").tobytes(),
                 delay=duration_to_samples(event.delay_s),
@@ -67,8 +66,8 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
     match message:
         case Phone():
             return phone_of(message)
-        case Lips():
-            return events.LipFrame(
+        case LipPositions():
+            return events.LipPositions(
                 time_s=time_s,
                 delay_s=to_seconds(message.delay),
                 faps=np.frombuffer(message.values, "<f4"),

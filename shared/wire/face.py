@@ -26,7 +26,7 @@ ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 class FaceSettings:
     """How a session's face moves. A setting without a value does not change."""
 
-    lips: Name | None = None  # the lip model
+    lip_model: Name | None = None
     expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (
         None  # scales the mouth's motion; 1: as the lip model moves it
     )
@@ -39,7 +39,7 @@ class FaceSettings:
         shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])
         expressed = self if change.expressions is None else change
         return FaceSettings(
-            lips=change.lips or self.lips,
+            lip_model=change.lip_model or self.lip_model,
             expressiveness=change.expressiveness or self.expressiveness,
             expressions=expressed.expressions,
             hold_s=expressed.hold_s,

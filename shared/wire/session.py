@@ -58,7 +58,7 @@ class SessionFacts:
     language: Name | None = None  # of the phones
     frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # of the FAP frames
     delay_ms: Annotated[float, Meta(ge=0, le=1000)] | None = None  # from audio to its FAP frame
-    lips: Name | None = None  # lip model of a face without a chosen one
+    lip_model: Name | None = None  # of a face without a chosen one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,7 @@ class SessionOpened(Message):
     request: Name
     token: Name  # proves ownership when the client sends audio, flushes or closes
     audio: Endpoint  # ROUTER for the client's audio
-    phones: Endpoint  # XPUB: phone, lips, speech, sound
+    phones: Endpoint  # XPUB: phone, lip-positions, speech, sound
     faps: Endpoint  # XPUB: fap-frame, end-of-faps
     events: Endpoint  # XPUB: event, session-moved
     facts: SessionFacts
@@ -103,10 +103,13 @@ class SessionMoved(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloseSession(Message):
-    """The client is done; the services forget the session."""
+    """The session is over; the services forget it.
 
-    request: Name
-    token: Name
+    Sent by a client to control, and by control to the services.
+    """
+
+    request: Name | None = None  # None: no answer is needed
+    token: Name | None = None  # a client must give it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

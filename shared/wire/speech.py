@@ -53,7 +53,7 @@ class Phone(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Lips(Message):
+class LipPositions(Message):
     """The mouth at media_time, from a lip model that works on the audio itself."""
 
     published_at: ClassVar[str | None] = "phones"
@@ -62,16 +62,6 @@ class Lips(Message):
     delay: LipDelay  # how much audio after media_time the model has used; below 0: it predicts
     closure: Probability  # that the lips touch
     lip_to_teeth: Probability  # that the lower lip touches the teeth
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress(Message):
-    """The audio is processed up to media_time."""
-
-    state: Name = AudioState.RUNNING
-    level_db: Annotated[float, Meta(ge=-200, le=20)] = -200.0  # RMS of the newest 20 ms, dBFS
-    zero_crossing_rate: Probability = 0.0  # sign changes per sample in the newest 20 ms
-    pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,14 +74,22 @@ class NewestFrame:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ResumeFace(Message):
-    """A new synthesizer continues after the lost one's newest frame."""
+class Progress(Message):
+    """The audio is processed up to media_time."""
 
-    newest_frame: NewestFrame
+    state: Name = AudioState.RUNNING
+    level_db: Annotated[float, Meta(ge=-200, le=20)] = -200.0  # RMS of the newest 20 ms, dBFS
+    zero_crossing_rate: Probability = 0.0  # sign changes per sample in the newest 20 ms
+    pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
+    # Of the lost synthesizer: the new one continues after it. In the first message of an epoch
+    newest_frame: NewestFrame | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AcknowledgePhones(Message):
-    """The synthesizer has received every message of the session's epoch up to ``sequence``."""
+class Acknowledge(Message):
+    """Every message of the session up to ``sequence`` has arrived.
 
-    newest_frame: NewestFrame | None = None
+    Sent by the recognizer to the client, and by the synthesizer to the recognizer.
+    """
+
+    newest_frame: NewestFrame | None = None  # of a synthesizer; None: no frame yet

@@ -19,7 +19,7 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import AllowedKey, EventName, SessionInput
-from kouxing.shared.wire.events import LINK_MESSAGES
+from kouxing.shared.wire.events import SPEECH_MESSAGES
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
@@ -199,7 +199,7 @@ def test_documents_every_answer() -> None:
     assert asked - {"joined", "request"} == from_clients | {
         "heartbeat",
         "start-session",
-        *(cls.kind for cls in LINK_MESSAGES),
+        *(cls.kind for cls in SPEECH_MESSAGES),
     }
     assert answers < set(MESSAGES)
     assert errors - {"request"} < {*ErrorCode}
@@ -272,7 +272,7 @@ def test_documents_the_order_of_lip_values() -> None:
         f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(map(str, each))
         for each in ranges
     )
-    assert text in section("`lips`", MESSAGES_DOCUMENT)
+    assert text in section("`lip-positions`", MESSAGES_DOCUMENT)
 
 
 def test_documents_the_size_limits() -> None:

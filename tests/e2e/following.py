@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from kouxing.shared.audio_file import read_audio
 
 
-class Lips(Result, frozen=True, kw_only=True):
+class LipPositions(Result, frozen=True, kw_only=True):
     """The mouth from a lip model that works on the audio itself."""
 
-    kind: ClassVar[str] = "lips"
+    kind: ClassVar[str] = "lip-positions"
 
     values: Floats
     delay: int
@@ -27,14 +27,14 @@ class Lips(Result, frozen=True, kw_only=True):
     lip_to_teeth: float
 
 
-KINDS: tuple[type[Result], ...] = (FapFrame, Phone, Lips, Speech, Sound)
+KINDS: tuple[type[Result], ...] = (FapFrame, Phone, LipPositions, Speech, Sound)
 
 
 @dataclass
 class Collected:
     frames: list[FapFrame] = field(default_factory=list)
     phones: list[Phone] = field(default_factory=list)
-    lips: list[Lips] = field(default_factory=list)
+    lips: list[LipPositions] = field(default_factory=list)
     speech: list[Speech] = field(default_factory=list)
     sounds: list[Sound] = field(default_factory=list)
 
@@ -45,7 +45,7 @@ class Collected:
                     self.frames.append(result)
                 case Phone():
                     self.phones.append(result)
-                case Lips():
+                case LipPositions():
                     self.lips.append(result)
                 case Speech():
                     self.speech.append(result)

@@ -13,9 +13,10 @@ from kouxing_client import Client, Refused, Session, Sound
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import load_key
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
+from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.session import Error
+from kouxing.shared.wire.speech import Acknowledge
 from tests.e2e.following import stream
 from tests.system import System
 
@@ -98,7 +99,7 @@ def test_a_foreign_token_is_refused_and_a_replay_dropped(
     thief.send(replace(replay, acknowledge=True))
     assert thief.wait(60.0)
     (answer,) = thief.receive()
-    assert isinstance(answer.message, AcknowledgeAudio)
+    assert isinstance(answer.message, Acknowledge)
     assert answer.message.sequence == 1
     assert output.get(0.2) is None
 

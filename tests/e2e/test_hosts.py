@@ -143,7 +143,7 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: Sys
     assert roles["recognizer"] == roles["synthesizer"] == "worker"
 
     send(client, "close-session", "lit", request="3", token=opened["token"])
-    assert receive(lamp)[0] == "stop-session"
+    assert receive(lamp)[0] == "close-session"
     send(lamp, "heartbeat", "", **{**heartbeat, "state": "draining"})
     assert receive(lamp)[0] == "heartbeat-reply"
     stranger.close()

@@ -140,7 +140,7 @@ def test_learns_keeps_uses_and_forgets_a_mouth(system: System, browser: Browser)
     assert system.recognizer is not None
     (start,) = system.recognizer.starts.values()
     assert start.mouth_profile == profile
-    learnt = (start.session, FaceSettings(lips="learnt"))
+    learnt = (start.session, FaceSettings(lip_model="learnt"))
     wait_until(lambda: system.synthesizer.changes == [learnt], 60)
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")

@@ -23,9 +23,9 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone
+from kouxing.shared.phones.events import LipPositions, Phone
+from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
-from kouxing.shared.wire.speech import Lips
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.lips import LIPS, clip_of
 from tests.made_up_lips import JAW, LoudLips
@@ -67,7 +67,7 @@ def test_services_send_the_frames_of_the_chain(
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     assert sent.faps[:, MOUTH].any()
     assert lips_of(sent) == [
-        message_of(event) for event in chain.events if isinstance(event, LipFrame)
+        message_of(event) for event in chain.events if isinstance(event, LipPositions)
     ]
     assert sent.lips
     recognised = [event for event in chain.events if isinstance(event, Phone)]
@@ -106,10 +106,10 @@ def test_services_send_the_frames_of_the_chain_with_chosen_lips(
     assert sent.faps[:, MOUTH[JAW]].max() > 50.0
 
 
-def lips_of(sent: Collected) -> list[Lips]:
+def lips_of(sent: Collected) -> list[speech.LipPositions]:
     """Lip frames without session, epoch and sequence."""
     return [
-        Lips(
+        speech.LipPositions(
             media_time=lips.media_time,
             values=lips.values.tobytes(),
             delay=lips.delay,
@@ -167,7 +167,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
-    lips = [message_of(event) for event in chain.events if isinstance(event, LipFrame)]
+    lips = [message_of(event) for event in chain.events if isinstance(event, LipPositions)]
     assert lips_of(sent) == lips
     (delay,) = {each.delay for each in sent.lips}
     assert delay == round(delay_for(LoudLips().delays_s, delay_ms / 1e3) * 16000)
@@ -191,8 +191,8 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
         )
         with Client(running.control) as client:
             session = client.open_session(encoding="f32le", sample_rate_hz=16000, paced=False)
-            session.set_face(lips="muscles")  # is reported and ignored
-            session.set_face(lips="learnt")
+            session.set_face(lip_model="muscles")  # is reported and ignored
+            session.set_face(lip_model="learnt")
             sent = stream_into(session, samples, chunk=320)
             session.close()
     # the choice may overtake the sound's beginning or not; both are at rest there

@@ -386,7 +386,9 @@ def test_settings_apply_at_once_and_to_later_sessions(
     page.wait_for("window.kouxing.state.lips === 'learnt'")
     page.click("microphone")
     page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
-    sessions, lips = zip(*[(name, face.lips) for name, face in changes if face.lips], strict=True)
+    sessions, lips = zip(
+        *[(name, face.lip_model) for name, face in changes if face.lip_model], strict=True
+    )
     assert lips == ("ferguson", "ferguson", "learnt")
     assert sessions[0] != sessions[1] == sessions[2]
     assert amounts(changes) == [(sessions[0], 0.7), (sessions[1], 0.7)]

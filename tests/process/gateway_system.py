@@ -29,7 +29,6 @@ from kouxing.shared.wire.control import (
     HeartbeatReply,
     SessionStarted,
     StartSession,
-    StopSession,
 )
 from kouxing.shared.wire.face import FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
@@ -92,7 +91,7 @@ class ScriptedSystem(FakeControl):
             paced=True,
             facts=SessionFacts(language="mandarin"),
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
-            face=FaceSettings(lips="dynamic-visemes"),
+            face=FaceSettings(lip_model="dynamic-visemes"),
         )
         self.commands.send(message, to=self.gateway)
 
@@ -137,7 +136,7 @@ class ScriptedSystem(FakeControl):
                     self.answer_open(*self._openings[message.session], message.session)
             case CloseSession():
                 self.closed.append(message.session)
-                self.commands.send(StopSession(session=message.session), to=self.gateway)
+                self.commands.send(CloseSession(session=message.session), to=self.gateway)
             case FlushSession():
                 self.flushed.append(message.session)
             case SetFace():
@@ -146,8 +145,8 @@ class ScriptedSystem(FakeControl):
 
     def _on_set_face(self, message: SetFace) -> None:
         face = message.face
-        if face.lips is not None:
-            self.chosen.append((message.session, face.lips))
+        if face.lip_model is not None:
+            self.chosen.append((message.session, face.lip_model))
         if face.expressiveness is not None:
             self.amounts.append((message.session, face.expressiveness))
         if face.expressions is not None:
@@ -155,7 +154,7 @@ class ScriptedSystem(FakeControl):
         self.commands.send(message, to=self.gateway)
 
     def stop_session(self, session: str) -> None:
-        message = StopSession(session=session)
+        message = CloseSession(session=session)
         self.do(lambda: self.commands.send(message, to=self.gateway))
 
 

@@ -162,7 +162,7 @@ def test_asyncio_does_the_same(control: FakeControl) -> None:
             session = await client.open_session("s")
             frames = await session.frames()
             await session.push(CHUNK)
-            await session.set_face(lips="learnt")
+            await session.set_face(lip_model="learnt")
             await asyncio.to_thread(control.publish, control.faps, frame(1), frame(2), END)
             values = [result.values[0] async for result in frames]
             with pytest.raises(KouxingError, match="whole samples"):

@@ -10,7 +10,7 @@ from kouxing.services.control import service as control_service
 from kouxing.services.control import takeover
 from kouxing.shared.bus import Bus
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession, StopSession
+from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
@@ -66,7 +66,7 @@ def test_restores_a_session_unchanged(stage: Stage, client: Socket) -> None:
     recognizer, synthesizer = stage.services
     answers(stage, synthesizer)  # its heartbeat is answered
     answers(stage, recognizer)
-    face = FaceSettings(lips="learnt", expressiveness=1.5)
+    face = FaceSettings(lip_model="learnt", expressiveness=1.5)
     recognizer.send(report(face=face))
     for service in stage.services:
         (start,) = answers(stage, service)
@@ -135,11 +135,11 @@ def test_stops_unknown_sessions_only_after_the_deadline(stage: Stage) -> None:
     serving = beat("recognizer", sessions={"mine": SessionInput()})
     recognizer.send(serving)
     (seen,) = answers(stage, recognizer)
-    assert not isinstance(seen, StopSession)
+    assert not isinstance(seen, CloseSession)
     stage.control._takeover.end_s = 0.0
     stage.control.step(0.02)
     recognizer.send(serving)
-    assert StopSession(session="mine") in answers(stage, recognizer, 2)
+    assert CloseSession(session="mine") in answers(stage, recognizer, 2)
 
 
 def test_repeats_session_moved_to_the_client(

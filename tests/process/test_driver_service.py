@@ -21,10 +21,9 @@ from kouxing.shared.wire.control import (
     SessionInput,
     SessionStarted,
     StartSession,
-    StopSession,
 )
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
-from kouxing.shared.wire.session import SessionFacts
+from kouxing.shared.wire.session import CloseSession, SessionFacts
 
 pytestmark = pytest.mark.process
 
@@ -98,7 +97,7 @@ class Stage:
         assert self.started[-1] == session
 
     def stop(self, session: str) -> None:
-        self.commands.send(StopSession(session=session), to=self.address)
+        self.commands.send(CloseSession(session=session), to=self.address)
 
     def publish(self, session: str, number: int, value: float, epoch: int = 1) -> None:
         self.faps.send(

@@ -23,9 +23,8 @@ from kouxing.shared.wire.control import (
     SessionInput,
     SessionStarted,
     StartSession,
-    StopSession,
 )
-from kouxing.shared.wire.session import Done, SessionFacts
+from kouxing.shared.wire.session import CloseSession, Done, SessionFacts
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.raw_bytes import answer_handshake
 
@@ -173,7 +172,7 @@ class Control:
                 case Heartbeat() as beat:
                     self.beats.append(beat)
                     for session in self.stops:
-                        self.socket.send(StopSession(session=session), to=self.peer)
+                        self.socket.send(CloseSession(session=session), to=self.peer)
                     self.socket.send(
                         HeartbeatReply(
                             sent_ns=beat.sent_ns,

@@ -11,7 +11,7 @@ from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import (
     EndOfSound,
-    LipFrame,
+    LipPositions,
     Phone,
     Progress,
     SoundEvent,
@@ -82,7 +82,7 @@ def test_converts_an_event_to_a_message_and_back(event: SoundEvent) -> None:
 
 @given(
     st.builds(
-        LipFrame,
+        LipPositions,
         time_s=TIMES,
         delay_s=st.integers(-16_000, 16_000).map(to_seconds),
         faps=st.lists(
@@ -92,10 +92,10 @@ def test_converts_an_event_to_a_message_and_back(event: SoundEvent) -> None:
         lip_to_teeth=st.floats(0, 1),
     )
 )
-def test_converts_a_lip_frame_to_a_message_and_back(frame: LipFrame) -> None:
+def test_converts_a_lip_frame_to_a_message_and_back(frame: LipPositions) -> None:
     message = message_of(frame)
     assert decode(encode(message)) == message
     read = event_of(message)
-    assert isinstance(read, LipFrame)
+    assert isinstance(read, LipPositions)
     np.testing.assert_array_equal(read.faps, frame.faps)
     assert replace(read, faps=frame.faps) == frame

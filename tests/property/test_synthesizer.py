@@ -23,7 +23,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from tests import lips
 from tests.lips import INVENTORY, LIPS, advance, make_face
 
@@ -281,7 +281,7 @@ def sound(seed: int) -> list[SoundEvent]:
             events.append(phone)
         if is_speaking and rng.random() < 0.9:
             opening = min(max(opening + rng.uniform(-60.0, 60.0), 0.0), 300.0)
-            frame = LipFrame(
+            frame = LipPositions(
                 time_s=now_s - 0.015,
                 delay_s=0.0,
                 faps=np.full(len(MOUTH_FAPS), opening, np.float32),

@@ -162,7 +162,7 @@ def test_reconnects_and_resends_if_acknowledgements_stop() -> None:
     scene = Scene()
     scene.push(3)
     dead = scene.audio()
-    dead.answer("acknowledge-audio", sequence=1)
+    dead.answer("acknowledge", sequence=1)
     scene.pass_time(ANSWER_S[0] + 0.1)
     assert not dead.is_open
     assert sequences(scene.audio()) == [2, 3]
@@ -174,7 +174,7 @@ def test_audio_waits_for_subscriptions_so_that_no_frame_is_missed() -> None:
     scene.subscribe()
     scene.confirm()
     scene.push(2)
-    scene.audio().answer("acknowledge-audio", sequence=1)
+    scene.audio().answer("acknowledge", sequence=1)
     scene.pass_time(ANSWER_S[0] + 0.1)
     assert sequences(scene.audio()) == []
     scene.pass_time(REJOIN_S)

@@ -77,7 +77,7 @@ def test_parses_face_settings() -> None:
     settings = wire.parse_face_settings({"express": {"joy": 1}, "hold_s": 7, "expressiveness": 2})
     assert settings == FaceSettings(expressions={"joy": 1}, hold_s=7, expressiveness=2)
     assert wire.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
-    assert wire.parse_face_settings({"lips": "learnt"}) == FaceSettings(lips="learnt")
+    assert wire.parse_face_settings({"lips": "learnt"}) == FaceSettings(lip_model="learnt")
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.learnt.track import LipTrack
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange
 from tests import lips
 from tests.lips import LIPS
 
@@ -34,11 +34,11 @@ NEUTRAL = np.zeros(len(MOUTH_FAPS))
 OPEN = {3: 300.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -200.0)
 
 
-def lip_frame(time_s: float, opening: float = 1.0, closure: float = 0.0) -> LipFrame:
+def lip_frame(time_s: float, opening: float = 1.0, closure: float = 0.0) -> LipPositions:
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
     for fap, value in OPEN.items():
         faps[MOUTH_FAPS.index(fap)] = opening * value
-    return LipFrame(
+    return LipPositions(
         time_s=time_s, delay_s=LIPS_DELAY_S, faps=faps, closure=closure, lip_to_teeth=0.0
     )
 
@@ -58,7 +58,7 @@ def run(
     face: FaceAnimator,
     begin_s: float,
     end_s: float,
-    make: Callable[[float], LipFrame | None],
+    make: Callable[[float], LipPositions | None],
     phones: Sequence[tuple[float, Phone]] = (),
 ) -> list[Frame]:
     """Process sound with lip frames 5 ms before its slices, like a recognizer's output."""
@@ -87,13 +87,13 @@ def at(frames: Sequence[Frame], time_s: float) -> NDArray[np.float32]:
     return min(frames, key=lambda frame: abs(frame[0] - time_s))[1]
 
 
-def wave(time_s: float) -> LipFrame:
+def wave(time_s: float) -> LipPositions:
     return lip_frame(time_s, opening=0.5 - 0.5 * np.cos(2.0 * np.pi * 4.0 * time_s))
 
 
 def closing(
     closure: float, begin_s: float = 0.46, end_s: float = 0.54
-) -> Callable[[float], LipFrame]:
+) -> Callable[[float], LipPositions]:
     """Return open lips whose predicted closure is high for some time."""
     return lambda time_s: lip_frame(time_s, closure=closure if begin_s < time_s < end_s else 0.01)
 
@@ -161,7 +161,7 @@ def test_closures_do_not_flutter() -> None:
 def test_a_late_phone_still_closes_the_lips() -> None:
     face = speaking_face(delay_s=0.06)
 
-    def make(time_s: float) -> LipFrame:
+    def make(time_s: float) -> LipPositions:
         return lip_frame(time_s + LIPS_DELAY_S - 0.055, closure=0.1)
 
     # known 80 ms after the onset, when the frame at 0.54 s is made
@@ -256,7 +256,7 @@ def test_a_new_frame_does_not_change_the_past() -> None:
 def test_reduces_jitter_but_not_movement() -> None:
     face = speaking_face()
 
-    def make(time_s: float) -> LipFrame:
+    def make(time_s: float) -> LipPositions:
         jitter = 0.01 * (-1.0) ** round(time_s / 0.02)  # times 300 FAP units
         return lip_frame(time_s, opening=(0.5 if time_s < 1.0 else 1.0) + jitter)
 

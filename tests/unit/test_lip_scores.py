@@ -40,7 +40,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, b
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, SpeechChange
 from kouxing.training.visemes.recipe import save_parameters
 from tests.lips import INVENTORY, clip_of, utterance
 from tests.system import VOWELS_FILE
@@ -258,12 +258,12 @@ def test_one_recognizer_run_serves_all_delays() -> None:
     alone = sound_events(model, samples, lips, DEFAULT_DELAY_S)
     assert len(alone) == len(results[DEFAULT_DELAY_S]) > 200
     for event, other in zip(alone, results[DEFAULT_DELAY_S], strict=True):
-        if isinstance(event, LipFrame) and isinstance(other, LipFrame):
+        if isinstance(event, LipPositions) and isinstance(other, LipPositions):
             assert (event.time_s, event.delay_s) == (other.time_s, other.delay_s)
             np.testing.assert_allclose(event.faps, other.faps, rtol=1e-4, atol=1e-3)
         else:
             assert event == other
-    delays = [{e.delay_s for e in results[d] if isinstance(e, LipFrame)} for d in DELAYS_S]
+    delays = [{e.delay_s for e in results[d] if isinstance(e, LipPositions)} for d in DELAYS_S]
     assert all(len(each) == 1 for each in delays)
     assert delays[0] != delays[-1]
     assert live_events(model, samples, None, DELAYS_S)[0.0] == sound_events(model, samples)

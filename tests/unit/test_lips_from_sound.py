@@ -23,7 +23,7 @@ from kouxing.services.recognizer.lip_predictor import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.phones.events import LipPositions
 from tests.e2e.following import samples_of_file
 from tests.lip_predictors import DELAYS_S, HISTORY, NUM_FEATURES, UNITS, made_up_model
 from tests.live_streams import recognize_live
@@ -132,7 +132,7 @@ def test_uses_the_predictor_only_with_its_network(tmp_path: Path) -> None:
 
 def test_the_shipped_predictor_opens_rounds_and_closes_the_lips() -> None:
     outputs = recognize_live(load_model(), SAMPLES, lips=load_lip_predictor(), face_delay_s=0.2)
-    lips = [output for output in outputs if isinstance(output, LipFrame)]
+    lips = [output for output in outputs if isinstance(output, LipPositions)]
 
     def mean(fap: int, start_s: float, end_s: float) -> float:
         column = MOUTH_FAPS.index(fap)

@@ -20,7 +20,7 @@ from kouxing.services.recognizer.session import (
     RecognizerSession,
 )
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
-from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.session import ErrorCode
@@ -171,7 +171,7 @@ def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
     session.stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
     RECOGNIZER.decode_streams([session.stream])
     results = session.new_results(RECOGNIZER)
-    frames = [result for result in results if isinstance(result, LipFrame)]
+    frames = [result for result in results if isinstance(result, LipPositions)]
     assert len(frames) > 5
     assert {frame.faps[0] for frame in frames} == {77.0}
     messages = [message for result in results if (message := session.published_message(result))]

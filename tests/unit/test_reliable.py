@@ -11,7 +11,7 @@ import pytest
 from kouxing.shared.keys import Peer
 from kouxing.shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, Progress
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress
 
 pytestmark = pytest.mark.unit
 PEER = Peer(b"peer")
@@ -36,7 +36,7 @@ class Link:
         self.dealer, self.router = FakeSocket(), FakeSocket()
         self.sender = self.make_sender(epoch=1)
         self.receiver = ReliableReceiver(
-            cast(Any, self.router), "s", lambda: AcknowledgePhones(newest_frame=FRAME)
+            cast(Any, self.router), "s", lambda: Acknowledge(newest_frame=FRAME)
         )
         self.received: list[int] = []
 
@@ -92,5 +92,5 @@ def test_every_acknowledgement_carries_the_newest_frame() -> None:
     link.send(1)
     link.deliver()
     link.receiver.acknowledge()
-    expected = AcknowledgePhones(session="s", epoch=1, sequence=1)
+    expected = Acknowledge(session="s", epoch=1, sequence=1)
     assert [*link.router.sent] == [replace(expected, newest_frame=FRAME)]

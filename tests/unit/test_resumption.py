@@ -16,7 +16,7 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.clock import to_samples
 from kouxing.shared.phones.events import (
     EndOfSound,
-    LipFrame,
+    LipPositions,
     Phone,
     Progress,
     SoundEvent,
@@ -128,7 +128,7 @@ def first_chunks(outputs: Sequence[Sequence[StreamOutput]], from_s: float) -> li
 
 def test_suppresses_known_results() -> None:
     resumption = Resumption(1.0, "sil")
-    lips = LipFrame(
+    lips = LipPositions(
         time_s=0.98, delay_s=0.0, faps=np.zeros(28, np.float32), closure=0.0, lip_to_teeth=0.0
     )
     known: list[StreamOutput] = [

@@ -25,7 +25,7 @@ PROVIDES = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "f
 NEEDS = {"recognizer": ["phone_input"], "synthesizer": []}
 FACTS = {
     "recognizer": SessionFacts(language="mandarin"),
-    "synthesizer": SessionFacts(frame_rate_hz=50.0, delay_ms=100.0, lips="dynamic-visemes"),
+    "synthesizer": SessionFacts(frame_rate_hz=50.0, delay_ms=100.0, lip_model="dynamic-visemes"),
 }
 
 
@@ -199,19 +199,21 @@ def test_audio_that_is_not_paced_has_its_own_socket(system: System) -> None:
 
 def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
     record = system.open(face=FaceSettings(shapes=["vrm", "vrm"]))
-    assert record.start_message(0.0).face.lips == "dynamic-visemes", "the synthesizer's default"
+    assert record.start_message(0.0).face.lip_model == "dynamic-visemes", (
+        "the synthesizer's default"
+    )
     record.face.change(FaceSettings(expressions={"joy": 0.5}, hold_s=10.0), 0.0)
-    record.face.change(FaceSettings(expressiveness=1.8, lips="learnt", shapes=["arkit"]), 2.0)
+    record.face.change(FaceSettings(expressiveness=1.8, lip_model="learnt", shapes=["arkit"]), 2.0)
     face = record.start_message(4.0).face
-    assert (face.lips, face.expressiveness, face.shapes) == ("learnt", 1.8, ["vrm", "arkit"])
+    assert (face.lip_model, face.expressiveness, face.shapes) == ("learnt", 1.8, ["vrm", "arkit"])
     assert (face.expressions, face.hold_s) == ({"joy": 0.5}, 6.0)
     assert record.start_message(11.0).face.expressions is None
     system.lose("synthesizer-1")
-    facts = SessionFacts(delay_ms=40.0, lips="ferguson")
+    facts = SessionFacts(delay_ms=40.0, lip_model="ferguson")
     system.add(replace(worker("synthesizer", "synthesizer-2"), facts=facts))
     assert system.sessions.move(record, 12.0)
     start = record.start_message(12.0)
-    assert (start.facts.delay_ms, start.face.lips) == (40.0, "learnt")
+    assert (start.facts.delay_ms, start.face.lip_model) == (40.0, "learnt")
 
 
 # --- moves -----------------------------------------------------------------------------------

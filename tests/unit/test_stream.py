@@ -17,7 +17,7 @@ from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.stream import MAX_JITTER, SILENT_DB
 from kouxing.shared.phones.events import (
     EndOfSound,
-    LipFrame,
+    LipPositions,
     Phone,
     Progress,
     SoundEvent,
@@ -46,8 +46,8 @@ def phones_of(outputs: Sequence[StreamOutput]) -> list[Phone]:
     return [output for output in outputs if isinstance(output, Phone)]
 
 
-def lips_of(outputs: Sequence[StreamOutput]) -> list[LipFrame]:
-    return [output for output in outputs if isinstance(output, LipFrame)]
+def lips_of(outputs: Sequence[StreamOutput]) -> list[LipPositions]:
+    return [output for output in outputs if isinstance(output, LipPositions)]
 
 
 def messages_of(outputs: Sequence[StreamOutput]) -> list[Message]:
@@ -183,7 +183,7 @@ def test_lip_frames_are_known_5_ms_before_the_face_frame(rate_hz: int, before_s:
     stream = LiveStream(MODEL, sample_rate_hz=rate_hz, lips=LoudLips(), face_delay_s=0.1)
     newest_s, is_speaking, lags_s = 0.0, False, []
     for event in stream.feed(samples):
-        if isinstance(event, LipFrame):
+        if isinstance(event, LipPositions):
             newest_s = event.time_s + event.delay_s
         elif isinstance(event, SpeechChange):
             is_speaking = event.active

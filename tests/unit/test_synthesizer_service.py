@@ -64,7 +64,7 @@ def test_ignores_and_reports_unknown_face_settings(
     events: list[tuple[str, ...]] = []
     monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
     face = FaceSettings(
-        lips="muscles", expressions={"glee": 1.0, "joy": 0.5}, shapes=["clay", "vrm"]
+        lip_model="muscles", expressions={"glee": 1.0, "joy": 0.5}, shapes=["clay", "vrm"]
     )
     service._on_set_face(SetFace(session="gap", face=face), Peer())
     text = "bad-face: ignored unknown face settings: clay, glee, muscles"

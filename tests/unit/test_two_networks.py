@@ -12,7 +12,7 @@ from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.shared.phones.events import LipFrame, Phone
+from kouxing.shared.phones.events import LipPositions, Phone
 from tests.live_streams import recognize_live, recognize_together
 from tests.unit.test_block_model import FRAMES, HELLO, blocks
 
@@ -56,7 +56,7 @@ def events_of(model: AcousticModel, chunk: int = 320) -> list[StreamOutput]:
 def test_lip_frames_come_from_the_causal_network() -> None:
     assert lip_predictor_for(blocks()) is None
     frames, expected = (
-        [event for event in events_of(model) if isinstance(event, LipFrame)]
+        [event for event in events_of(model) if isinstance(event, LipPositions)]
         for model in (two_networks(), cast(NeuralModel, load_model()))
     )
     assert len(frames) > 40

@@ -27,7 +27,7 @@ LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before
 class FaceSettings(TypedDict, total=False):
     """How a face moves; a setting that is absent stays as it is."""
 
-    lips: str
+    lip_model: str
     """lip model that moves the mouth"""
     expressions: Mapping[str, float]
     """strengths from 0 to 1 by name, in place of those before; ``{}`` fades them now"""

@@ -182,7 +182,7 @@ class SessionFacts:
     """FAP frames per second of media time"""
     delay_ms: float | None = None
     """from audio to its FAP frame"""
-    lips: str | None = None
+    lip_model: str | None = None
     """lip model of a face whose settings name none"""
 
 

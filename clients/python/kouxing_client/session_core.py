@@ -287,7 +287,7 @@ class SessionCore:
         if (message := decode(parts)) is None or self.stream is None:
             return
         kind, fields = message
-        if kind == "acknowledge-audio":
+        if kind == "acknowledge":
             self.stream.acknowledge(fields["sequence"], self.sockets.now_s)
         elif kind == "error":
             error = refused(fields)

@@ -3,9 +3,9 @@
     lip frames -> stabilize -> closures -> lip track -> transition
     phones -> dynamic visemes -> tongue
 
-The recognizer predicts lip frames from the audio (``LipFrame``), 50 per second during speech. Small
-changes are reduced, because they are jitter. Recognized phones take part in the decision about
-closures (`closures`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which
+The recognizer predicts ``LipPositions`` from the audio, 50 per second during speech. Small changes
+are reduced, because they are jitter. Recognized phones take part in the decision about closures
+(`closures`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which
 cameras do not track, come from the dynamic visemes. The lip frames already contain the effect of
 loudness, so the amplitude modifier is off.
 
@@ -44,7 +44,7 @@ from kouxing.services.synthesizer.lips.trajectory import (
     still,
 )
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, SpeechChange
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ class LearntStream:
         self._bilabials, self._labiodentals = (
             ClosingPhones(visemes.inventory, viseme, rule) for viseme in ("b", "f")
         )
-        self._queue: deque[LipFrame] = deque()  # not due yet
+        self._queue: deque[LipPositions] = deque()  # not due yet
         self._newest_s = -np.inf  # time of the newest lip frame
         self._stable = self._neutral  # the last lip frame, stabilized
         self._shares = (0.0, 0.0)  # closure shares of the last two lip frames
@@ -122,7 +122,7 @@ class LearntStream:
         """Add a lip frame, a phone, a revision, or a change of voice activity."""
         self._visemes.add_event(event)
         match event:
-            case LipFrame():
+            case LipPositions():
                 self._add_lip_frame(event)
             case Phone():
                 for phones in (self._bilabials, self._labiodentals):
@@ -131,7 +131,7 @@ class LearntStream:
                 self._flushed_until_s = -np.inf
                 self._is_speaking = event.active
 
-    def _add_lip_frame(self, frame: LipFrame) -> None:
+    def _add_lip_frame(self, frame: LipPositions) -> None:
         numbers = (frame.time_s, frame.delay_s, frame.closure)
         is_valid = np.isfinite(numbers).all() and (np.abs(frame.faps) < _MAX_FAP).all()
         is_new = frame.time_s > self._newest_s
@@ -203,7 +203,7 @@ class LearntStream:
             self._late_s = max(0.0, frame.delay_s - self._delay_s)
         self._track.hold_s = HOLD_S + self._late_s if self._is_speaking else 0.0
 
-    def _process(self, frame: LipFrame) -> Array:
+    def _process(self, frame: LipPositions) -> Array:
         """Return the FAPs of the next lip frame, stabilized and with closures."""
         faps = frame.faps.astype(np.float64)
         if frame.time_s - self._track.end_s <= MAX_GAP_S:
