@@ -95,6 +95,11 @@ class LipClip:
         """The first part of the clip's name."""
         return self.name.partition("_")[0]
 
+    @property
+    def minutes(self) -> float:
+        """Duration of the audio."""
+        return len(self.samples) / SAMPLE_RATE_HZ / 60
+
     def filmed_speech(self) -> FilmedSpeech:
         """Return the clip as input for learning a mouth profile."""
         return FilmedSpeech(samples=self.samples, frame_s=self.time_s, lips=lip_tracks(self.faps))

@@ -63,6 +63,11 @@ class Example:
             return "synthetic"
         return "word" if len(self.phones) <= MAX_WORD_PHONES else "sentence"
 
+    @property
+    def minutes(self) -> float:
+        """Duration without outer silence."""
+        return len(self.log_mel) / FRAMES_PER_MINUTE
+
 
 def load_examples(
     corpora: Sequence[Path],

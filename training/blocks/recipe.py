@@ -148,9 +148,8 @@ def train_blocks(
         f"{num_readout_steps} steps of the readout, {num_steps} of {BATCH_S} s of sound of all, "
         f"aligned by `{start.name}`, on {len(recordings)} recordings of {minutes:.0f} minutes "
         "drawn from those below",
-        examples=examples,
+        recordings=examples,
         errors=errors,
-        chosen=None,
     )
     errors.print_to(report)
     for path in stored:

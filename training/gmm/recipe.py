@@ -97,7 +97,7 @@ def train_gmm(
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
         f"{len(inventory)} x {_STATES_PER_PHONE} states",
         details=f"seed {seed}, synthetic weight {synthetic_weight:.2f}",
-        examples=examples,
+        recordings=examples,
         errors=errors,
         chosen=chosen,
     )

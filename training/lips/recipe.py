@@ -23,6 +23,7 @@ from rich.progress import track
 
 from kouxing.corpora.lip_clips import label_clip, read_clips
 from kouxing.corpora.speech_corpus import may_ship
+from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
@@ -35,16 +36,16 @@ from kouxing.services.recognizer.lip_predictor import (
     LipPredictor,
 )
 from kouxing.shared.errors import UserError
-from kouxing.training.lips.card import write_card
 from kouxing.training.lips.positions import Speech, components_of, features_of, speech_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
-from kouxing.training.lips.targets import Touch, targets_at, touches
+from kouxing.training.lips.targets import closed_below, targets_at
 from kouxing.training.lips.teacher import (
     draw_recordings,
     label_recordings,
     load_encoder,
     train_teacher,
 )
+from kouxing.training.model_card import write_card
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -158,21 +159,18 @@ def train_lips(
             f"no clip in {folder} may be used; give clips with a free license, or --any-license"
         )
     recordings = draw_recordings(speech, seed)
-    speech_of_clips = track(speech_of(model, clips), description="clips", total=len(clips))
-    positions = {
-        clip.name: stretches for clip, stretches in zip(clips, speech_of_clips, strict=True)
-    }
+    plain = track(speech_of(model, used), description="clips", total=len(used))
+    trained_on = [stretch for stretches in plain for stretch in stretches]
+    if not trained_on:
+        raise UserError(f"the clips in {folder} contain no speech; give clips with speech")
     augmented = speech_of(model, used, copy=1)
     copies = [
         stretch
         for stretches in track(augmented, description="augmented copies", total=len(used))
         for stretch in stretches
     ]
-    trained_on = [stretch for clip in used for stretch in positions[clip.name]]
-    if not trained_on:
-        raise UserError(f"the clips in {folder} contain no speech; give clips with speech")
     filmed = [*trained_on, *copies]
-    targets = _targets(model, filmed, touches(clips))
+    targets = _targets(model, filmed, closed_below(clips))
     basis = basis_of(trained_on, targets)
     examples = examples_of(filmed, targets, basis)
     labeled = []
@@ -190,12 +188,20 @@ def train_lips(
         )
     lips, losses = fit(examples, labeled, basis, seed)
     lips.save(output)
+    hours = POSITION_S * _num_positions(labeled) / 3600
     write_card(
-        output, lips, clips, positions, trained_on=used, labeled=labeled, losses=losses, seed=seed
+        output,
+        title="Lip model",
+        details=f"seed {seed}; the teacher labeled {hours:.1f} hours of speech; mean training loss "
+        f"of each epoch: {', '.join(f'{loss:.3f}' for loss in losses)}",
+        recordings=used,
+        notes=Path(__file__).with_name("about.md").read_text(encoding="utf-8").rstrip(),
     )
 
 
-def _targets(model: NeuralModel, speech: Sequence[Speech], touch: dict[str, Touch]) -> list[Floats]:
+def _targets(
+    model: NeuralModel, speech: Sequence[Speech], closed_at: dict[str, float]
+) -> list[Floats]:
     """Compute the targets of every stretch, FAP units, (positions, delays, 17)."""
     code = model.inventory.code
     clips = {one.clip.name: one.clip for one in speech if one.clip.language == code}
@@ -206,7 +212,7 @@ def _targets(model: NeuralModel, speech: Sequence[Speech], touch: dict[str, Touc
         targets_at(
             stretch.clip,
             phones.get(stretch.clip.name),
-            touch[stretch.clip.speaker],
+            closed_at[stretch.clip.speaker],
             stretch.known_s * stretch.speed,
             [delay_s * stretch.speed for delay_s in DELAYS_S],
         )

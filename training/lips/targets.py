@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,59 +28,48 @@ from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 
-_CLOSED_SHARE, _OPEN_SHARE = 0.1, 0.5  # of the range of a speaker's opening
+_CLOSED_SHARE = 0.1  # of the range of a speaker's opening
 _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Touch:
-    """Limits of a speaker's opening, FAP units."""
-
-    closed_below: float  # below this the lips touch
-    half_open: float
-
-
-def opening(clip: LipClip) -> Array:
+def _opening(clip: LipClip) -> Array:
     """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
     upper, lower = (MOUTH_FAPS.index(fap) for fap in (4, 5))
     return -clip.faps[:, upper] - clip.faps[:, lower]
 
 
-def touches(clips: Sequence[LipClip]) -> dict[str, Touch]:
-    """Measure the limits of each speaker."""
+def closed_below(clips: Sequence[LipClip]) -> dict[str, float]:
+    """Measure the opening, FAP units, below which the lips of each speaker touch."""
     by_speaker: dict[str, list[Array]] = defaultdict(list)
     for clip in clips:
-        by_speaker[clip.speaker].append(opening(clip))
+        by_speaker[clip.speaker].append(_opening(clip))
     limits = {}
     for speaker, heights in by_speaker.items():
         known = np.concatenate(heights)
         known = known[~np.isnan(known)]
         low, high = np.percentile(known, _RANGE_PERCENTILES) if len(known) else (np.nan, np.nan)
-        limits[speaker] = Touch(
-            closed_below=float(low + _CLOSED_SHARE * (high - low)),
-            half_open=float(low + _OPEN_SHARE * (high - low)),
-        )
+        limits[speaker] = float(low + _CLOSED_SHARE * (high - low))
     return limits
 
 
 def targets_at(
     clip: LipClip,
     phones: Sequence[Phone] | None,
-    touch: Touch,
+    closed_at: float,
     known_s: Array,
     delays_s: Sequence[float],
 ) -> NDArray[np.float32]:
     """Compute the targets of positions whose audio is known up to ``known_s``, (n,), in the clip.
 
-    ``phones`` are None if the recognizer does not support the clip's language. ``touch`` has the
-    limits of its speaker. Returns FAPs in FAP units, closure and lip to teeth (0 or 1),
-    (n, delays, 17); NaN if unknown.
+    ``phones`` are None if the recognizer does not support the clip's language. Below the opening
+    ``closed_at`` the speaker's lips touch. Returns FAPs in FAP units, closure and lip to teeth (0
+    or 1), (n, delays, 17); NaN if unknown.
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
     faps = [interpolate_track(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]
-    height = interpolate_track(clip.time_s, opening(clip), time_s)
-    closure = np.where(np.isnan(height), np.nan, height < touch.closed_below)
+    height = interpolate_track(clip.time_s, _opening(clip), time_s)
+    closure = np.where(np.isnan(height), np.nan, height < closed_at)
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
     for phone in phones or ():
         if phone.symbol == _LIP_TO_TEETH:

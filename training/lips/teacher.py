@@ -35,19 +35,19 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.special import expit
 
-from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.corpora.feature_cache import as_floats, as_integers
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from kouxing.corpora.speech_corpus import audio_files, duration_s, is_held_out
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.training.lips.positions import Speech, speech_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
 from kouxing.training.neural.initial_network import load_whisper
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
+from kouxing.training.training_set import load_untranscribed
 
 Floats = NDArray[np.float32]
 Features = NDArray[np.float16]  # of Whisper's encoder
@@ -56,7 +56,6 @@ Array = NDArray[np.float64]
 _LAYERS = (1, 3, 5)  # of Whisper's encoder, the first is 0
 TAUGHT_DELAY_S = 0.015
 _MAX_FOLDER_S = 3600.0  # drawn from each folder, so that none outweighs the others
-_MAX_SAMPLES = 20 * SAMPLE_RATE_HZ
 _NUM_COMPONENTS = 128
 _MAX_DEVIATIONS = 6.0
 _MIN_DEVIATION = 1e-3
@@ -67,43 +66,30 @@ _NUM_FAPS = len(LIP_FAPS)
 T = TypeVar("T", bound=np.generic)
 
 
-def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
-    """Draw recordings, at most an hour from each folder, without those that models are measured on.
+def draw_recordings(folders: Sequence[Path], seed: int) -> list[LipClip]:
+    """Draw clips without lips, at most an hour from each folder.
 
-    Raises UserError if a folder contains no recordings, or one of them cannot be read.
+    They are pieces of up to 20 s. Recordings that models are measured on are left out. Raises
+    UserError if a folder contains no usable recordings.
     """
     rng = np.random.default_rng(seed)
     drawn = []
     for folder in folders:
-        files = [file for file in audio_files(folder) if not is_held_out(file)]
+        pieces = load_untranscribed([folder], RowErrors())
         total_s = 0.0
-        for number in rng.permutation(len(files)):
+        for number in rng.permutation(len(pieces)):
             if total_s >= _MAX_FOLDER_S:
                 break
-            try:
-                total_s += duration_s(files[number])
-            except ValueError as error:
-                raise _unreadable(error) from error
-            drawn.append(files[number])
+            total_s += len(pieces[number]) / SAMPLE_RATE_HZ
+            drawn.append(
+                LipClip(
+                    name=f"{folder.name} {number}",
+                    time_s=np.empty(0),
+                    faps=np.empty((0, len(MOUTH_FAPS))),
+                    samples=as_floats(pieces[number]),
+                )
+            )
     return drawn
-
-
-def _unreadable(error: Exception) -> UserError:
-    return UserError(f"{error}; remove it, or give another folder")
-
-
-def _read_recording(path: Path) -> LipClip:
-    """Read the first 20 s of a recording as a clip without lips."""
-    try:
-        samples = read_audio(path)[:_MAX_SAMPLES]
-    except ValueError as error:
-        raise _unreadable(error) from error
-    return LipClip(
-        name=path.name,
-        time_s=np.empty(0),
-        faps=np.empty((0, len(MOUTH_FAPS))),
-        samples=samples,
-    )
 
 
 def load_encoder(whisper: Path) -> WholeEncoder:
@@ -218,7 +204,7 @@ def train_teacher(
 def label_recordings(
     teacher: Teacher,
     model: NeuralModel,
-    recordings: Sequence[Path],
+    recordings: Sequence[LipClip],
     components: Callable[[Speech], Floats],
     delays_s: Sequence[float],
     speaker: int,
@@ -226,10 +212,9 @@ def label_recordings(
     """Label recordings; the components of the examples come from augmented copies.
 
     ``components`` computes the live model's components of a stretch, (positions, components). The
-    examples get this ``speaker`` number, and labels of these delays. Raises UserError if a
-    recording cannot be read.
+    examples get this ``speaker`` number, and labels of these delays.
     """
-    augmented = speech_of(model, map(_read_recording, recordings), copy=1)
+    augmented = speech_of(model, recordings, copy=1)
     return [
         example
         for speech in track(augmented, description="recordings", total=len(recordings))

@@ -120,7 +120,7 @@ def train_neural(
         details=f"with Whisper's weights (Radford et al. 2023, MIT license), seed {seed}, "
         f"{num_steps} steps of {BATCH_S} s of sound, aligned by `{aligner.name}`, on "
         f"{len(recordings)} recordings",
-        examples=examples,
+        recordings=examples,
         errors=errors,
         chosen=chosen,
     )
