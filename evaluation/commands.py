@@ -67,21 +67,14 @@ def recognizer(
     split: Split = "test",
     acoustic: Acoustic = None,
     look_ahead: LookAhead = None,
-    confusions: Annotated[
-        Path | None, typer.Option(help="Plot the phone confusions of the last model (.png).")
-    ] = None,
     curve: Annotated[Path | None, typer.Option(help="Plot errors against delay (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Compare phone and viseme errors, delays and CPU cost of acoustic models."""
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
-    from kouxing.evaluation.recognizer.report import (
-        draw_confusions,
-        draw_delay_curve,
-        print_figures,
-    )
+    from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
 
-    check_output(confusions, curve, json_file)
+    check_output(curve, json_file)
     results = {
         title: {
             "acoustic": name,
@@ -91,8 +84,6 @@ def recognizer(
     }
     print_figures(results, Console())
     write_json(json_file, results)
-    if confusions is not None:
-        draw_confusions(list(results.values())[-1], confusions)
     if curve is not None:
         draw_delay_curve(list(results.values()), curve)
 
@@ -305,7 +296,7 @@ def faults(
 
     Faults on this machine: "none", "recognizer killed", "recognizer stopped", "recognizer hangs",
     the same for "synthesizer", each of these also with ", one more" worker of the same kind,
-    "control killed", "busy machine", "16 sessions" and "a subscriber stopped".
+    "control killed", "busy machine" and "16 sessions".
 
     Faults between hosts: "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut
     off for 2 s", "hosts, recognizer gone for good, one more" and the same for "synthesizer".

@@ -14,12 +14,10 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-DRIFT_HZ = 1.0
 CLOSURE_WINDOW_S = 0.04
 OPENING_WINDOW_S = 0.3  # a made opening further away belongs to another real one
 HALF_OPEN = 60.0  # FAP units: neither closed nor open
@@ -27,10 +25,7 @@ _CLOSED, _OPEN = 20.0, 100.0  # opening of made lips in FAP units: 0.6 and 3 mm 
 _CLOSED_SHARE = 0.1  # of a real mouth's range
 # A contact counts only near lips that are open by this share of the range. Else it is a pause.
 _OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2
-_NEAR_REST, _RAISED = 10.0, 10.0  # FAP units of the lower and the upper lip in an f
 _RISE_FROM, _RISE_TO = 0.1, 0.3  # shares of a mouth's range
-_MIN_SPEED = 25.0  # FAP units per second
-_CLOSING_S, _PREPARING_S = 0.3, 0.2  # the start and end of a pause, when lips still or already move
 _NO_POWER = 1e-12  # per frame: what filters leave of a constant curve
 _ROUNDING_S = 1e-6
 
@@ -97,32 +92,6 @@ class Detections(Sums):
         return 2.0 * self.recall * precision / (self.recall + precision or 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Turns(Sums):
-    """Changes of direction."""
-
-    count: int = 0
-    seconds: float = 0.0
-
-    @property
-    def per_second(self) -> float | None:
-        """Rate; None without frames."""
-        return self.count / self.seconds if self.seconds else None
-
-
-@dataclass(frozen=True, slots=True)
-class Speed(Sums):
-    """Squared velocities."""
-
-    num_steps: int = 0
-    squares: float = 0.0
-
-    @property
-    def rms(self) -> float | None:
-        """Root mean square velocity, units per second; None without frames."""
-        return float(np.sqrt(self.squares / self.num_steps)) if self.num_steps else None
-
-
 def moments(made: Array, real: Array) -> Moments:
     """Compare two curves of a clip."""
     if not len(made):
@@ -131,53 +100,10 @@ def moments(made: Array, real: Array) -> Moments:
     return Moments(len(made), float(made @ real), float(made @ made), float(real @ real))
 
 
-def without_drift(values: Array, rate_hz: float) -> Array:
-    """Remove everything below 1 Hz from a curve, without delay."""
-    sections = butter(2, DRIFT_HZ, "highpass", fs=rate_hz, output="sos")
-    reach = min(len(values) - 1, round(rate_hz / DRIFT_HZ))
-    filtered: Array = sosfiltfilt(sections, values, padlen=reach)
-    return filtered
-
-
-def turns(time_s: Array, values: Array) -> Turns:
-    """Count sign changes of the velocity where it is above 25 FAP units per second."""
-    if len(values) < 2:
-        return Turns()
-    velocity = np.diff(values) / np.diff(time_s)
-    direction = np.sign(velocity[np.abs(velocity) > _MIN_SPEED])
-    return Turns(int(np.sum(direction[1:] != direction[:-1])), float(time_s[-1] - time_s[0]))
-
-
 def rms_jerk(curves: Sequence[Array], rate_hz: float) -> float | None:
     """Root mean square of the third derivative of curves; None if none has four frames."""
     jerks = np.concatenate([np.zeros(0), *(np.diff(curve, n=3) for curve in curves)]) * rate_hz**3
     return float(np.sqrt(np.mean(jerks**2))) if len(jerks) else None
-
-
-def speed_in(pauses_s: Array, time_s: Array, values: Array) -> Speed:
-    """Measure how fast a curve moves in pauses, without their first 0.3 s and last 0.2 s.
-
-    ``pauses_s`` has the starts and ends, shape (num_pauses, 2).
-    """
-    start_s, end_s = pauses_s[:, :1] + _CLOSING_S, pauses_s[:, 1:] - _PREPARING_S
-    is_inside: Mask = np.any((time_s >= start_s) & (time_s <= end_s), axis=0)
-    velocity = np.diff(values) / np.diff(time_s)
-    velocity = velocity[is_inside[1:] & is_inside[:-1] & ~np.isnan(velocity)]
-    return Speed(len(velocity), float(velocity @ velocity))
-
-
-def closed_after(pauses_s: Array, closed_s: Array) -> Array:
-    """Return the time from the start of each pause to the first frame with closed lips, seconds.
-
-    NaN for pauses in which the lips do not close. ``pauses_s`` has shape (num_pauses, 2).
-    """
-    after = np.append(closed_s, np.inf)[np.searchsorted(closed_s, pauses_s[:, 0])]
-    return np.where(after <= pauses_s[:, 1], after - pauses_s[:, 0], np.nan)
-
-
-def made_closed(time_s: Array, opening: Array) -> Array:
-    """Return the times of all frames in which made lips are closed, seconds."""
-    return time_s[opening < _CLOSED]
 
 
 def real_closed(time_s: Array, opening: Array) -> Array:
@@ -189,7 +115,12 @@ def real_closures(time_s: Array, opening: Array) -> Array:
     """Return when real lips close, seconds: minima of closed lips near an opening."""
     before, here, after = opening[:-2], opening[1:-1], opening[2:]
     is_minimum = (here <= before) & (here < after) & _is_closed(opening)[1:-1]
-    return _near_opening(time_s[1:-1][is_minimum], time_s, opening)
+    moments_s: Array = time_s[1:-1][is_minimum]
+    if not len(moments_s):
+        return moments_s
+    low, high = np.nanpercentile(opening, [1, 99])
+    opened_s = time_s[opening > low + _OPEN_SHARE * (high - low)]
+    return np.asarray(moments_s[is_near(moments_s, opened_s, _OPEN_WINDOW_S)])
 
 
 def _is_closed(opening: Array) -> Mask:
@@ -201,37 +132,10 @@ def _is_closed(opening: Array) -> Mask:
     return is_closed
 
 
-def lip_to_teeth_poses(time_s: Array, upper: Array, lower: Array) -> Array:
-    """Return when a real mouth looks like an f, seconds.
-
-    These are peaks of the lower lip (FAP 5) near rest, with the upper lip (FAP 4) raised, near an
-    opening. A camera does not see whether lip and teeth touch: of a newsreader's 16 f, 12 look like
-    this, but only 12 of the 68 such moments are an f.
-    """
-    contact = _lip_to_teeth(upper, lower)
-    before, here, after = contact[:-2], contact[1:-1], contact[2:]
-    is_peak = (here >= before) & (here > after) & (here > 0.0)
-    return _near_opening(time_s[1:-1][is_peak], time_s, -upper - lower)
-
-
-def _lip_to_teeth(upper: Array, lower: Array) -> Array:
-    """Return the margin in FAP units by which a mouth looks like an f; negative if it does not."""
-    margin: Array = np.minimum(lower + _NEAR_REST, -upper - _RAISED)
-    return margin
-
-
-def _near_opening(moments_s: Array, time_s: Array, opening: Array) -> Array:
-    if not len(moments_s):
-        return moments_s
-    low, high = np.nanpercentile(opening, [1, 99])
-    opened_s = time_s[opening > low + _OPEN_SHARE * (high - low)]
-    near: Array = moments_s[is_near(moments_s, opened_s, _OPEN_WINDOW_S)]
-    return near
-
-
 def is_closed_at(moments_s: Array, time_s: Array, opening: Array) -> Mask:
     """Whether made lips close within 40 ms of each moment and are open within 0.2 s."""
-    return _touches_at(moments_s, time_s, opening < _CLOSED, opening > _OPEN)
+    near: Mask = is_near(moments_s, time_s[opening < _CLOSED], CLOSURE_WINDOW_S)
+    return near & is_near(moments_s, time_s[opening > _OPEN], _OPEN_WINDOW_S)
 
 
 def closures(real_s: Array, closed_s: Array, time_s: Array, opening: Array) -> Detections:
@@ -242,36 +146,13 @@ def closures(real_s: Array, closed_s: Array, time_s: Array, opening: Array) -> D
     open lips are rest, not closures. ``real_s`` and ``closed_s`` are the results of
     ``real_closures`` and ``real_closed``; the opening is that of made lips.
     """
-    return _detections(real_s, closed_s, time_s, opening < _CLOSED, opening > _OPEN)
-
-
-def lip_to_teeth(
-    real_s: Array, poses_s: Array, time_s: Array, upper: Array, lower: Array
-) -> Detections:
-    """Compare contacts of lower lip and upper teeth, like ``closures``.
-
-    Real contacts at ``real_s`` can be reproduced. A made contact near one of ``poses_s``, when real
-    lips look like it, is true. ``upper`` and ``lower`` are FAP 4 and 5 of made lips.
-    """
-    touching = _lip_to_teeth(upper, lower) > 0.0
-    return _detections(real_s, poses_s, time_s, touching, (-upper - lower > _OPEN) & ~touching)
-
-
-def _touches_at(moments_s: Array, time_s: Array, touching: Mask, is_open: Mask) -> Mask:
-    return is_near(moments_s, time_s[touching], CLOSURE_WINDOW_S) & is_near(
-        moments_s, time_s[is_open], _OPEN_WINDOW_S
-    )
-
-
-def _detections(
-    real_s: Array, true_s: Array, time_s: Array, touching: Mask, is_open: Mask
-) -> Detections:
-    is_met = _touches_at(real_s, time_s, touching, is_open)
-    touching = touching & is_near(time_s, time_s[is_open], _OPEN_WINDOW_S)
+    is_met = is_closed_at(real_s, time_s, opening)
+    is_open = opening > _OPEN
+    touching = (opening < _CLOSED) & is_near(time_s, time_s[is_open], _OPEN_WINDOW_S)
     # A contact's number is how often the lips have opened before it. Contact 0 is the initial rest.
     state = np.where(is_open, 1, -1)[is_open | touching]
     number = np.cumsum(np.diff(state, prepend=-1) > 0)[state < 0]
-    is_true = is_near(time_s[touching], true_s, CLOSURE_WINDOW_S)
+    is_true = is_near(time_s[touching], closed_s, CLOSURE_WINDOW_S)
     made, true = np.unique(number[number > 0]), np.unique(number[(number > 0) & is_true])
     return Detections(len(real_s), int(is_met.sum()), len(made), len(true))
 

@@ -47,8 +47,8 @@ FRAME_RATE_HZ = 50.0
 _LOUDNESS_RANGE_DB = 40.0
 _LOUDNESS_WINDOW = np.hanning(7)  # frames
 _SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
-_MIN_PAUSE_S = 0.5
 _POWER_STEP_S = 0.01
+_LABIAL = "b"  # viseme of b p m
 _STILL_OPENING = 250.0  # FAP units; it affects only closures, because means are removed
 
 
@@ -232,19 +232,6 @@ def is_speech(clip: RecognizedClip, time_s: Array) -> NDArray[np.bool_]:
     return speech
 
 
-def pauses(clip: RecognizedClip) -> Array:
-    """Return the starts and ends of pauses after speech, seconds, shape (num_pauses, 2).
-
-    A pause lasts at least half a second. It extends from the last loud sound with voice activity to
-    the next one, or to the end of the clip.
-    """
-    loud_s = _loud_s(clip)
-    speech_s = loud_s[_is_active(clip, loud_s)]
-    edges_s = np.append(speech_s, len(clip.clip.samples) / SAMPLE_RATE_HZ)
-    is_pause = np.diff(edges_s) >= _MIN_PAUSE_S
-    return np.stack([edges_s[:-1][is_pause], edges_s[1:][is_pause]], axis=1)
-
-
 def _is_active(clip: RecognizedClip, time_s: Array) -> NDArray[np.bool_]:
     events = next(iter(clip.events.values()))  # voice activity is the same for all delays
     changes = [event for event in events if isinstance(event, SpeechChange)]
@@ -262,13 +249,13 @@ def _loud_s(clip: RecognizedClip) -> Array:
     return loud_s
 
 
-def phones_with_viseme(clip: RecognizedClip, viseme: str) -> list[Phone]:
-    """Return the phones that start with a viseme; none for a clip in another language."""
+def labials(clip: RecognizedClip) -> list[Phone]:
+    """Return the phones that start with closed lips; none for a clip in another language."""
     if clip.clip.language != clip.inventory.code:
         return []
     visemes = clip.inventory.visemes
     phones = clip.aligned or clip.recognized
-    return [phone for phone in phones if visemes[phone.symbol][0][0] == viseme]
+    return [phone for phone in phones if visemes[phone.symbol][0][0] == _LABIAL]
 
 
 def quietest_moments(clip: LipClip, phones: Sequence[Phone]) -> Array:

@@ -4,20 +4,15 @@ The schemes (``schemes.py``) run the same code as the services, on held-out clip
 pooled over all frames of a group of clips: all, a language, a source, a speaker.
 
 - Correlation of opening, width and jaw, after removal of each clip's mean, because a tracked face
-  at rest is never exactly at 0. It is measured over everything, in speech only (``is_speech``), and
-  with drift below 1 Hz removed.
+  at rest is never exactly at 0. It is measured over everything and in speech only (``is_speech``).
 - The lag with the highest correlation, positive if the made lips are late; the error in FAP units.
 - Closures: recall, precision and F1 (``measures.py``), also in speech only, because lips that close
-  after each word are nearly always right. Contacts of lower lip and upper teeth. How many b p m
-  close: the lips must close within 40 ms of the phone's quietest moment. The phones come from
-  forced alignment or, without a transcript, from offline decoding.
-- Turns: sign changes of the velocity per second, for made and real lips, at the video's frame rate
-  and at 50 Hz. Tracked lips tremble; smooth ones, of an animator's rig, are the stricter measure.
+  after each word are nearly always right. How many b p m close: the lips must close within 40 ms of
+  the phone's quietest moment. The phones come from forced alignment or, without a transcript, from
+  offline decoding.
 - The time from a real opening to the made one. The face's delay comes on top.
-- Pauses of half a second and more: the RMS velocity of the opening, and the time from the last
-  sound to closed lips.
 
-Clips that are out of sync count only for shapes, not for lags, events and pauses.
+Clips that are out of sync count only for shapes, not for lags and events.
 """
 
 from __future__ import annotations
@@ -35,15 +30,14 @@ from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, read_clips
 from kouxing.evaluation.lips import measures
-from kouxing.evaluation.lips.measures import Detections, Moments, Speed, Sums, Turns
+from kouxing.evaluation.lips.measures import Detections, Moments, Sums
 from kouxing.evaluation.lips.schemes import (
     FRAME_RATE_HZ,
     RecognizedClip,
     Scheme,
     all_schemes,
     is_speech,
-    pauses,
-    phones_with_viseme,
+    labials,
     quietest_moments,
     recognize_clip,
 )
@@ -63,7 +57,6 @@ MEASURES: dict[str, Callable[[Array], Array]] = {
     "jaw": lambda faps: faps[:, 2],
 }
 LAGS_S = np.arange(-30, 31) / 100.0
-_F_WINDOW_S = 0.1  # around the middle of an f
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +76,7 @@ class CurveSums(Sums):
 
     everything: Moments
     in_speech: Moments
-    without_drift: Moments
     lagged: Lagged
-    turns: Turns
-    turns_at_50_hz: Turns
-    real_turns: Turns
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,22 +85,10 @@ class EventSums(Sums):
 
     closures: Detections = field(default_factory=Detections)
     closures_in_speech: Detections = field(default_factory=Detections)
-    lip_to_teeth: Detections = field(default_factory=Detections)
     bpm: int = 0
     bpm_met: int = 0
     num_openings: int = 0
     opening_delays_s: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class PauseSums(Sums):
-    """The mouth in pauses."""
-
-    count: int = 0
-    speed: Speed = field(default_factory=Speed)
-    real_speed: Speed = field(default_factory=Speed)
-    closed_after_s: tuple[float, ...] = ()  # for pauses in which the lips close
-    real_closed_after_s: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +99,6 @@ class ClipScore:
     scheme: Scheme
     curves: dict[str, CurveSums]  # by measure, if the clip has it
     events: EventSums
-    pauses: PauseSums
 
 
 def real_faps(clip: LipClip) -> Array:
@@ -140,7 +116,7 @@ def is_measured(clip: LipClip, measure: str) -> bool:
 def score_clip(recognized: RecognizedClip, scheme: Scheme) -> ClipScore | None:
     """Score a scheme on a clip; None if the scheme does not apply to the clip.
 
-    If the clip is out of sync, times are not compared: it has no lags, events and pauses.
+    If the clip is out of sync, times are not compared: it has no lags and events.
     """
     made = scheme.frames(recognized)
     if made is None:
@@ -152,10 +128,8 @@ def score_clip(recognized: RecognizedClip, scheme: Scheme) -> ClipScore | None:
         for name, measure in MEASURES.items()
         if is_measured(clip, name)
     }
-    if not clip.is_in_sync:
-        return ClipScore(clip, scheme, curves, EventSums(), PauseSums())
-    events, in_pauses = _score_events(recognized, real, made), _score_pauses(recognized, real, made)
-    return ClipScore(clip, scheme, curves, events, in_pauses)
+    events = _score_events(recognized, real, made) if clip.is_in_sync else EventSums()
+    return ClipScore(clip, scheme, curves, events)
 
 
 def _score_curve(
@@ -166,19 +140,12 @@ def _score_curve(
     time_s, real, in_speech = clip.time_s[is_known], real[is_known], in_speech[is_known]
     made_s = np.arange(len(values)) / FRAME_RATE_HZ
     made = np.interp(time_s, made_s, values)
-    rate_hz = 1.0 / float(np.median(np.diff(clip.time_s)))
     lags_s = LAGS_S if clip.is_in_sync else np.zeros(0)
     lagged = (np.interp(time_s + lag_s, made_s, values) for lag_s in lags_s)
     return CurveSums(
         everything=measures.moments(made, real),
         in_speech=measures.moments(made[in_speech], real[in_speech]),
-        without_drift=measures.moments(
-            measures.without_drift(made, rate_hz), measures.without_drift(real, rate_hz)
-        ),
         lagged=Lagged(tuple(measures.moments(curve, real) for curve in lagged)),
-        turns=measures.turns(time_s, made),
-        turns_at_50_hz=measures.turns(made_s, values),
-        real_turns=measures.turns(time_s, real),
     )
 
 
@@ -186,13 +153,7 @@ def _score_events(recognized: RecognizedClip, real: Array, made: Array) -> Event
     """Compare closures and openings of real and made FAPs, (num_frames, 68)."""
     clip, time_s = recognized.clip, np.arange(len(made)) / FRAME_RATE_HZ
     real_opening, opening = MEASURES["opening"](real), MEASURES["opening"](made)
-    bpm_s = quietest_moments(clip, phones_with_viseme(recognized, "b"))
-    f_s = np.array(
-        [phone.onset_s + phone.duration_s / 2.0 for phone in phones_with_viseme(recognized, "f")]
-    )
-    poses_s = measures.lip_to_teeth_poses(clip.time_s, real[:, 3], real[:, 4])
-    real_f_s = f_s + measures.offsets(f_s, poses_s, _F_WINDOW_S)
-    real_f_s = real_f_s[~np.isnan(real_f_s)]
+    bpm_s = quietest_moments(clip, labials(recognized))
     real_openings_s = measures.openings(clip.time_s, real_opening)
     delays_s = measures.offsets(
         real_openings_s, measures.openings(time_s, opening), measures.OPENING_WINDOW_S
@@ -205,32 +166,11 @@ def _score_events(recognized: RecognizedClip, real: Array, made: Array) -> Event
         closures_in_speech=measures.closures(
             closures_s[is_speech(recognized, closures_s)], closed_s, time_s, in_speech
         ),
-        lip_to_teeth=measures.lip_to_teeth(real_f_s, poses_s, time_s, made[:, 3], made[:, 4]),
         bpm=len(bpm_s),
         bpm_met=int(measures.is_closed_at(bpm_s, time_s, opening).sum()),
         num_openings=len(real_openings_s),
-        opening_delays_s=_known(delays_s),
+        opening_delays_s=tuple(delays_s[~np.isnan(delays_s)]),
     )
-
-
-def _score_pauses(recognized: RecognizedClip, real: Array, made: Array) -> PauseSums:
-    """Compare the openings of real and made FAPs, (num_frames, 68), in pauses."""
-    real_s, made_s = recognized.clip.time_s, np.arange(len(made)) / FRAME_RATE_HZ
-    real_opening, opening = MEASURES["opening"](real), MEASURES["opening"](made)
-    pauses_s = pauses(recognized)
-    made_closed_s = measures.made_closed(made_s, opening)
-    real_closed_s = measures.real_closed(real_s, real_opening)
-    return PauseSums(
-        count=len(pauses_s),
-        speed=measures.speed_in(pauses_s, real_s, np.interp(real_s, made_s, opening)),
-        real_speed=measures.speed_in(pauses_s, real_s, real_opening),
-        closed_after_s=_known(measures.closed_after(pauses_s, made_closed_s)),
-        real_closed_after_s=_known(measures.closed_after(pauses_s, real_closed_s)),
-    )
-
-
-def _known(values: Array) -> tuple[float, ...]:
-    return tuple(values[~np.isnan(values)])
 
 
 @dataclass(slots=True, kw_only=True)
@@ -239,13 +179,9 @@ class CurveScore:
 
     correlation: float | None
     correlation_in_speech: float | None
-    correlation_without_drift: float | None
     best_lag_ms: float | None  # positive: late
     best_correlation: float | None
     rmse: float | None  # FAP units, clip means removed
-    turns_per_s: float | None  # at the video's frame rate
-    turns_per_s_at_50_hz: float | None
-    real_turns_per_s: float | None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -262,21 +198,6 @@ class HitScore:
 
 
 @dataclass(slots=True, kw_only=True)
-class PauseScore:
-    """The opening in pauses; None if there is no pause."""
-
-    count: int
-    speed: float | None  # RMS, FAP units per second, at the video's frame rate
-    real_speed: float | None
-    shut: int  # pauses in which the lips close
-    real_shut: int
-    shut_after_p50_ms: float | None  # after the last sound
-    shut_after_p95_ms: float | None
-    real_shut_after_p50_ms: float | None
-    real_shut_after_p95_ms: float | None
-
-
-@dataclass(slots=True, kw_only=True)
 class LipScore:
     """One scheme on one group of clips."""
 
@@ -288,14 +209,12 @@ class LipScore:
     curves: dict[str, CurveScore]  # of opening, width and jaw
     closures: HitScore
     closures_in_speech: HitScore
-    lip_to_teeth: HitScore
     bpm: int  # phones b p m
     bpm_met: int  # that close
     openings: int  # of the real lips
     openings_met: int  # within 0.3 s
     opening_delay_p50_ms: float | None
     opening_delay_p95_ms: float | None
-    pauses: PauseScore
 
 
 def clips_to_score(
@@ -359,8 +278,9 @@ def _pool(
         if any(measure in score.curves for score in scores)
     }
     events = reduce(add, (score.events for score in scores), EventSums())
-    pauses = reduce(add, (score.pauses for score in scores), PauseSums())
-    p50, p95 = _percentiles_ms(events.opening_delays_s)
+    p50, p95 = None, None
+    if events.opening_delays_s:
+        p50, p95 = (1e3 * np.percentile(events.opening_delays_s, [50, 95])).tolist()
     return LipScore(
         scheme=scheme,
         delay_ms=None if delay_s is None else round(1e3 * delay_s),
@@ -370,14 +290,12 @@ def _pool(
         curves={measure: _curve_score(sums) for measure, sums in curves.items()},
         closures=_hit_score(events.closures),
         closures_in_speech=_hit_score(events.closures_in_speech),
-        lip_to_teeth=_hit_score(events.lip_to_teeth),
         bpm=events.bpm,
         bpm_met=events.bpm_met,
         openings=events.num_openings,
         openings_met=len(events.opening_delays_s),
         opening_delay_p50_ms=p50,
         opening_delay_p95_ms=p95,
-        pauses=_pause_score(pauses),
     )
 
 
@@ -386,41 +304,14 @@ def _curve_score(sums: CurveSums) -> CurveScore:
     return CurveScore(
         correlation=sums.everything.correlation,
         correlation_in_speech=sums.in_speech.correlation,
-        correlation_without_drift=sums.without_drift.correlation,
         best_lag_ms=None if best is None else round(1e3 * best[1]),
         best_correlation=None if best is None else best[0],
         rmse=sums.everything.rmse,
-        turns_per_s=sums.turns.per_second,
-        turns_per_s_at_50_hz=sums.turns_at_50_hz.per_second,
-        real_turns_per_s=sums.real_turns.per_second,
     )
 
 
 def _hit_score(hits: Detections) -> HitScore:
     return HitScore(**asdict(hits), recall=hits.recall, precision=hits.precision, f1=hits.f1)
-
-
-def _pause_score(sums: PauseSums) -> PauseScore:
-    p50, p95 = _percentiles_ms(sums.closed_after_s)
-    real_p50, real_p95 = _percentiles_ms(sums.real_closed_after_s)
-    return PauseScore(
-        count=sums.count,
-        speed=sums.speed.rms,
-        real_speed=sums.real_speed.rms,
-        shut=len(sums.closed_after_s),
-        real_shut=len(sums.real_closed_after_s),
-        shut_after_p50_ms=p50,
-        shut_after_p95_ms=p95,
-        real_shut_after_p50_ms=real_p50,
-        real_shut_after_p95_ms=real_p95,
-    )
-
-
-def _percentiles_ms(times_s: Sequence[float]) -> tuple[float | None, float | None]:
-    if not times_s:
-        return None, None
-    p50, p95 = 1e3 * np.percentile(times_s, [50, 95])
-    return float(p50), float(p95)
 
 
 def score_lip_models(

@@ -31,12 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import change_speed
+from kouxing.evaluation.tables import print_table
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
@@ -223,11 +223,10 @@ def bounds(real: Array) -> dict[str, float]:
 def print_rates(scores: Sequence[RateScore], console: Console) -> None:
     """Print accuracies by speaking rate as in the paper's table 3, one row per method."""
     for title, accuracies in _TITLES.items():
-        table = Table(title, *(f"{score.rate:g}" for score in scores))
-        table.add_row("syllables per second", *(f"{score.syllables_per_s:.1f}" for score in scores))
+        rows = [["syllables per second", *(f"{score.syllables_per_s:.1f}" for score in scores)]]
         for name in accuracies(scores[0]):
-            table.add_row(name, *(f"{100 * accuracies(score)[name]:.0f} %" for score in scores))
-        console.print(table)
+            rows.append([name, *(f"{100 * accuracies(score)[name]:.0f} %" for score in scores)])
+        print_table(console, "", (title, *(f"{score.rate:g}" for score in scores)), rows)
 
 
 def rates_figure(scores: Sequence[RateScore]) -> Any:

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
 from kouxing.evaluation.lips.scores import MEASURES, clips_to_score, real_faps
+from kouxing.evaluation.tables import print_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -146,17 +146,17 @@ def _rms(error: Array) -> float:
 
 def print_errors(errors: Sequence[VisemeError], console: Console) -> None:
     """Print the errors, one row per viseme."""
-    title = "error in FAP units: learnt (initial); standard deviation of the measured values"
-    table = Table("viseme", "frames", *MEASURES, title=title)
+    rows = []
     for viseme in dict.fromkeys(error.viseme for error in errors):
-        rows = {error.measure: error for error in errors if error.viseme == viseme}
+        of_viseme = {error.measure: error for error in errors if error.viseme == viseme}
         cells = {
             measure: f"{error.learnt:.0f} ({error.guessed:.0f}); {error.extent:.0f}"
-            for measure, error in rows.items()
+            for measure, error in of_viseme.items()
         }
-        num_frames = max(error.num_frames for error in rows.values())
-        table.add_row(viseme, str(num_frames), *(cells.get(m, "") for m in MEASURES))
-    console.print(table)
+        num_frames = max(error.num_frames for error in of_viseme.values())
+        rows.append([viseme, str(num_frames), *(cells.get(measure, "") for measure in MEASURES)])
+    title = "error in FAP units: learnt (initial); standard deviation of the measured values"
+    print_table(console, title, ("viseme", "frames", *MEASURES), rows)
 
 
 def fit_figure(fitted: Sequence[FittedClip]) -> Any:

@@ -23,7 +23,7 @@ class Confusions:
 
     def __init__(self, inventory: PhoneInventory) -> None:
         self._inventory = inventory
-        self.counts: NDArray[np.int64] = np.zeros((len(inventory), len(inventory)), np.int64)
+        self._counts: NDArray[np.int64] = np.zeros((len(inventory), len(inventory)), np.int64)
 
     def add(self, reference: Sequence[str], recognized: Sequence[str]) -> None:
         """Count the phones of a recording."""
@@ -31,18 +31,7 @@ class Confusions:
         for i, j in matched_pairs(reference, recognized):
             row = silence if i is None else reference[i]
             column = silence if j is None else recognized[j]
-            self.counts[index[row], index[column]] += 1
-
-    def most_frequent(self, num: int = 15) -> list[dict[str, object]]:
-        """Return the most frequent confusions with their counts."""
-        errors = self.counts.copy()
-        np.fill_diagonal(errors, 0)
-        order = np.argsort(errors, axis=None)[::-1][:num]
-        phones = self._inventory.phones
-        return [
-            {"reference": phones[i], "recognized": phones[j], "count": int(errors[i, j])}
-            for i, j in zip(*np.unravel_index(order, errors.shape), strict=True)
-        ]
+            self._counts[index[row], index[column]] += 1
 
     def labials(self) -> dict[str, float | None]:
         """Measure the consonants made with the lips, whose errors viewers can see.
@@ -52,7 +41,7 @@ class Confusions:
         ``for_lingual`` are the same with consonants made with the tongue. None without phones.
         """
         labial, lingual = self._with_viseme(_LABIALS), self._with_viseme(_LINGUALS)
-        spoken, recognized = self.counts[labial], self.counts[:, labial]
+        spoken, recognized = self._counts[labial], self._counts[:, labial]
 
         def share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> float | None:
             return int(part.sum()) / int(whole.sum()) if whole.any() else None

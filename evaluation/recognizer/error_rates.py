@@ -1,4 +1,4 @@
-"""Error rates, delays, confusions and CPU cost of the recognizer.
+"""Error rates, delays and CPU cost of the recognizer.
 
 Measured for offline decoding and for the live output rule (Li et al. 2011, eq. 4) with several
 parameters:
@@ -133,9 +133,8 @@ def evaluate_recognizer(
     """Measure a model on one split of a corpus in the model's language; return JSON figures.
 
     The score of ``default_rule`` is the last one, after those of ``rules``. In the figures,
-    ``confusions`` counts reference phones (rows) against phones of offline decoding (columns), in
-    the order of ``phones``. ``labials`` has the consonants made with the lips. ``bad_rows`` lists
-    rows that could not be used. Raises UserError if the split has no usable recording.
+    ``labials`` has the consonants made with the lips, and ``bad_rows`` lists rows that could not be
+    used. Raises UserError if the split has no usable recording.
     """
     inventory = model.inventory
     errors = RowErrors()
@@ -182,14 +181,9 @@ def evaluate_recognizer(
         "recordings": len(used),
         "speakers": len({utterance.speaker for utterance in used}),
         "seconds": seconds,
-        "num_bad_rows": len(errors.messages),
         "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (offline, *live)],
-        "most_confused": confusions["offline"].most_frequent(),
         "labials": {output: counted.labials() for output, counted in confusions.items()},
-        "phones": list(inventory.phones),
-        "silence": inventory.silence,
-        "confusions": confusions["offline"].counts.tolist(),
         "cpu_per_audio_second": cpu_by_stage(model, read_audio(used[0].path)),
     }
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.scoring import ErrorCounts, count_errors, final_hypothesis, first_hypothesis
@@ -22,7 +21,7 @@ from kouxing.evaluation.recognizer.disturbances import (
     babble,
 )
 from kouxing.evaluation.recognizer.error_rates import mouth_shapes
-from kouxing.evaluation.recognizer.report import percent
+from kouxing.evaluation.tables import percent, print_table
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
@@ -34,10 +33,11 @@ from kouxing.shared.phones.inventory import PhoneInventory
 
 _SOUND_S = 60.0
 _MAX_OTHER_RECORDINGS = 40
+_FINAL = "final_hypothesis"
 _OUTPUTS = {  # key of the figures: title of the column
     "offline": "offline decoding",
     "first_hypothesis": "first hypothesis",
-    "final_hypothesis": "final hypothesis",
+    _FINAL: "final hypothesis",
 }
 
 
@@ -52,30 +52,10 @@ def evaluate_robustness(
 ) -> dict[str, Any]:
     """Measure a model on disturbed speech and on sounds without its language.
 
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    corpus, audio
-        A corpus folder, or a manifest and the folder of its recordings, in the model's language.
-    split
-        Split of the corpus, such as ``dev`` or ``test``.
-    rule
-        The recognizer's output rule.
-    other_language
-        Folder of recordings in another language, of which forty are used.
-
-    Returns
-    -------
-    dict
-        ``speech``: phone and viseme error rates and ``labials``
-        (:meth:`kouxing.evaluation.recognizer.confusions.Confusions.labials`) by condition and
-        output. ``sounds``: phones per minute by sound.
-
-    Raises
-    ------
-    UserError
-        If a folder does not exist or has no usable recording.
+    ``other_language`` is a folder of recordings, of which forty are used. In the result,
+    ``speech`` has the error rates and ``labials`` (:class:`Confusions`) by condition and output,
+    and ``sounds`` the phones per minute by sound. Raises UserError if a folder does not exist or
+    has no usable recording.
     """
     phones = model.inventory.phones
     errors = RowErrors()
@@ -129,25 +109,32 @@ class _Tally:
 
 def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> None:
     """Print two tables for each model."""
+    labials = "p, b, m, f in the final hypothesis, recall / precision %"
     for name, figures in results.items():
-        title = f"{name}, {figures['split']}: phone / viseme error %"
-        labials = "p, b, m, f in the final hypothesis, recall / precision %"
-        table = Table("speech", *_OUTPUTS.values(), labials, title=title)
-        for condition, outputs in figures["speech"].items():
-            final = outputs["final_hypothesis"]["labials"]
-            table.add_row(
-                condition,
-                *(
-                    f"{percent(rates['phone_error_rate'])} / {percent(rates['viseme_error_rate'])}"
-                    for rates in outputs.values()
-                ),
-                f"{percent(final['recall'])} / {percent(final['precision'])}",
-            )
-        console.print(table)
-        table = Table("sound without speech", "phones per minute", title=name)
-        for sound, rate in figures["sounds"].items():
-            table.add_row(sound, f"{rate:.1f}")
-        console.print(table)
+        print_table(
+            console,
+            f"{name}, {figures['split']}: phone / viseme error %",
+            ("speech", *_OUTPUTS.values(), labials),
+            (
+                [
+                    condition,
+                    *map(_pair, (*outputs.values(), outputs["final_hypothesis"]["labials"])),
+                ]
+                for condition, outputs in figures["speech"].items()
+            ),
+        )
+        print_table(
+            console,
+            name,
+            ("sound without speech", "phones per minute"),
+            ((sound, f"{rate:.1f}") for sound, rate in figures["sounds"].items()),
+        )
+
+
+def _pair(rates: dict[str, Any]) -> str:
+    """Format the first two rates."""
+    first, second, *_ = rates.values()
+    return f"{percent(first)} / {percent(second)}"
 
 
 def _recognize(
@@ -159,7 +146,7 @@ def _recognize(
     outputs = {
         "offline": decode_offline(model, scores),
         "first_hypothesis": first_hypothesis(events, set()),
-        "final_hypothesis": final_hypothesis(events),
+        _FINAL: final_hypothesis(events),
     }
     return {
         name: [phone.symbol for phone in spoken(phones, model.inventory)]
@@ -171,12 +158,8 @@ def _phones_per_minute(
     model: AcousticModel, sounds: Sequence[Samples], rule: OutputRuleConfig
 ) -> float:
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
-    num_phones = 0
-    for samples in sounds:
-        scores = score_recording(model, samples, SAMPLE_RATE_HZ)
-        events = LiveDecoder(model.topology, rule).decode(scores)
-        num_phones += len(spoken(final_hypothesis(events), model.inventory))
-    return num_phones / minutes
+    phones = (_recognize(model, samples, rule)[_FINAL] for samples in sounds)
+    return sum(map(len, phones)) / minutes
 
 
 def read_recordings(folder: Path) -> list[Samples]:

@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import percentiles, stream
 from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.tables import format_number, print_table
 from kouxing.services.kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
@@ -101,31 +101,31 @@ def measure(path: Path, names: Collection[str], console: Console) -> list[Damage
     with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
         _delays_ms(system.control, speech, rate_hz)  # the first session of a process is slow
         damages = []
-        for number, (name, target) in enumerate(runs, start=2):
+        for place, (name, target) in enumerate(runs, start=2):
             console.print(f"attack: {name}" + (f" on {target}" if target else ""))
             # A new source address each time: a service may reject one that has misbehaved.
-            damages.append(_damage(system, name, target, f"127.0.0.{number}", speech, rate_hz))
+            damages.append(_damage(system, name, target, f"127.0.0.{place}", speech, rate_hz))
         return damages
 
 
 def show(damages: list[Damage], console: Console) -> None:
     """Print the figures as a table, with the memory of the service that grew most."""
     columns = ("attack", "target", "key", "service", "growth MB", "kept MB", "p95 ms by phase")
-    table = Table(*columns)
-    for damage in damages:
-        worst = max(damage.growth_mb, key=lambda service: damage.growth_mb[service])
-        delays = (damage.p95_ms[phase] for phase in PHASES)
-        notes = [f"{service} restarted" for service in damage.restarted]
-        table.add_row(
-            "; ".join([damage.attack, *notes]),
-            damage.target,
-            "yes" if damage.has_key else "no",
-            worst,
-            f"{damage.growth_mb[worst]:.1f}",
-            f"{damage.kept_mb[worst]:.1f}",
-            " / ".join("none" if delay is None else f"{delay:.0f}" for delay in delays),
-        )
-    console.print(table)
+    print_table(console, "", columns, map(_row, damages))
+
+
+def _row(damage: Damage) -> list[str]:
+    worst = max(damage.growth_mb, key=lambda service: damage.growth_mb[service])
+    notes = [f"{service} restarted" for service in damage.restarted]
+    return [
+        "; ".join([damage.attack, *notes]),
+        damage.target,
+        "yes" if damage.has_key else "no",
+        worst,
+        f"{damage.growth_mb[worst]:.1f}",
+        f"{damage.kept_mb[worst]:.1f}",
+        " / ".join(format_number(damage.p95_ms[phase], ".0f") for phase in PHASES),
+    ]
 
 
 def _damage(
@@ -163,7 +163,7 @@ def _delays_ms(control: str, speech: NDArray[np.float32], rate_hz: int) -> dict[
         times_s, delays_s, _ = stream(client, speech, rate_hz, SynthesizerConfig().delay_ms / 1e3)
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)
-    delays_ms = [delays_s[phase == number] * 1e3 for number in range(len(PHASES))]
+    delays_ms = [delays_s[phase == place] * 1e3 for place in range(len(PHASES))]
     p95_ms = [percentiles(values)["p95"] if values.size else None for values in delays_ms]
     return dict(zip(PHASES, p95_ms, strict=True))
 

@@ -96,21 +96,3 @@ def largest_steps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the largest change of each FAP from one frame to the next, shape (68,)."""
     steps: NDArray[np.float32] = np.abs(np.diff(faps, axis=0)).max(axis=0)
     return steps
-
-
-def staleness(
-    followed: Sequence[tuple[float, int]], seen: Seen, since_s: float
-) -> NDArray[np.float64]:
-    """Return how late another subscriber received frames since a time, in seconds.
-
-    ``followed`` has arrival and media time of each of its frames, ``seen`` the results of a
-    subscriber without delays.
-    """
-    in_time_s = {frame.media_time: arrival_s for arrival_s, frame in reversed(seen.frames)}
-    return np.array(
-        [
-            arrival_s - in_time_s[media_time]
-            for arrival_s, media_time in followed
-            if arrival_s >= since_s and media_time in in_time_s
-        ]
-    )

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from kouxing.evaluation.system.live import CHUNK
+from kouxing.evaluation.tables import format_number, print_table
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.writer import VideoWriter
@@ -47,18 +47,17 @@ def measure_sessions(path: Path) -> dict[str, float]:
         model = load_live_model(name)
         recognizer = Recognizer(model, RecognizerConfig(acoustic=name).output_rule)
         recognizer.warm_up()
-        for number in NUM_SESSIONS:
+        for num in NUM_SESSIONS:
             for lips, note in ((None, ""), (lip_predictor_for(model), " with lips")):
-                costs[f"{name}, {number}{note}"] = _cpu_s(recognizer, lips, samples, number)
+                costs[f"{name}, {num}{note}"] = _cpu_s(recognizer, lips, samples, num)
     return costs
 
 
 def show_sessions(costs: dict[str, float], console: Console) -> None:
     """Print the costs as a table."""
-    table = Table("model, sessions of a recognizer", "CPU s per s of audio, each")
-    for name, value in costs.items():
-        table.add_row(name, f"{value:.3f}")
-    console.print(table)
+    rows = ((name, f"{value:.3f}") for name, value in costs.items())
+    columns = ("model, sessions of a recognizer", "CPU s per s of audio, each")
+    print_table(console, "", columns, rows)
 
 
 def _cpu_s(
@@ -104,7 +103,7 @@ def measure_images() -> Rendering:
         load_s[detail] = time.perf_counter() - start_s
         renderer = Renderer(head, *size, samples=samples)
         opengl = renderer.description
-        frames = [_frame(number) for number in range(NUM_IMAGES)]
+        frames = [_frame(place) for place in range(NUM_IMAGES)]
         images = [renderer.draw(faps) for faps in frames[:10]]  # warm up
         start_s = time.perf_counter()
         for faps in frames:
@@ -125,21 +124,26 @@ def measure_images() -> Rendering:
 def show_images(rendering: Rendering, console: Console) -> None:
     """Print the figures as a table."""
     names = list(dict.fromkeys(stage for ms in rendering.stages_ms.values() for stage in ms))
-    table = Table(f"rendering with {rendering.opengl}", "images per s", *(f"{n} ms" for n in names))
-    for case, rate in rendering.images_per_s.items():
-        ms = rendering.stages_ms[case]
-        table.add_row(case, f"{rate:.0f}", *(f"{ms[n]:.1f}" if n in ms else "" for n in names))
-    console.print(table)
+    rows = [
+        [
+            case,
+            f"{rate:.0f}",
+            *(format_number(rendering.stages_ms[case].get(name), ".1f") for name in names),
+        ]
+        for case, rate in rendering.images_per_s.items()
+    ]
+    columns = (f"rendering with {rendering.opengl}", "images per s", *(f"{n} ms" for n in names))
+    print_table(console, "", columns, rows)
     loading = ", ".join(f"{detail} {took:.2f} s" for detail, took in rendering.load_s.items())
     console.print(f"the head: {rendering.asset_bytes / 1e6:.2f} MB, load time: {loading}")
 
 
-def _frame(number: int) -> NDArray[np.float32]:
+def _frame(place: int) -> NDArray[np.float32]:
     """Return the FAPs (68,) of an image: one viseme after another, blinks and nods."""
-    amount = np.float32(0.5 - 0.5 * np.cos(number * 0.7))
-    faps: NDArray[np.float32] = VISEMES[1 + number // 5 % 14] * amount
+    amount = np.float32(0.5 - 0.5 * np.cos(place * 0.7))
+    faps: NDArray[np.float32] = VISEMES[1 + place // 5 % 14] * amount
     faps[18:20] = 500 * amount
-    faps[47] = 3000 * np.sin(number * 0.3)
+    faps[47] = 3000 * np.sin(place * 0.3)
     return faps
 
 
@@ -148,6 +152,6 @@ def _encode_ms(images: list[NDArray[np.uint8]]) -> float:
     with tempfile.TemporaryDirectory() as folder:
         with VideoWriter(Path(folder) / "bench.mp4", width_px, height_px, 25.0, None) as writer:
             start_s = time.perf_counter()
-            for number in range(NUM_IMAGES):
-                writer.write_image(images[number % len(images)])
+            for place in range(NUM_IMAGES):
+                writer.write_image(images[place % len(images)])
         return 1e3 * (time.perf_counter() - start_s) / NUM_IMAGES

@@ -15,28 +15,26 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from kouxing_client import Client, KouxingError, Refused, Session
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
-from kouxing.evaluation.system.continuity import Continuity, compare, staleness, worst
-from kouxing.evaluation.system.live import EpochMonitor, Seen, speak, speak_undisturbed
+from kouxing.evaluation.system.continuity import Continuity, compare, worst
+from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link, Network
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
+from kouxing.evaluation.tables import print_table
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
-from kouxing.shared.config import COMMON, variable
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
@@ -61,7 +59,6 @@ class Timing:
     fault_at_s: float = 8.0
     also_at_s: tuple[float, ...] = (3.2, 4.6)  # in other sessions
     frozen_s: float = 10.0  # how long a service or the machine is blocked
-    stopped_s: float = 60.0  # how long a subscriber is stopped
     cut_s: float = 2.0  # how long a host is cut off
 
 
@@ -78,7 +75,6 @@ class Fault:
     actions: Actions  # by system and session name
     spare: str = ""  # kind of which a second worker runs; then services do not restart
     num_sessions: int = 1
-    stops_subscriber: bool = False  # a second subscriber, not the measured one
     link: Link | None = None  # between virtual hosts; None: everything runs on this host
     is_sudden: bool = True  # the effect depends on the instant
 
@@ -90,11 +86,8 @@ class Outcome:
     fault: str
     failure: str  # why the session did not complete; empty: it did
     face: Continuity | None = None  # None: no frame arrived
-    old_frames: int = 0  # of an earlier epoch, after the first of a later one
     num_refused: int = 0  # sessions
     late_p95_ms: float | None = None  # maximum over all sessions
-    stale_frames: int = 0  # over a second late, at a subscriber that had been stopped
-    stalest_s: float = 0.0
     load: float  # load average of the last minute
 
 
@@ -184,7 +177,6 @@ FAULTS = {
     "control killed": Fault(_signal("control", signal.SIGKILL)),
     "busy machine": Fault(_busy, is_sudden=False),
     f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS, is_sudden=False),
-    "a subscriber stopped": Fault(_nothing, stops_subscriber=True, is_sudden=False),
     **{
         f"hosts, {delay_ms} ms, {loss:.0%} lost": Fault(
             _nothing, link=Link(delay_ms, loss), is_sudden=False
@@ -218,7 +210,7 @@ def measure(
     if unknown:
         raise UserError(f"no fault is named {unknown[0]!r}; choose from {', '.join(FAULTS)}")
     sentence = to_16_khz(*read_audio(path))
-    undisturbed: dict[int, Seen] = {}  # by the length of the audio
+    undisturbed: list[Seen] = []  # once it was measured
     for name in names or FAULTS:
         also_at_s = timing.also_at_s if FAULTS[name].is_sudden else ()
         outcomes = []
@@ -240,7 +232,7 @@ def _worst(outcomes: Sequence[Outcome]) -> Outcome:
     """Return the worst value of each figure."""
     faces = [outcome.face for outcome in outcomes if outcome.face is not None]
     late_ms = [outcome.late_p95_ms for outcome in outcomes if outcome.late_p95_ms is not None]
-    numbers = ("old_frames", "num_refused", "stale_frames", "stalest_s", "load")
+    numbers = ("num_refused", "load")
     return Outcome(
         fault=outcomes[0].fault,
         failure="; ".join(sorted({outcome.failure for outcome in outcomes} - {""})),
@@ -252,32 +244,28 @@ def _worst(outcomes: Sequence[Outcome]) -> Outcome:
 
 def show(outcomes: Collection[Outcome], console: Console) -> None:
     """Print the figures as a table, and which sessions did not complete."""
-    table = Table(
-        *("fault", "stopped s", "late s", "phones lost, doubled, changed"),
-        *("frames lost, doubled, old, at rest", "largest step", "p50, p95 ms", "load"),
-    )
-    for outcome in outcomes:
-        face = outcome.face
-        notes = [f"not completed: {outcome.failure}"] if outcome.failure else []
-        if outcome.num_refused:
-            notes.append(f"{outcome.num_refused} refused")
-        if outcome.stale_frames:
-            notes.append(f"{outcome.stale_frames} stale frames, of up to {outcome.stalest_s:.1f} s")
-        cells = ["no frame"]
-        if face is not None:
-            phones = face.phones_lost, face.phones_doubled, face.phones_changed
-            frames = face.frames_lost, face.frames_doubled, outcome.old_frames, face.rest_frames
-            cells = [
-                f"{face.stood_s:.2f}",
-                f"{face.late_s:.2f}",
-                f"{', '.join(map(str, phones))} of {face.phones}",
-                ", ".join(map(str, frames)),
-                f"{face.largest_step:.1f} x {face.largest_step_fap}",
-                f"{face.late_p50_ms:.0f}, {outcome.late_p95_ms:.0f}",
-                f"{outcome.load:.1f}",
-            ]
-        table.add_row("; ".join([outcome.fault, *notes]), *cells)
-    console.print(table)
+    columns = ("fault", "stopped s", "late s", "phones lost, doubled, changed")
+    more = ("frames lost, doubled, at rest", "largest step", "p50, p95 ms", "load")
+    print_table(console, "", (*columns, *more), map(_row, outcomes))
+
+
+def _row(outcome: Outcome) -> list[str]:
+    notes = [f"not completed: {outcome.failure}"] if outcome.failure else []
+    if outcome.num_refused:
+        notes.append(f"{outcome.num_refused} refused")
+    name, face = "; ".join([outcome.fault, *notes]), outcome.face
+    if face is None:
+        return [name, "no frame"]
+    return [
+        name,
+        f"{face.stood_s:.2f}",
+        f"{face.late_s:.2f}",
+        f"{face.phones_lost}, {face.phones_doubled}, {face.phones_changed} of {face.phones}",
+        f"{face.frames_lost}, {face.frames_doubled}, {face.rest_frames}",
+        f"{face.largest_step:.1f} x {face.largest_step_fap}",
+        f"{face.late_p50_ms:.0f}, {outcome.late_p95_ms:.0f}",
+        f"{outcome.load:.1f}",
+    ]
 
 
 @contextlib.contextmanager
@@ -304,49 +292,38 @@ def _outcome(
     name: str,
     folder: Path,
     sentence: NDArray[np.float32],
-    undisturbed: dict[int, Seen],
+    undisturbed: list[Seen],
     timing: Timing,
     console: Console,
 ) -> Outcome:
     fault = FAULTS[name]
-    stopped_s = timing.stopped_s if fault.stops_subscriber else 0.0
-    length_s = timing.length_s + stopped_s
-    sound = np.resize(sentence, round(length_s * MEDIA_RATE_HZ))
+    sound = np.resize(sentence, round(timing.length_s * MEDIA_RATE_HZ))
     delay_s = SynthesizerConfig().delay_ms / 1e3
     with (
         _system(fault, folder, timing, console) as system,
         system.on_client(),
         connect(system.control, key=system.key) as client,
     ):
-        if len(sound) not in undisturbed:
-            undisturbed[len(sound)] = speak_undisturbed(client, sound)
+        if not undisturbed:
+            undisturbed.append(speak_undisturbed(client, sound))
         sessions, num_refused = _open_all(client, fault.num_sessions)
         silence = load_inventory(sessions[0].info["facts"]["language"] or DEFAULT_LANGUAGE).silence
-        endpoints = [state.endpoints for state in client.status().services]
-        publishers = [by_name["faps"] for by_name in endpoints if "faps" in by_name]
-        monitor = EpochMonitor(sessions[0], publishers, system.key)
         actions = fault.actions(system, sessions[0].name, timing)
-        with _second_subscriber(
-            system, sessions[0].name, stopped_s, timing, actions
-        ) as late_frames:
-            start_s = time.monotonic()
+        start_s = time.monotonic()
 
-            def on_step() -> None:
-                monitor.receive()
-                while actions and time.monotonic() > start_s + actions[0][0]:
-                    actions.pop(0)[1]()
+        def on_step() -> None:
+            while actions and time.monotonic() > start_s + actions[0][0]:
+                actions.pop(0)[1]()
 
-            all_seen = speak(sessions, sound, on_step=on_step)
-        ages_s = staleness(late_frames, all_seen[0], start_s + timing.fault_at_s + stopped_s)
+        all_seen = speak(sessions, sound, on_step=on_step)
         load = os.getloadavg()[0]
-        monitor.close()
         for session in sessions:
             with contextlib.suppress(KouxingError):  # already closed
                 session.close()
     failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
-    fault_s, expected = start_s + timing.fault_at_s, undisturbed[len(sound)]
+    fault_s = start_s + timing.fault_at_s
     faces = [
-        compare(seen, expected, silence, delay_s, fault_s=fault_s)
+        compare(seen, undisturbed[0], silence, delay_s, fault_s=fault_s)
         for seen in all_seen
         if seen.frames
     ]
@@ -354,50 +331,10 @@ def _outcome(
         fault=name,
         failure=", ".join(sorted(set(failures))),
         face=faces[0] if faces else None,
-        old_frames=monitor.num_old,
         num_refused=num_refused,
         late_p95_ms=max((face.late_p95_ms for face in faces), default=None),
-        stale_frames=int((ages_s > 1.0).sum()),
-        stalest_s=float(ages_s.max(initial=0.0)),
         load=load,
     )
-
-
-@contextlib.contextmanager
-def _second_subscriber(
-    system: System, session: str, stopped_s: float, timing: Timing, actions: list[Action]
-) -> Iterator[list[tuple[float, int]]]:
-    """Follow a session in another process, which is stopped for some time.
-
-    Yields
-    ------
-    list of tuple
-        Arrival in seconds and media time of each frame, when the context has ended.
-    """
-    frames: list[tuple[float, int]] = []
-    if not stopped_s:
-        yield frames
-        return
-    environment = {**os.environ, variable(COMMON, "control"): system.control.partition(" ")[0]}
-    process = subprocess.Popen(  # noqa: S603 - our own module; prints a line for each frame
-        [sys.executable, "-m", "kouxing", "listen", session],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-
-    def read(lines: IO[str]) -> None:
-        with lines:
-            for line in lines:
-                frames.append((time.monotonic(), to_samples(float(line.split()[0]))))
-
-    reader = threading.Thread(target=read, args=(process.stdout,))
-    reader.start()
-    actions += _stopped(process.pid, timing.fault_at_s, stopped_s)
-    yield frames
-    reader.join()
-    process.wait()
 
 
 def _open_all(client: Client, num: int) -> tuple[list[Session], int]:

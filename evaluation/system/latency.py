@@ -23,9 +23,9 @@ import numpy as np
 from kouxing_client import Client
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.tables import print_table
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.control_client import connect
@@ -75,17 +75,14 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
 
 def show(latency: Latency, console: Console) -> None:
     """Print the figures as tables."""
-    delays = Table("delay", "p50 ms", "p95 ms", "p99 ms")
-    for name, row in (
-        ("chunk to frame", latency.chunk_to_frame_ms),
-        (f"sound to frame ({latency.delay_ms:g} ms delay)", latency.sound_to_frame_ms),
-    ):
-        delays.add_row(name, *(f"{row[key]:.1f}" for key in ("p50", "p95", "p99")))
-    console.print(delays)
-    costs = Table("service", "CPU s per s of audio")
-    for name, value in latency.cpu_s_per_audio_s.items():
-        costs.add_row(name, f"{value:.3f}")
-    console.print(costs)
+    delays = {
+        "chunk to frame": latency.chunk_to_frame_ms,
+        f"sound to frame ({latency.delay_ms:g} ms delay)": latency.sound_to_frame_ms,
+    }
+    rows = [[name, *(f"{ms:.1f}" for ms in row.values())] for name, row in delays.items()]
+    print_table(console, "", ("delay", "p50 ms", "p95 ms", "p99 ms"), rows)
+    costs = ((name, f"{value:.3f}") for name, value in latency.cpu_s_per_audio_s.items())
+    print_table(console, "", ("service", "CPU s per s of audio"), costs)
 
 
 def stream(

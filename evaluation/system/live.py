@@ -10,12 +10,8 @@ import numpy as np
 from kouxing_client import Client, FapFrame, KouxingError, Phone, Session, Speech
 from numpy.typing import NDArray
 
-from kouxing.shared.bus import Bus
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Key
-from kouxing.shared.sockets import Socket
-from kouxing.shared.wire import face
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 END_LIMIT_S = 15.0  # from the last sample to the last frame
@@ -70,29 +66,6 @@ class Seen:
             ]
         final.sort(key=lambda phone: phone.media_time)
         return [phone for phone in final if phone.symbol != silence]
-
-
-class EpochMonitor:
-    """Receives a session's FAP frames from all synthesizers, also those of earlier epochs."""
-
-    def __init__(self, session: Session, endpoints: Sequence[str], key: Key) -> None:
-        self._bus = Bus(key)
-        self._socket: Socket = self._bus.connect_subscriber(*endpoints)
-        self._socket.subscribe(face.FapFrame, session.name)
-        self._epoch = 0
-        self.num_old = 0  # frames of an earlier epoch, after the first of a later one
-
-    def receive(self) -> None:
-        """Process the frames that have arrived."""
-        for received in self._socket.receive():
-            frame = received.message
-            if isinstance(frame, face.FapFrame):
-                self.num_old += frame.epoch < self._epoch
-                self._epoch = max(self._epoch, frame.epoch)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._bus.close()
 
 
 def speak(

@@ -20,12 +20,12 @@ import numpy as np
 from kouxing_client import Client, FapFrame, Refused, Session
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.system.latency import percentiles
 from kouxing.evaluation.system.live import CHUNK
 from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.tables import format_number, print_table
 from kouxing.services.kinds import read_settings
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -123,8 +123,8 @@ def measure(
         tempfile.TemporaryDirectory() as folder,
         LocalSystem(Path(folder), console, services=SERVICES, settings=settings) as system,
     ):
-        for number in step_sizes(num_sessions):
-            steps.append(_step(system.control, text, number, step_s, delay_s))
+        for num in step_sizes(num_sessions):
+            steps.append(_step(system.control, text, num, step_s, delay_s))
             time.sleep(PAUSE_S)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Load(steps, cores or 1, machine_load, delay_s * 1e3)
@@ -136,10 +136,10 @@ def step_sizes(maximum: int) -> list[int]:
 
 
 def _step(
-    control: str, text: NDArray[np.float32], number: int, step_s: float, delay_s: float
+    control: str, text: NDArray[np.float32], num_asked: int, step_s: float, delay_s: float
 ) -> Step:
     with connect(control) as client:
-        crowd = Crowd(client, text, number)
+        crowd = Crowd(client, text, num_asked)
         crowd.start()
         from_s = time.perf_counter() + SETTLE_S
         crowd.speak_until(from_s)
@@ -156,7 +156,7 @@ def _step(
         time.sleep(DRAIN_S)
         crowd.close()
     return Step(
-        num_asked=number,
+        num_asked=num_asked,
         num_sessions=len(crowd.spoken),
         refusals=crowd.refusals,
         delay_ms=percentiles(np.concatenate(delays_ms)) if delays_ms else {},
@@ -204,30 +204,39 @@ def usage_of(client: Client) -> dict[str, Usage]:
 
 def show(load: Load, console: Console) -> None:
     """Print the figures as tables, with a summary."""
-    delays = Table("sessions", "refused", "p50 ms", "p95 ms", "worst p95", "at rest", "sent late")
     services = list(load.steps[0].cpu_cores)
-    costs = Table(
-        "sessions", *(f"{service}: cores, MB" for service in services), "this client: cores"
+    print_table(
+        console,
+        "",
+        ("sessions", "refused", "p50 ms", "p95 ms", "worst p95", "at rest", "sent late"),
+        (
+            [
+                str(step.num_sessions),
+                ", ".join(f"{count} {code}" for code, count in step.refusals.items()) or "0",
+                *(format_number(step.delay_ms.get(key), ".1f") for key in ("p50", "p95")),
+                f"{step.worst_p95_ms:.1f}",
+                str(step.num_rest_frames),
+                f"{step.client_late_ms:.1f}",
+            ]
+            for step in load.steps
+        ),
     )
-    for step in load.steps:
-        delays.add_row(
-            str(step.num_sessions),
-            ", ".join(f"{number} {code}" for code, number in step.refusals.items()) or "0",
-            *(f"{step.delay_ms[key]:.1f}" if step.delay_ms else "" for key in ("p50", "p95")),
-            f"{step.worst_p95_ms:.1f}",
-            str(step.num_rest_frames),
-            f"{step.client_late_ms:.1f}",
-        )
-        costs.add_row(
-            str(step.num_sessions),
-            *(
-                f"{step.cpu_cores.get(service, 0):.2f}, {step.memory_mb.get(service, 0):.0f}"
-                for service in services
-            ),
-            f"{step.client_cpu_cores:.2f}",
-        )
-    console.print(delays)
-    console.print(costs)
+    print_table(
+        console,
+        "",
+        ("sessions", *(f"{name}: cores, MB" for name in services), "this client: cores"),
+        (
+            [
+                str(step.num_sessions),
+                *(
+                    f"{step.cpu_cores.get(name, 0):.2f}, {step.memory_mb.get(name, 0):.0f}"
+                    for name in services
+                ),
+                f"{step.client_cpu_cores:.2f}",
+            ]
+            for step in load.steps
+        ),
+    )
     figures = load.summary
     if load.best is None:
         console.print(f"not even one session has 95 % of its frames within {LIMIT_MS:g} ms")
@@ -253,28 +262,17 @@ def draw(load: Load) -> Any:
     worst = [step.worst_p95_ms for step in load.steps]
     delay.plot(requested, worst, "s--", label="p95, worst session")
     delay.axhline(LIMIT_MS, color="grey", linestyle=":", label=f"limit, {LIMIT_MS:g} ms")
-    delay.set_yscale("log")
-    delay.set_ylabel("latency without the delay, ms")
-    admitted = [step.num_sessions for step in load.steps]
-    if admitted != requested:
-        right = delay.twinx()
-        right.plot(requested, admitted, "k.:", label="admitted")
-        right.set_ylim(bottom=0)
-        right.set_ylabel("sessions admitted")
     for service in load.steps[0].cpu_cores:
         cores = [step.cpu_cores.get(service) for step in load.steps]
         memory_mb = [step.memory_mb.get(service) for step in load.steps]
         cpu.plot(requested, cores, "o-", label=service)
         memory.plot(requested, memory_mb, "o-", label=service)
-    cpu.plot(requested, [step.client_cpu_cores for step in load.steps], "k:", label="this client")
-    cpu.set_ylabel("cores busy")
-    memory.set_ylabel("memory, MB")
+    delay.set(ylabel="latency without the delay, ms", yscale="log")
+    cpu.set(ylabel="cores busy", ylim=(0, None))
+    memory.set(ylabel="memory, MB", ylim=(0, None))
     for axes in (delay, cpu, memory):
         axes.set_xlabel("requested sessions")
-        axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-        if axes is not delay:
-            axes.set_ylim(bottom=0)
     return figure
 
 

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from kouxing.evaluation.system.chromium import Chromium
 from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.tables import format_number, print_table
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
@@ -65,20 +65,21 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
 
 def show(drawings: dict[str, Drawing], console: Console) -> None:
     """Print the figures as a table."""
-    columns = ("pictures per s", "size", "ms", "CPU ms", "voice to frame", "to picture", "load")
-    table = Table("page of {} x {}".format(*SIZE_PX), *columns)
-    for name, drawing in drawings.items():
-        delays_ms = (drawing.voice_to_frame_ms, drawing.voice_to_picture_ms)
-        table.add_row(
+    columns = ("pictures per s", "size", "ms", "CPU ms", "voice to frame", "to picture ms", "load")
+    rows = [
+        [
             name,
             f"{drawing.pictures_per_s:.1f}",
             "{} x {}".format(*drawing.size_px),
             f"{drawing.picture_ms:.0f}",
             f"{drawing.picture_cpu_ms:.0f}",
-            *("" if delay_ms is None else f"{delay_ms:.0f} ms" for delay_ms in delays_ms),
+            format_number(drawing.voice_to_frame_ms, ".0f"),
+            format_number(drawing.voice_to_picture_ms, ".0f"),
             f"{drawing.load:.1f}",
-        )
-    console.print(table)
+        ]
+        for name, drawing in drawings.items()
+    ]
+    print_table(console, "", ("page of {} x {}".format(*SIZE_PX), *columns), rows)
 
 
 def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:

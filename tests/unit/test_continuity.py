@@ -7,7 +7,7 @@ from array import array
 import pytest
 from kouxing_client import FapFrame, Phone, Speech
 
-from kouxing.evaluation.system.continuity import compare, staleness, worst
+from kouxing.evaluation.system.continuity import compare, worst
 from kouxing.evaluation.system.live import Seen
 
 pytestmark = pytest.mark.unit
@@ -125,8 +125,3 @@ def test_takes_the_worst_of_each_figure() -> None:
     both = worst([other, one])
     assert (both.frames_lost, both.phones_lost, both.largest_step) == (20, 3, 1.0)
     assert both.late_p50_ms == max(one.late_p50_ms, other.late_p50_ms)
-
-
-def test_staleness_is_relative_to_a_subscriber_without_delay() -> None:
-    late = [(0.01, 0), (0.9, 320), (0.9, 320 * 40)]
-    assert staleness(late, UNDISTURBED, since_s=0.5) == pytest.approx([0.82, 0.04])

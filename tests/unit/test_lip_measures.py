@@ -10,14 +10,10 @@ from kouxing.evaluation.lips.measures import (
     best_lag,
     closures,
     is_closed_at,
-    lip_to_teeth,
-    lip_to_teeth_poses,
     moments,
     openings,
     real_closed,
     real_closures,
-    turns,
-    without_drift,
 )
 
 pytestmark = pytest.mark.unit
@@ -44,19 +40,7 @@ def test_moments_add_up() -> None:
     assert both.num_frames == 8
     assert both.correlation == pytest.approx(0.0)
     assert moments(np.zeros(0), np.zeros(0)) == Moments()
-    rest = without_drift(np.full(len(TIME_S), -250.0), 50.0)  # all but zero
-    assert moments(rest, np.sin(TIME_S)).correlation is None
     assert Moments().correlation is Moments().rmse is None
-
-
-def test_removes_drift_without_delay() -> None:
-    drift = 500.0 * np.sin(2.0 * np.pi * 0.1 * TIME_S)
-    syllables = np.sin(2.0 * np.pi * 4.0 * TIME_S)
-    filtered = without_drift(drift + syllables, 50.0)
-    middle = slice(50, -50)
-    assert moments(filtered[middle], syllables[middle]).correlation == pytest.approx(1.0, abs=0.01)
-    np.testing.assert_allclose(filtered[middle], syllables[middle], atol=0.15)
-    assert np.abs(without_drift(np.full(30, 5.0), 25.0)).max() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_finds_the_lag_of_a_delayed_curve() -> None:
@@ -66,17 +50,6 @@ def test_finds_the_lag_of_a_delayed_curve() -> None:
     assert best_lag(late, lags_s) == pytest.approx((1.0, 0.06))
     assert best_lag(late[:8], lags_s[:8]) is None  # it may be better still beyond
     assert best_lag([Moments()] * len(lags_s), lags_s) is best_lag([], lags_s) is None
-
-
-def test_turns_ignore_trembling() -> None:
-    wave = 100.0 * np.sin(2.0 * np.pi * 2.0 * TIME_S)
-    assert turns(TIME_S, wave).count == 16  # two a period, four seconds
-    assert turns(TIME_S, wave).per_second == pytest.approx(4.0, rel=0.01)
-    trembling = np.where(np.arange(len(TIME_S)) % 2, 0.2, -0.2)
-    assert turns(TIME_S, trembling).count == 0
-    assert turns(TIME_S, 50.0 * TIME_S + trembling).count == 0
-    assert turns(TIME_S[:1], wave[:1]).per_second is None
-    assert (turns(TIME_S, wave) + turns(TIME_S, wave)).per_second == pytest.approx(4.0, rel=0.01)
 
 
 def test_real_closures_are_minima_near_an_opening() -> None:
@@ -128,23 +101,6 @@ def test_real_lips_agree_with_themselves() -> None:
     assert closures(real_s, shut_s, TIME_S, real) == Detections(4, 4, 4, 4)
     late = np.interp(TIME_S - 0.2, TIME_S, real)  # too late but in the pauses, which last
     assert closures(real_s, shut_s, TIME_S, late) == Detections(4, 0, 4, 2)
-
-
-def test_finds_contacts_of_lip_and_teeth() -> None:
-    upper, lower = np.full((2, len(TIME_S)), -60.0)
-    lower[TIME_S < 3.9] = -240.0
-    bite, shut = np.abs(TIME_S - 1.0) < 0.03, np.abs(TIME_S - 2.0) < 0.03
-    lower[bite], lower[shut], upper[shut] = 20.0, -40.0, 40.0
-    lower[np.flatnonzero(bite)[1]] = 30.0
-    lower[TIME_S >= 3.9] = -240.0
-    np.testing.assert_allclose(lip_to_teeth_poses(TIME_S, upper, lower), [1.0])
-    contacts = lip_to_teeth(np.array([1.0]), np.array([1.0]), TIME_S, upper, lower)
-    assert contacts == Detections(1, 1, 1, 1)
-    # a pose makes a contact true, but need not be reproduced
-    contacts = lip_to_teeth(np.zeros(0), np.array([1.0]), TIME_S, upper, lower)
-    assert contacts == Detections(0, 0, 1, 1)
-    nothing = np.full(len(TIME_S), np.nan)
-    assert not len(lip_to_teeth_poses(TIME_S, nothing, nothing))
 
 
 def test_finds_openings_in_any_range() -> None:

@@ -20,10 +20,9 @@ from kouxing.evaluation.lips.schemes import (
     RecognizedClip,
     Scheme,
     is_speech,
+    labials,
     live_events,
     loudness_frames,
-    pauses,
-    phones_with_viseme,
     quietest_moments,
 )
 from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool, score_clip
@@ -108,9 +107,6 @@ def test_measures_lag_openings_and_closures() -> None:
     assert same.closures.real >= 3
     assert same.closures.recall == 1.0
     assert same.bpm == same.bpm_met == sum(phone.symbol == "b" for phone in phones) >= 3
-    for figures in same.curves.values():  # the made curve has 50 frames per second, like this clip
-        assert figures.turns_per_s == pytest.approx(figures.real_turns_per_s, rel=0.02)
-        assert figures.turns_per_s_at_50_hz == pytest.approx(figures.turns_per_s)
     # a mouth that never opens closes nothing
     assert [curve.correlation for curve in rest.curves.values()] == [None] * 3
     assert rest.bpm_met == rest.closures.met == rest.closures.made == rest.closures.f1 == 0
@@ -142,34 +138,6 @@ def test_speech_is_loud_voice_activity() -> None:
     results = is_speech(recognized(clip, events=events), times_s)
     assert results.tolist() == [False, True, True, False, True, True, False]
     assert not is_speech(recognized(clip), times_s).any()
-
-
-def test_measures_late_and_moving_lips_in_pauses() -> None:
-    time_s = np.arange(0.0, 4.0, 0.02)
-    frames = np.zeros((len(time_s), NUM_FAPS))
-    frames[time_s < 1.05, 4] = -300.0
-    samples = np.full(4 * SAMPLE_RATE_HZ, 1e-4, dtype=np.float32)
-    samples[:SAMPLE_RATE_HZ] = samples[round(2.5 * SAMPLE_RATE_HZ) : 3 * SAMPLE_RATE_HZ] = 0.1
-    events = [SpeechChange(active=True, time_s=0.0), SpeechChange(active=False, time_s=3.5)]
-    lips = recognized(replace(clip_of(time_s, frames[:, MOUTH]), samples=samples), events=events)
-    np.testing.assert_allclose(pauses(lips), [[0.99, 2.51], [2.99, 4.0]])
-    late = np.roll(frames, 5, axis=0)
-    late[:5] = late[5]
-    twitching = late.copy()
-    twitching[70:80:2, 4] = -10.0  # at 1.4 to 1.6 s
-    gaping = np.full_like(frames, -300.0)
-    results = {
-        score.scheme: score.pauses
-        for score in scores_of(lips, {"late": late, "twitching": twitching, "gaping": gaping})
-        if score.kind == "all"
-    }
-    assert results["late"].count == results["late"].shut == results["late"].real_shut == 2
-    assert results["late"].speed == results["late"].real_speed == 0.0
-    assert results["late"].real_shut_after_p95_ms == pytest.approx(70.0, abs=5.0)
-    assert results["late"].shut_after_p95_ms == pytest.approx(165.0, abs=10.0)
-    # ten steps of 10 units in 20 ms, among those of 1.29 to 2.31 s and of 3.29 to 3.8 s
-    assert results["twitching"].speed == pytest.approx(500.0 * np.sqrt(10 / 75), rel=0.02)
-    assert (results["gaping"].shut, results["gaping"].shut_after_p50_ms) == (0, None)
 
 
 def test_counts_closures_in_speech_separately() -> None:
@@ -204,7 +172,7 @@ def test_prints_scores_by_group() -> None:
     console = Console(record=True, width=80, file=StringIO())
     print_scores(scores, console)
     text = console.export_text()
-    for name in ("all: 2", "zh: 1", "en: 1", "one: 1", "somebody_with_a_name: 1"):
+    for name in ("all: 2", "zh: 1", "en: 1"):
         assert name in text
     opening = next(score for score in scores if score.kind == "all").curves["opening"]
     assert f"{opening.correlation:.2f}" in text
@@ -225,21 +193,21 @@ def test_loudness_opens_the_mouth() -> None:
 
 def test_finds_the_quietest_moment_of_a_phone() -> None:
     phones = utterance(4, 20)
-    labials = [phone for phone in phones if phone.symbol == "b"]
+    closing = [phone for phone in phones if phone.symbol == "b"]
     samples = np.random.default_rng(0).normal(0.0, 0.1, 8 * SAMPLE_RATE_HZ).astype(np.float32)
-    quiet_s = [phone.onset_s + 0.3 * phone.duration_s for phone in labials]
+    quiet_s = [phone.onset_s + 0.3 * phone.duration_s for phone in closing]
     for time_s in quiet_s:
         middle = round(time_s * SAMPLE_RATE_HZ)
         samples[middle - 200 : middle + 200] = 0.0
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    results = phones_with_viseme(recognized(clip, phones), "b")
+    results = labials(recognized(clip, phones))
     np.testing.assert_allclose(quietest_moments(clip, results), quiet_s, atol=0.011)
     # only phones in the model's language count
     english = replace(clip, language="en")
-    assert phones_with_viseme(recognized(english, phones), "b") == []
+    assert labials(recognized(english, phones)) == []
     theirs = replace(INVENTORY, code="en", visemes={**INVENTORY.visemes, "d": (("b", 1.0),)})
     lips = replace(recognized(english, phones), inventory=theirs)
-    assert {phone.symbol for phone in phones_with_viseme(lips, "b")} == {"b", "d"}
+    assert {phone.symbol for phone in labials(lips)} == {"b", "d"}
 
 
 def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: str = "zh") -> None:

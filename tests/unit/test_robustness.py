@@ -15,10 +15,7 @@ from kouxing.evaluation.recognizer.disturbances import (
     add_noise,
     add_sound,
     babble,
-    change_level,
     change_speed,
-    clip,
-    limit_to_telephone_band,
     pink_noise,
 )
 from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
@@ -55,12 +52,6 @@ def test_pink_noise_has_equal_power_in_every_octave() -> None:
     assert np.ptp(10 * np.log10(octaves)) < 0.7
 
 
-@pytest.mark.parametrize(("frequency_hz", "passes"), [(1000, True), (100, False), (6000, False)])
-def test_telephone_band(frequency_hz: float, passes: bool) -> None:
-    share = level(limit_to_telephone_band(tone(frequency_hz))) / level(tone(frequency_hz))
-    assert share == pytest.approx(1.0, abs=0.05) if passes else share < 0.03
-
-
 def test_babble_mixes_six_voices() -> None:
     voices = [tone(frequency_hz) for frequency_hz in (200, 400, 600, 800, 1000, 1200)]
     together = babble([(number + 1) * voice for number, voice in enumerate(voices)])
@@ -79,24 +70,6 @@ def test_echoes_last_half_a_second() -> None:
     falls = level(heard[1:801]) / level(heard[4001:4801])
     assert 20 * np.log10(falls) == pytest.approx(30, abs=2)  # in a quarter of a second
     assert np.abs(heard[8000:]).max() < 1e-6
-
-
-@pytest.mark.parametrize("name", ["MP3, 16 kbit/s", "Opus, 9 kbit/s"])
-def test_codecs_keep_length_and_pitch(name: str) -> None:
-    speech = tone(440)
-    decoded = SPEECH_CONDITIONS[name](speech)
-    assert len(decoded) == pytest.approx(len(speech), abs=2000)
-    spectrum = np.abs(np.fft.rfft(decoded[4000:12_000]))
-    assert np.fft.rfftfreq(8000, 1 / RATE_HZ)[spectrum.argmax()] == 440
-
-
-def test_clipping_is_relative_to_the_peak() -> None:
-    assert np.abs(clip(tone(440), 0.2)).max() == pytest.approx(0.06, abs=1e-3)
-
-
-def test_double_level_clips() -> None:
-    assert change_level(tone(440), 4.0).max() == 1.0
-    np.testing.assert_array_equal(change_level(tone(440), 0.5), tone(440) / 2)
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.3])
@@ -125,8 +98,11 @@ def test_evaluates_a_small_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     conditions = {name: SPEECH_CONDITIONS[name] for name in ("as recorded", "half level")}
     monkeypatch.setattr(robustness, "SPEECH_CONDITIONS", conditions)
     monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "hello.wav").symlink_to(DEMO / "hello-male.wav")
     figures = evaluate_robustness(
-        load_model(), tmp_path, "dev", OutputRuleConfig(1, 0.9), other_language=DEMO
+        load_model(), tmp_path, "dev", OutputRuleConfig(1, 0.9), other_language=other
     )
     assert set(figures["speech"]) == {*conditions, "babble 10 dB below"}
     rates = figures["speech"]["as recorded"]["offline"]
