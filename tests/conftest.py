@@ -17,6 +17,11 @@ settings.register_profile(
 settings.load_profile("kouxing")
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark a test with the name of its folder: unit, property, e2e, …."""
+    item.add_marker(item.path.parent.name)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _own_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep tests away from the keys of the user who runs them."""

@@ -10,8 +10,6 @@ from typer.main import get_command
 
 from kouxing.services.cli.main import app
 
-pytestmark = pytest.mark.contract
-
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
     path

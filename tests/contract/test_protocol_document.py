@@ -35,7 +35,6 @@ from kouxing.shared.wire.session import (
 from kouxing.shared.wire.speech import NewestFrame
 from tests.samples import SAMPLES
 
-pytestmark = pytest.mark.contract
 ROOT = Path(__file__).parents[2]
 PROTOCOL, MESSAGES_DOCUMENT, VALUES = (
     (ROOT / "proto" / name).read_text(encoding="utf-8")
@@ -98,18 +97,14 @@ def number_text(value: float) -> str:
     return f"{value:.10g}"
 
 
-def span_text(low: float | None, high: float | None) -> str:
+def span_text(low: float | None, high: float | None, unit: str = "") -> str:
+    if unit:  # a number of characters, bytes or entries
+        if high is None or low == high:
+            return f"{high} {unit}" if high else ""
+        return f"{low} to {high} {unit}" if low else f"up to {high} {unit}"
     if low is not None and high is not None:
         return f"{number_text(low)} to {number_text(high)}"
     return "" if low is None else f"at least {number_text(low)}"
-
-
-def size_text(low: int | None, high: int | None, unit: str) -> str:
-    if high is None:
-        return ""
-    if low == high:
-        return f"{high} {unit}"
-    return f"{low} to {high} {unit}" if low else f"up to {high} {unit}"
 
 
 def pattern_text(pattern: str) -> str:
@@ -125,11 +120,11 @@ def range_text(kind: msgspec.inspect.Type) -> str:
         case msgspec.inspect.StrType(pattern=str() as pattern):
             text = pattern_text(pattern)
         case msgspec.inspect.StrType():
-            text = size_text(kind.min_length, kind.max_length, "characters")
+            text = span_text(kind.min_length, kind.max_length, "characters")
         case msgspec.inspect.BytesType():
-            text = size_text(kind.min_length, kind.max_length, "bytes")
+            text = span_text(kind.min_length, kind.max_length, "bytes")
         case msgspec.inspect.DictType() | msgspec.inspect.ListType():
-            text = size_text(kind.min_length, kind.max_length, "entries")
+            text = span_text(kind.min_length, kind.max_length, "entries")
         case msgspec.inspect.IntType() | msgspec.inspect.FloatType():
             text = (
                 f"above 0, up to {number_text(kind.le)}"
@@ -148,11 +143,8 @@ def default_text(field: msgspec.inspect.Field) -> str:
         return "empty"
     if isinstance(field.default, float):
         return f"{field.default:g}"
-    return (
-        field.default
-        if field.default and isinstance(field.default, str)
-        else json.dumps(field.default)
-    )
+    is_text = field.default and isinstance(field.default, str)
+    return field.default if is_text else json.dumps(field.default)
 
 
 def expected_rows(cls: type[Any]) -> list[list[str]]:
@@ -166,12 +158,23 @@ def expected_rows(cls: type[Any]) -> list[list[str]]:
     ]
 
 
-def test_documents_this_version() -> None:
+def test_documents_version_limits_errors_and_events() -> None:
     assert PROTOCOL.startswith(f"# The kouxing protocol, version {VERSION}\n")
-
-
-def test_documents_the_common_fields() -> None:
+    assert f"at most {MAX_MESSAGE_BYTES // 2**20} MiB" in section("A message")
+    assert f"{MAX_AUDIO_BYTES // 1024} KiB of audio" in section("A message")
     assert [row[:4] for row in table(section("A message"))] == expected_rows(Message)
+    assert {row[0].strip("`") for row in table(section("Errors"))} == {*ErrorCode}
+    assert {row[0].strip("`") for row in table(section("Events"))} == {*EventName}
+
+
+def test_the_schema_the_samples_and_the_document_have_the_same_messages() -> None:
+    stored = json.loads((ROOT / "proto" / "schema.json").read_text(encoding="utf-8"))
+    assert stored == json.loads(json.dumps(schema()))
+    assert sorted(sample.kind for sample in SAMPLES) == sorted(MESSAGES)
+    described = re.findall(r"^### `([a-z-]+)`$", MESSAGES_DOCUMENT, re.MULTILINE)
+    assert sorted(described) == sorted(STRUCTURES)
+    for cls in (SessionOpened, SessionMoved):
+        assert set(CLIENT_NEEDS) <= {field.name for field in dataclasses.fields(cls)}
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
@@ -179,15 +182,6 @@ def test_documents_every_field_with_type_range_and_default(name: str) -> None:
     rows = table(section(f"`{name}`", MESSAGES_DOCUMENT))
     assert [row[:4] for row in rows] == expected_rows(STRUCTURES[name])
     assert all(row[4] for row in rows), "every field has its meaning"
-
-
-def test_documents_no_other_message() -> None:
-    described = re.findall(r"^### `([a-z-]+)`$", MESSAGES_DOCUMENT, re.MULTILINE)
-    assert sorted(described) == sorted(STRUCTURES)
-
-
-def test_documents_every_error_code() -> None:
-    assert {row[0].strip("`") for row in table(section("Errors"))} == {*ErrorCode}
 
 
 def test_documents_every_answer() -> None:
@@ -205,30 +199,24 @@ def test_documents_every_answer() -> None:
     assert errors - {"request"} < {*ErrorCode}
 
 
-def test_documents_every_fap() -> None:
+def test_documents_every_fap_and_shape() -> None:
+    points = {fap.number: ", ".join(fap.feature_points) for fap in FAPS}
     assert table(section("FAPs", VALUES), -1) == [
         [
             str(fap.number),
             f"`{fap.name}`",
             fap.fapu,
             fap.direction.replace("_", " "),
-            ", ".join(fap.feature_points),
+            points[fap.number],
         ]
         for fap in FAPS
     ]
-    assert list(LOW_LEVEL_FAPS) == list(range(2, 68)), "FAP 1 and 2 are never set"
-
-
-def test_documents_every_unit_of_faps() -> None:
-    assert {row[0] for row in table(section("FAPs", VALUES))} == {
-        fap.fapu for fap in FAPS if fap.fapu
-    }
-
-
-def test_documents_every_shape() -> None:
+    units = {row[0] for row in table(section("FAPs", VALUES))}
+    assert units == {fap.fapu for fap in FAPS if fap.fapu}
     assert table(section("Sets of shapes", VALUES)) == [
         [f"`{name}`", " ".join(shapes.names)] for name, shapes in SHAPE_SETS.items()
     ]
+    assert list(LOW_LEVEL_FAPS) == list(range(2, 68)), "FAP 1 and 2 are never set"
 
 
 def test_documents_every_phone_with_a_correct_example() -> None:
@@ -244,10 +232,6 @@ def test_documents_every_phone_with_a_correct_example() -> None:
             ((syllable),) = inventory.pronounce(character)
             assert inventory.pronounce(pinyin) == [syllable]
             assert symbol.strip("`") in syllable
-
-
-def test_documents_every_event() -> None:
-    assert {row[0].strip("`") for row in table(section("Events"))} == {*EventName}
 
 
 def test_documents_the_messages_of_each_publisher() -> None:
@@ -268,27 +252,5 @@ def test_documents_the_order_of_lip_values() -> None:
             ranges[-1].append(fap)
         else:
             ranges.append([fap])
-    text = ", ".join(
-        f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(map(str, each))
-        for each in ranges
-    )
-    assert text in section("`lip-positions`", MESSAGES_DOCUMENT)
-
-
-def test_documents_the_size_limits() -> None:
-    assert f"at most {MAX_MESSAGE_BYTES // 2**20} MiB" in section("A message")
-    assert f"{MAX_AUDIO_BYTES // 1024} KiB of audio" in section("A message")
-
-
-@pytest.mark.parametrize("cls", [SessionOpened, SessionMoved])
-def test_messages_to_clients_contain_the_endpoints_they_need(cls: type[Message]) -> None:
-    assert set(CLIENT_NEEDS) <= {field.name for field in dataclasses.fields(cls)}
-
-
-def test_the_stored_schema_is_current() -> None:
-    stored = json.loads((ROOT / "proto" / "schema.json").read_text(encoding="utf-8"))
-    assert stored == json.loads(json.dumps(schema()))
-
-
-def test_there_is_a_sample_of_every_kind() -> None:
-    assert sorted(sample.kind for sample in SAMPLES) == sorted(MESSAGES)
+    texts = [f"{r[0]} to {r[-1]}" if len(r) > 2 else ", ".join(map(str, r)) for r in ranges]
+    assert ", ".join(texts) in section("`lip-positions`", MESSAGES_DOCUMENT)

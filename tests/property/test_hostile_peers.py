@@ -38,8 +38,6 @@ from kouxing.shared.wire.session import Error, OpenSession, StatusReport, Status
 from tests.samples import SAMPLES
 from tests.system import free_port
 
-pytestmark = pytest.mark.property
-
 LOCAL = "tcp://127.0.0.1:*"
 NO_CONTROL = f"tcp://127.0.0.1:{free_port()}"
 MAX_SESSIONS = 4

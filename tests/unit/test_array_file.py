@@ -12,8 +12,6 @@ import pytest
 
 from kouxing.shared.array_file import read_arrays
 
-pytestmark = pytest.mark.unit
-
 MIB = 1024 * 1024
 
 

@@ -15,8 +15,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.wav_header import WavHeader, read_wav_header
 from tests.system import VOWELS_FILE
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_24", "FLOAT", "DOUBLE"])
 def test_scales_every_sample_format_to_one(tmp_path: Path, subtype: str) -> None:

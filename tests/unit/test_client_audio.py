@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from kouxing_client.audio import RESEND_S, AudioStream, to_pcm
 
-pytestmark = pytest.mark.unit
 CHUNK = 1600  # samples: 100 ms
 
 

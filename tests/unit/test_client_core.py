@@ -22,7 +22,6 @@ from kouxing_client.session_core import (
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.fake_sockets import FakeConnection, FakeSockets
 
-pytestmark = pytest.mark.unit
 OPENED = {
     "epoch": 1,
     "token": "t",

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from array import array
 
-import pytest
 from kouxing_client import FapFrame, Sound
 from kouxing_client.follower import CATCH_UP_S, KEEP_S, MAX_OLD, RETRY_S, Follower
 from kouxing_client.messages import EndOfFaps, Joined, Message
 
 from tests.fake_sockets import FakeConnection, FakeSockets
 
-pytestmark = pytest.mark.unit
 PHONES, FAPS, OTHER_FAPS = "phones", "faps", "other faps"
 
 

@@ -12,8 +12,6 @@ from kouxing.shared.clock import (
     to_seconds,
 )
 
-pytestmark = pytest.mark.unit
-
 
 def test_media_time_is_samples_at_16_khz() -> None:
     assert to_samples(1.5) == 24000

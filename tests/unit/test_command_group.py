@@ -14,8 +14,6 @@ from kouxing.services.cli import main as command_line
 from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
 
-pytestmark = pytest.mark.unit
-
 wave_app = typer.Typer(add_completion=False)
 
 

@@ -17,7 +17,6 @@ from kouxing.shared.config import ServiceConfig, Settings
 from kouxing.shared.errors import UserError
 from tests.documents import code_blocks
 
-pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[2]
 TYPES = {kind.name: kind.config_type for kind in KINDS.values()}
 ANYWHERE = "0.0.0.0"  # noqa: S104

@@ -10,8 +10,6 @@ from kouxing.services.cli.configuration import TABLES, config, markdown_page
 from kouxing.services.kinds import read_settings
 from kouxing.shared.errors import UserError
 
-pytestmark = pytest.mark.unit
-
 PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
 
 

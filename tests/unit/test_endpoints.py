@@ -9,7 +9,6 @@ import pytest
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.endpoints import own_address
 
-pytestmark = pytest.mark.unit
 ROUTES = {"10.77.0.1": "10.77.0.2", "fd77::1": "fd77::2", "192.0.2.1": "10.88.0.2"}
 
 

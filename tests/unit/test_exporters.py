@@ -21,7 +21,6 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT
 
-pytestmark = pytest.mark.unit
 RATE_HZ = 40.0
 
 

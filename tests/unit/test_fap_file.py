@@ -8,8 +8,6 @@ import pytest
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 
-pytestmark = pytest.mark.unit
-
 
 def mask(*faps: int, digits: int = 68) -> str:
     return " ".join("1" if number in faps else "0" for number in range(1, digits + 1))

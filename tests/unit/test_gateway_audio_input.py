@@ -15,8 +15,6 @@ from kouxing.services.gateway.limits import RateLimit
 from kouxing.services.gateway.pcm_format import PcmFormat, check_text
 from kouxing.shared.errors import UserError
 
-pytestmark = pytest.mark.unit
-
 PCM16 = PcmFormat(sample_rate_hz=16000)
 FLOAT = PcmFormat(sample_rate_hz=16000, encoding="f32le")
 

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import asyncio
 
-import pytest
-
 from kouxing.services.gateway.viewer_queue import (
     MAX_QUEUED,
     NUM_FRAMES_KEPT,
     MessageKind,
     ViewerQueue,
 )
-
-pytestmark = pytest.mark.unit
 
 
 def drain(viewer_queue: ViewerQueue) -> list[str | bytes]:

@@ -13,7 +13,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
 
-pytestmark = pytest.mark.unit
 LONG_PROFILE = "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)
 
 

@@ -9,7 +9,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import MANDARIN, install_language
 
-pytestmark = pytest.mark.unit
 MANY = tuple(chr(97 + n // 26) + chr(97 + n % 26) for n in range(256))
 
 

@@ -29,8 +29,6 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey, HeartbeatReply
 from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.fixture(autouse=True)
 def _new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,8 +17,6 @@ from kouxing.services.kinds import (
 )
 from kouxing.shared.errors import UserError
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "*"])
 def test_rejects_a_configured_port_that_is_taken(host: str) -> None:

@@ -13,7 +13,6 @@ from kouxing.services.kinds import KINDS
 from kouxing.shared.config import Bound, Settings, bound_keys
 from tests.system import ROOT
 
-pytestmark = pytest.mark.unit
 FOLDER = ROOT / "deploy" / "kubernetes"
 KUSTOMIZATION = yaml.safe_load((FOLDER / "kustomization.yaml").read_text("utf-8"))
 OBJECTS: dict[tuple[str, str], Any] = {

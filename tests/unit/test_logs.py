@@ -12,8 +12,6 @@ import pytest
 from kouxing.services.process import run_service
 from kouxing.shared.logs import LOG, configure
 
-pytestmark = pytest.mark.unit
-
 
 class Crashing:
     current_session = "second"

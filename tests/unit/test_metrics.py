@@ -8,8 +8,6 @@ from prometheus_client import CollectorRegistry
 from kouxing.shared.metrics import WINDOW, BusyShare, Metrics
 from kouxing.shared.prometheus import MetricsCollector
 
-pytestmark = pytest.mark.unit
-
 
 def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
     metrics = Metrics()

@@ -4,8 +4,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.mandarin.pinyin import phones_of_syllable, spell, transcribe
 from tests.languages import MANDARIN
 
-pytestmark = pytest.mark.unit
-
 # The syllables of Mandarin by initial (Xinhua Zidian's table), ü written v after n and l.
 SYLLABLES = {
     "": "a o e ai ei ao ou an en ang eng er",

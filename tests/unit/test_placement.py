@@ -12,8 +12,6 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.wire.session import OpenSession
 from tests.unit.test_sessions import System, worker
 
-pytestmark = pytest.mark.unit
-
 MAX_LOAD = 0.8
 WORKERS = ("recognizer-1", "recognizer-2", "synthesizer-1", "synthesizer-2")
 

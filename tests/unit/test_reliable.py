@@ -6,14 +6,11 @@ from collections import deque
 from dataclasses import replace
 from typing import Any, cast
 
-import pytest
-
 from kouxing.shared.keys import Peer
 from kouxing.shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress
 
-pytestmark = pytest.mark.unit
 PEER = Peer(b"peer")
 FRAME = NewestFrame(sequence=2, media_time=320, values=bytes(272))
 

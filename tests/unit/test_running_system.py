@@ -13,7 +13,6 @@ from kouxing.services.cli.running_system import announce, find_control
 from kouxing.shared.keys import user_key
 from tests.system import ROOT
 
-pytestmark = pytest.mark.unit
 ANNOUNCE = """
 import sys
 from kouxing.services.cli.running_system import announce

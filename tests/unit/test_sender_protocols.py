@@ -18,8 +18,6 @@ from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.receivers import LIVE_LINK_ORDER, Messages, read_live_link, read_osc
 
-pytestmark = pytest.mark.unit
-
 
 def frame_of(shapes: str = "arkit", time_s: float = 0.0, /, **weights: float) -> FaceFrame:
     """Return a frame with some shapes or FAPs, by name."""
@@ -140,40 +138,11 @@ def response(kind: str, **data: object) -> str:
     return json.dumps({"apiName": "VTubeStudioPublicAPI", "messageType": kind, "data": data})
 
 
-def next_request(dialogue: Dialogue, kind: str, **data: object) -> tuple[str, dict[str, object]]:
-    """Return the kind and the data of what follows a response."""
-    request = json.loads(dialogue.reply(response(kind, **data)))
-    return request["messageType"], request["data"]
-
-
-def test_vtube_studio_requests_a_token_once() -> None:
-    saved: list[str] = []
-    dialogue = Dialogue("", saved.append)
-    request = json.loads(dialogue.first_message())
-    assert request["messageType"] == "AuthenticationTokenRequest"
-    assert request["data"] == {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
-    assert "Allow" in dialogue.problem
-    kind, data = next_request(dialogue, "AuthenticationTokenResponse", authenticationToken="t")
-    assert saved == ["t"]
-    assert (kind, data["authenticationToken"]) == ("AuthenticationRequest", "t")
-    kind, _ = next_request(dialogue, "AuthenticationResponse", authenticated=True)
-    assert (kind, dialogue.is_ready) == ("InputParameterListRequest", False)
-    known = [{"name": "MouthOpen"}, {"name": "FaceAngleX"}]
-    listed = response("InputParameterListResponse", defaultParameters=known, customParameters=[])
-    assert dialogue.reply(listed) == ""
-    assert dialogue.is_ready
-    message = json.loads(dialogue.frame_message(frame_of("vrm", aa=1.0), is_mouth_only=False))
-    assert message["messageType"] == "InjectParameterDataRequest"
-    values = message["data"]["parameterValues"]
-    assert [value["id"] for value in values] == ["MouthOpen", "FaceAngleX"]
-    assert message["data"]["faceFound"] is True
-
-
 def test_vtube_studio_errors() -> None:
     dialogue = Dialogue("revoked", lambda _: None)
     assert json.loads(dialogue.first_message())["messageType"] == "AuthenticationRequest"
-    kind, _ = next_request(dialogue, "AuthenticationResponse", authenticated=False)
-    assert kind == "AuthenticationTokenRequest"
+    request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=False)))
+    assert request["messageType"] == "AuthenticationTokenRequest"
     with pytest.raises(Denied):
         dialogue.reply(response("APIError", errorID=50, message="denied"))
     for number, reason in ((1, "Start API"), (51, "press Allow"), (500, "no such")):

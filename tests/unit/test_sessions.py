@@ -18,8 +18,6 @@ from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import OpenSession, SessionFacts
 
-pytestmark = pytest.mark.unit
-
 CLIENT = Peer(b"client", "its key")
 PROVIDES = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 NEEDS = {"recognizer": ["phone_input"], "synthesizer": []}

@@ -13,8 +13,6 @@ from kouxing.shared.face.shapes import ARKIT, OCULUS, SHAPE_SETS, VRM, ShapeSet
 from tests import heads
 from tests.heads import neutral_faps
 
-pytestmark = pytest.mark.unit
-
 
 def weights_by_name(faps: np.ndarray, shapes: ShapeSet = ARKIT) -> dict[str, float]:
     return dict(zip(shapes.names, shapes.weights(faps).tolist(), strict=True))

@@ -12,8 +12,6 @@ import pytest
 from kouxing.shared.errors import UserError
 from kouxing.shared.sound_devices import monitor, sound_devices
 
-pytestmark = pytest.mark.unit
-
 SOURCES = [
     {"name": "mic0", "description": "A microphone", "properties": {"device.class": "sound"}},
     {"name": "hdmi.monitor", "description": "HDMI", "properties": {"device.class": "monitor"}},

@@ -11,7 +11,6 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.known_text import characters_of, place_in_text
 from kouxing.shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
 
-pytestmark = pytest.mark.unit
 MANDARIN = load_inventory("mandarin")
 
 
