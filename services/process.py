@@ -38,7 +38,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     returns 1.
     """
     from kouxing.shared.connections import raise_file_limit
-    from kouxing.shared.errors import UserError
+    from kouxing.shared.errors import UserError, with_name
     from kouxing.shared.logs import LOG, configure
     from kouxing.shared.metrics import keep_one_arena
 
@@ -48,7 +48,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     try:
         service = make_service()
     except UserError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(with_name(name, str(error)), file=sys.stderr)
         return 2
     try:
         service.run()
@@ -62,7 +62,7 @@ def run_module(name: str) -> None:
     """Run one service, as ``python -m kouxing.services.<name>`` does."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.kinds import KINDS
-    from kouxing.shared.errors import UserError
+    from kouxing.shared.errors import UserError, with_name
 
     parser = argparse.ArgumentParser(
         prog=f"python -m kouxing.services.{name}", description=KINDS[name].summary
@@ -75,6 +75,6 @@ def run_module(name: str) -> None:
     try:
         status = serve(name, arguments.config, arguments.set)
     except UserError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(with_name(name, str(error)), file=sys.stderr)
         status = 2
     sys.exit(status)

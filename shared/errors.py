@@ -16,3 +16,8 @@ def install_command(package: str) -> str:
     if importlib.util.find_spec("pip") is None:  # an environment of uv
         return f"uv pip install --python {sys.executable} '{package}'"
     return f"{sys.executable} -m pip install '{package}'"
+
+
+def with_name(name: str, text: str) -> str:
+    """Return a message that starts with the name of its service, once."""
+    return text if text.startswith((f"{name}:", f"{name}.")) else f"{name}: {text}"

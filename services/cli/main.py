@@ -10,7 +10,7 @@ from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperGroup, TyperOption
 
 from kouxing.services.cli import clients, cluster, configuration, offline, run
 from kouxing.services.cli.heads import app as head_app
@@ -23,6 +23,17 @@ from kouxing.shared.terminal import CONSOLE
 
 SERVICES = "A single service (run starts all of them)"
 ENTRY_POINTS = "kouxing.commands"  # such as those of training and evaluation
+_VALUE_NAMES = {
+    "<bool>": "",
+    "<str>": "TEXT",
+    "<list[str]>": "TEXT",
+    "<path>": "PATH",
+    "<list[Path]>": "PATH",
+    "<int>": "NUMBER",
+    "<float>": "NUMBER",
+    "<int range>": "NUMBER",
+    "<float range>": "NUMBER",
+}
 
 
 class CommandGroup(TyperGroup):
@@ -40,7 +51,10 @@ class CommandGroup(TyperGroup):
         """Return a command, or None."""
         if cmd_name not in self.commands:
             self._add_entry_points()
-        return super().get_command(ctx, cmd_name)
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            _name_values(command, ctx)
+        return command
 
     def _add_entry_points(self) -> None:
         for entry_point in entry_points(group=ENTRY_POINTS):
@@ -48,6 +62,15 @@ class CommandGroup(TyperGroup):
                 command = typer.main.get_command(entry_point.load())
                 command.name = entry_point.name
                 self.add_command(command)
+
+
+def _name_values(command: Any, ctx: Any) -> None:
+    """Show TEXT or PATH in the help of options instead of Python's types, and nothing for flags."""
+    for parameter in command.get_params(ctx):
+        if isinstance(parameter, TyperOption) and parameter.metavar is None:
+            parameter.metavar = _VALUE_NAMES.get(parameter.display_type(ctx))
+    for subcommand in getattr(command, "commands", {}).values():
+        _name_values(subcommand, ctx)
 
 
 app = typer.Typer(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource
 
 BOUND_CONTROL = variable("control", "control")
+_SAMPLE_SESSION = "demo"
 
 
 def run(
@@ -56,7 +57,6 @@ def run(
 ) -> None:
     """Run all services on this machine, and restart any that crashes or hangs."""
     from kouxing.services.cli.supervisor import Supervisor
-    from kouxing.shared.audio_file import open_audio
 
     given = parse_assignments(assignments or [])
     if port is not None:
@@ -64,10 +64,10 @@ def run(
     settings = read_settings(config, given)
     for kind in KINDS.values():
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
-    sample = None if play is None else open_audio(play)
     driver = settings.load(DriverConfig)
-    arguments = ["--config", str(config)] if config else []
     out = Path(driver.out)
+    sample = None if play is None else _open_sample(play, out / f"{_SAMPLE_SESSION}.mp4")
+    arguments = ["--config", str(config)] if config else []
     addresses = available_addresses(settings)
     control_config = settings.load(ControlConfig)
     bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
@@ -169,10 +169,21 @@ def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str
         yield f"your kouxing commands use this one; for other programs, KOUXING_CONTROL={control}"
 
 
+def _open_sample(path: Path, video: Path) -> AudioSource:
+    """Open the file to play, and remove the video of the last one."""
+    from kouxing.shared.audio_file import open_audio
+
+    if video.exists() and video.samefile(path):
+        raise UserError(f"{path}: the video would overwrite this file; rename it first")
+    sample = open_audio(path)
+    video.unlink(missing_ok=True)
+    return sample
+
+
 def _play_sample(sample: AudioSource, control: str) -> None:
     from kouxing.services.cli.streaming import stream
 
-    summary = stream(sample, control, CONSOLE, session="demo", record=True)
+    summary = stream(sample, control, CONSOLE, session=_SAMPLE_SESSION, record=True)
     print_message(f"spoke {sample.name}: {summary.num_phones} phones in {summary.duration_s:.1f} s")
     if not summary.video:
         raise UserError("no video was written; see the messages above")

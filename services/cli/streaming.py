@@ -143,7 +143,9 @@ class _Streaming:
                     due_s += len(block) / source.sample_rate_hz * (PIPE_CLOCK if is_pipe else 1.0)
                     time.sleep(max(0.0, due_s - time.monotonic()))
         except KeyboardInterrupt:
-            self._console.print("stopping")
+            if not source.is_live:
+                raise
+            self._console.print("stopping; press Ctrl-C again to drop the last words")
         self._duration_s = num_sent / source.sample_rate_hz
         self._clipped = num_clipping / max(1, num_sent * source.num_channels)
 

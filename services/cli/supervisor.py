@@ -20,8 +20,9 @@ from rich.console import Console
 from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
 from kouxing.services.kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.control_client import connect
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
+from kouxing.shared.terminal import check_output
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
 STEADY_S = 30.0  # a service that has run for longer restarts without delay
@@ -62,7 +63,14 @@ class Supervisor:
         self._stopping = threading.Event()
         self._process_ended = threading.Event()
         self._failure: UserError | None = None
-        log_folder.mkdir(parents=True, exist_ok=True)
+        try:
+            log_folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"{log_folder}: cannot be written: {error.strerror}; start kouxing in a folder that"
+                " you can write to, or add --set driver.out=FOLDER"
+            ) from None
+        check_output(*(self._log_file(name) for name in self._names))
 
     def start(self) -> None:
         """Start every service."""
@@ -193,13 +201,16 @@ class Supervisor:
         process.wait()
         self._process_ended.set()
 
+    def _log_file(self, name: str) -> Path:
+        return self._log_folder / f"{name}.log"
+
     def _copy_log(self, name: str, stream: IO[bytes]) -> None:
-        with stream, (self._log_folder / f"{name}.log").open("ab") as log:
+        with stream, self._log_file(name).open("ab") as log:
             for line in stream:
                 log.write(line)
                 log.flush()
                 if text := _console_text(line):
-                    self._console.print(f"{name}: {text}", markup=False, highlight=False)
+                    self._console.print(with_name(name, text), markup=False, highlight=False)
 
     def _warn(self, text: str) -> None:
         self._console.print(f"[yellow]{text}")

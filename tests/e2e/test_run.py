@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -66,6 +67,19 @@ def test_runs_on_free_ports_until_it_is_interrupted(tmp_path: Path) -> None:
         _, rest = running.communicate(timeout=60)
     assert running.returncode == 0, rest
     assert "Traceback" not in rest
+
+
+def test_reports_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    environment = own_environment(tmp_path) | {"KOUXING_DRIVER_OUT": str(tmp_path / "out")}
+    (tmp_path / "out/logs/recognizer.log").mkdir(parents=True)
+    result = kouxing("run", environment=environment)
+    assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
+    assert "recognizer.log: cannot be written" in result.stderr
+    shutil.rmtree(tmp_path / "out")
+    (tmp_path / "out").touch()
+    result = kouxing("run", environment=environment)
+    assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
+    assert "start kouxing in a folder that you can write to" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from importlib.metadata import EntryPoint, version
@@ -54,6 +55,13 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
     result = CliRunner().invoke(command_line.app, ["--version"])
     assert result.output == f"kouxing {version('kouxing')}\n"
     assert added == []
+
+
+def test_help_names_values_instead_of_python_types() -> None:
+    for command in ("render", "speak", "run", "phones"):
+        text = CliRunner().invoke(command_line.app, [command, "-h"]).output
+        assert "PATH" in text
+        assert not re.search("<bool>|<str>|<float|<int|list", text.split("Options", 1)[1])
 
 
 @pytest.mark.parametrize("command", [[], ["speak"], ["head", "export"], ["wave"]])
