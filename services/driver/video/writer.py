@@ -20,6 +20,7 @@ import contextlib
 import errno
 import re
 import secrets
+import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -164,6 +165,7 @@ class VideoWriter:
         self._sample_rate_hz = sample_rate_hz
         # Another process may be writing a video of the same name.
         self._unfinished = self._path.with_name(f".{self._path.name}.{secrets.token_hex(4)}.part")
+        self._delete_unfinished = weakref.finalize(self, self._unfinished.unlink, missing_ok=True)
         self._num_images = self._num_samples = 0
         try:
             if self._path.is_dir():
@@ -247,14 +249,14 @@ class VideoWriter:
             path = self._path if self._overwrite else _reserve(self._path)
             return self._unfinished.replace(path)
         except OSError as error:
-            self._unfinished.unlink(missing_ok=True)
+            self._delete_unfinished()
             raise _unwritable(self._path, error) from error
 
     def discard(self) -> None:
         """Delete the unfinished file."""
         with contextlib.suppress(OSError):
             self._container.close()
-        self._unfinished.unlink(missing_ok=True)
+        self._delete_unfinished()
 
 
 class PictureSequence:
