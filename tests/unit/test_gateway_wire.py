@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 
 import pytest
 
@@ -16,16 +15,8 @@ from kouxing.shared.wire.face import FaceSettings
 LONG_PROFILE = "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)
 
 
-def test_binary_messages_have_an_aligned_header() -> None:
-    message = wire.binary(wire.FAP_TYPE, 7, 2**40 + 1, b"payload!")
-
-    assert struct.unpack_from("<B3xId", message) == (1, 7, 2**40 + 1)
-    assert message[16:] == b"payload!"
-
-
 def test_hello_describes_the_audio() -> None:
     hello = wire.parse_hello('{"sample_rate_hz": 44100, "num_channels": 2, "encoding": "f32le"}')
-
     assert hello.pcm_format == PcmFormat(sample_rate_hz=44100, num_channels=2, encoding="f32le")
     assert hello.pcm_format.frame_bytes == 8
     assert hello.mouth_profile == b""
@@ -52,10 +43,8 @@ def test_rejects_a_bad_hello_and_names_the_field(fields: object, field: str) -> 
 
 
 def test_parses_microphone_commands() -> None:
-    flush, skip = wire.parse_command('{"flush": true}'), wire.parse_command('{"skip": 960}')
-
-    assert (flush.flush, flush.num_skipped, flush.lips) == (True, 0, "")
-    assert (skip.flush, skip.num_skipped, skip.lips) == (False, 960, "")
+    assert wire.parse_command('{"flush": true}').flush
+    assert wire.parse_command('{"skip": 960}').num_skipped == 960
     assert wire.parse_command('{"lips": "ferguson"}').lips == "ferguson"
 
 

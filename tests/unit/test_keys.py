@@ -158,19 +158,16 @@ def test_a_credential_takes_precedence(tmp_path: Path, monkeypatch: pytest.Monke
 def test_rejects_too_many_keys_but_revokes_them(
     tmp_path: Path, roles: list[str], number: int
 ) -> None:
-    lines = [f"{n:040} name-{n:055} {' '.join(roles)}\n" for n in range(number + 20)]
     add_key("first", ("client",), tmp_path / "first.key")
     allowed = key_folder() / "allowed"
-    with allowed.open("a", encoding="ascii") as file:
-        file.writelines(lines[:number])
-    keys = {
-        public: AllowedKey(name=grant.name, roles=list(grant.roles))
-        for public, grant in read_grants().items()
-    }
+    text = allowed.read_text(encoding="ascii")
+    lines = [f"{n:040} name-{n:055} {' '.join(roles)}\n" for n in range(number + 20)]
+    allowed.write_text(text + "".join(lines[:number]), encoding="ascii")
+    grants = read_grants().items()
+    keys = {public: AllowedKey(name=one.name, roles=list(one.roles)) for public, one in grants}
     reply = HeartbeatReply(sent_ns=0, received_ns=0, replied_ns=0, control="control-1", keys=keys)
     assert sum(map(len, encode(reply))) < MAX_MESSAGE_BYTES
-    with allowed.open("a", encoding="ascii") as file:
-        file.writelines(lines[number:])
+    allowed.write_text(text + "".join(lines), encoding="ascii")
     with pytest.raises(UserError, match=f"{allowed}: .*revoke some with 'kouxing keys revoke'"):
         read_grants()
     with pytest.raises(UserError, match="revoke some with 'kouxing keys revoke'"):

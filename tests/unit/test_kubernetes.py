@@ -35,25 +35,13 @@ def container(name: str) -> Any:
     return only
 
 
-def settings(name: str) -> Settings:
-    """Return the settings in a container's environment."""
-    variables = dict(OBJECTS["ConfigMap", "kouxing"]["data"])
-    variables |= {item["name"]: item.get("value", "") for item in container(name)["env"]}
-    types = {kind.name: kind.config_type for kind in KINDS.values()}
-    return Settings(types, environment=variables)
-
-
 def ports(name: str) -> dict[str, int]:
     return {port["name"]: port["containerPort"] for port in container(name)["ports"]}
 
 
-@pytest.mark.parametrize("key", OBJECTS, ids="-".join)
-def test_an_object_is_valid(key: tuple[str, str]) -> None:
-    newest = kubernetes_validate.latest_version()
-    kubernetes_validate.validate(OBJECTS[key], newest, strict=True)
-
-
-def test_all_services_except_the_driver_run() -> None:
+def test_the_objects_are_valid_and_all_services_except_the_driver_run() -> None:
+    for item in OBJECTS.values():
+        kubernetes_validate.validate(item, kubernetes_validate.latest_version(), strict=True)
     assert WORKLOADS.keys() == KINDS.keys() - {"driver"}
     files = {path.name for path in FOLDER.glob("*.yaml")}
     assert files == {*KUSTOMIZATION["resources"], "kustomization.yaml", "prometheus-adapter.yaml"}
@@ -61,7 +49,10 @@ def test_all_services_except_the_driver_run() -> None:
 
 @per_service
 def test_the_settings_of_a_service_are_valid(name: str) -> None:
-    config = settings(name).load(KINDS[name].config_type)
+    variables = dict(OBJECTS["ConfigMap", "kouxing"]["data"])
+    variables |= {item["name"]: item.get("value", "") for item in container(name)["env"]}
+    types = {kind.name: kind.config_type for kind in KINDS.values()}
+    config = Settings(types, environment=variables).load(types[name])
     assert container(name)["args"] == [name]
     assert not config.insecure
     assert config.metrics_port == ports(name)["metrics"]
@@ -75,7 +66,7 @@ def test_the_settings_of_a_service_are_valid(name: str) -> None:
 
 
 @per_service
-def test_a_service_has_no_privileges(name: str) -> None:
+def test_a_service_has_no_privileges_and_only_its_own_key(name: str) -> None:
     pod = WORKLOADS[name]["spec"]["template"]["spec"]
     assert pod["securityContext"]["runAsNonRoot"]
     assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
@@ -88,11 +79,6 @@ def test_a_service_has_no_privileges(name: str) -> None:
     }
     user = f"USER {pod['securityContext']['runAsUser']}:{pod['securityContext']['runAsGroup']}\n"
     assert user in (ROOT / "deploy" / "Dockerfile").read_text("utf-8")
-
-
-@per_service
-def test_a_service_gets_only_its_own_key(name: str) -> None:
-    pod = WORKLOADS[name]["spec"]["template"]["spec"]
     volumes = {volume["name"]: volume for volume in pod["volumes"]}
     mounts = {mount["name"]: mount["mountPath"] for mount in container(name)["volumeMounts"]}
     assert mounts.keys() == volumes.keys()

@@ -47,19 +47,12 @@ def test_admits_as_many_sessions_as_the_measured_load_leaves_room_for(
     assert num_admitted(loaded(num_sessions, measured), 10.0) == admitted
 
 
-@pytest.mark.parametrize(("idle", "cost"), [((0.05,), 0.1), ((0.0, 0.3), 0.15)])
-def test_the_cost_excludes_the_lowest_load_without_sessions(
-    idle: tuple[float, ...], cost: float
-) -> None:
+def test_remembers_the_highest_cost_for_a_while_without_the_load_of_an_idle_worker() -> None:
     load = WorkerLoad()
-    for time_s, measured in enumerate(idle):
-        load.measure(measured, float(time_s))
+    load.measure(0.05, 0.0)
     load.add_session(2.0, paced=True)
     load.measure(0.15, 10.0)
-    assert load.cost == pytest.approx(cost)
-
-
-def test_remembers_the_highest_cost_for_a_while() -> None:
+    assert load.cost == pytest.approx(0.1)
     load = loaded(4, 0.4)
     load.measure(0.02, 12.0)
     assert load.expected(12.0) == pytest.approx(0.4, rel=0.05)

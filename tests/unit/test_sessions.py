@@ -86,20 +86,12 @@ def refused(code: str, text: str | None = None) -> Iterator[None]:
     assert caught.value.code == code
 
 
-# --- opening ---------------------------------------------------------------------------------
-
-
 def test_a_new_session_waits_for_its_workers_and_all_observers(system: System) -> None:
     system.add(observer("lamp-1"))
     record = system.open()
     assert record.name
     assert len(record.token) >= 32
-    assert record.workers == {
-        "audio": "recognizer-1",
-        "phones": "recognizer-1",
-        "phone_input": "synthesizer-1",
-        "faps": "synthesizer-1",
-    }
+    assert set(record.workers.values()) == {"recognizer-1", "synthesizer-1"}
     assert record.waiting_for == {"recognizer-1", "synthesizer-1", "lamp-1"}
     system.add(observer("lamp-2"))
     assert system.sessions.participants(record) >= {"lamp-1", "lamp-2"}
@@ -192,9 +184,6 @@ def test_audio_that_is_not_paced_has_its_own_socket(system: System) -> None:
     assert record.moved_message().audio == f"tcp://{record.workers['audio']}:unpaced"
 
 
-# --- the face --------------------------------------------------------------------------------
-
-
 def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
     record = system.open(face=FaceSettings(shapes=["vrm", "vrm"]))
     assert record.start_message(0.0).face.lip_model == "dynamic-visemes", (
@@ -212,9 +201,6 @@ def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
     assert system.sessions.move(record, 12.0)
     start = record.start_message(12.0)
     assert (start.facts.delay_ms, start.face.lip_model) == (40.0, "learnt")
-
-
-# --- moves -----------------------------------------------------------------------------------
 
 
 def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(system: System) -> None:
@@ -262,9 +248,6 @@ def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
     assert record.start_message(1.0).media_time == max(32_000, reported)
     assert system.sessions.record_started(record, last, 0) == set()
     assert record.waiting_for == set()
-
-
-# --- lost workers ----------------------------------------------------------------------------
 
 
 def test_a_worker_wrongly_declared_lost_keeps_its_sessions(system: System) -> None:
