@@ -18,7 +18,7 @@ HeadName = Annotated[
     str,
     typer.Option(
         "--head",
-        help=f"{', '.join(HEAD_NAMES)}, an .npz file, or a .glb file with morph targets.",
+        help=f"{', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz).",
     ),
 ]
 MouthFile = Annotated[

@@ -38,7 +38,7 @@ class DriverConfig(FaceConfig):
     out: str = "out"
     """Folder for recorded videos."""
     head: str = "woman"
-    """Name of a built-in head, an imported .npz file, or a .glb file with morph targets."""
+    """Name of a built-in head, or an avatar (.glb, .gltf, .vrm, or an imported .npz)."""
     background: str = "studio"
     """Background: studio, #rrggbb, or a color name."""
     camera: Framing = Framing.FACE

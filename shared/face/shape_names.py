@@ -1,8 +1,22 @@
-"""Names of the blendshape sets, as used by users and messages."""
+"""Names of the blendshape sets, and the names that avatars give to their shapes.
+
+``shape_names.txt`` is the only table of names. The JavaScript client, Blender, Unity and Godot
+contain the same table. Each line or continuation belongs to a set. An entry is a shape and its
+other names, ``shape=OTHER=PART+PART``; a sum of parts also forms the shape. An avatar can speak if
+it has all shapes with ``*`` of a set. ARKit's shapes without other names are not listed.
+
+Names match in any case, after any prefix, and with ``_L``, ``.L`` or ``Left`` at the end. A name of
+one letter matches only without a prefix or after ``.``, ``:``, ``|`` or ``/``.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
+from pathlib import Path
+
+from kouxing.shared.errors import UserError
 
 MAX_SHAPES = 256  # per set
 
@@ -13,3 +27,94 @@ class ShapeSetName(StrEnum):
     ARKIT = "arkit"  # ARKit's 52 blend shapes
     OCULUS = "oculus"  # Oculus' 15 visemes
     VRM = "vrm"  # VRM 1's expressions
+
+
+TABLE = Path(__file__).with_name("shape_names.txt").read_text(encoding="utf-8")
+_TITLES = {"arkit": "ARKit", "oculus": "Oculus", "vrm": "VRM"}
+_SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL")
+_SIDES = {"L": "Left", "R": "Right"}
+
+
+def find_shapes(set_name: str, names: Iterable[str], listed: Iterable[str] = ()) -> dict[str, str]:
+    """Return the shapes of the recognized names of a mesh, by name.
+
+    ``listed`` are shapes of the set that the table need not contain. If a mesh has a shape under
+    several names, only the first name of the table counts.
+    """
+    entries = {shape: [[_key(shape)]] for shape in listed} | _TABLE[set_name]
+    keys = {key for choices in entries.values() for parts in choices for key in parts}
+    by_key: dict[str, str] = {}
+    for name in names:
+        key = next((key for key in _candidates(name) if key in keys), "")
+        by_key.setdefault(key, name)
+    shape_of = {}
+    for shape, choices in entries.items():
+        parts = next((parts for parts in choices if not by_key.keys().isdisjoint(parts)), [])
+        shape_of |= {by_key[key]: shape for key in parts if key in by_key}
+    return shape_of
+
+
+def choose_set(names: Iterable[str]) -> ShapeSetName:
+    """Return the first set whose necessary shapes an avatar has.
+
+    Raises ``UserError`` if the avatar cannot speak; the text names what the nearest set lacks.
+    """
+    names = list(names)
+    missing = {}
+    for set_name, needed in _NEEDED.items():
+        found = find_shapes(set_name, names).values()
+        missing[set_name] = [shape for shape in needed if shape not in found]
+        if not missing[set_name]:
+            return ShapeSetName(set_name)
+    nearest = min(missing, key=lambda name: len(missing[name]) / len(_NEEDED[name]))
+    raise UserError(
+        f"the avatar cannot speak: it has no shape {', '.join(missing[nearest])} of"
+        f" {_TITLES[nearest]}; use an avatar with the shapes of ARKit, Oculus or VRM"
+    )
+
+
+def _key(name: str) -> str:
+    return _SEPARATOR.sub("", name).lower()
+
+
+def _sided(name: str) -> str:
+    """Write the side at the end as a word."""
+    name = re.sub(r"_div\d$", "", name)  # of Daz
+    return re.sub(
+        r"(?:[._\- ]([LRlr])|(?<=[a-z])([LR]))$",
+        lambda match: _SIDES[(match[1] or match[2]).upper()],
+        name,
+    )
+
+
+def _candidates(name: str) -> Iterator[str]:
+    """Yield the keys of a name without none, one, two, ... words at its beginning."""
+    name = _sided(name)
+    yield _key(name)
+    for separator in _SEPARATOR.finditer(name):
+        key = _key(name[separator.end() :])
+        if len(key) > 1 or separator[0] in ".:|/":
+            yield key
+
+
+def _read_table() -> tuple[dict[str, dict[str, list[list[str]]]], dict[str, list[str]]]:
+    """Return the names of each set's shapes, as keys, and the shapes that an avatar needs."""
+    table: dict[str, dict[str, list[list[str]]]] = {}
+    needed: dict[str, list[str]] = {}
+    set_name = ""
+    for line in TABLE.splitlines():
+        words = line.split()
+        if not line.startswith(" "):
+            set_name = words.pop(0)
+            table[set_name], needed[set_name] = {}, []
+        for word in words:
+            choices = word.lstrip("*").split("=")
+            table[set_name][choices[0]] = [
+                [_key(_sided(part)) for part in choice.split("+")] for choice in choices
+            ]
+            if word.startswith("*"):
+                needed[set_name].append(choices[0])
+    return table, needed
+
+
+_TABLE, _NEEDED = _read_table()

@@ -1,4 +1,4 @@
-"""Reads binary glTF (GLB) files from untrusted sources: every size is checked before use.
+"""Reads glTF files (.glb, .gltf, .vrm) from untrusted sources: every size is checked before use.
 
 Khronos glTF 2.0, sections 3.6 (accessors), 3.7 (geometry, skins, morph targets) and 4.4 (GLB).
 pygltflib is not used because it does not check sizes and decodes neither accessors nor nodes.
@@ -10,6 +10,9 @@ import base64
 import binascii
 import json
 import struct
+import urllib.parse
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +27,11 @@ MAX_COUNT = 2_000_000  # elements of an accessor
 MAX_NODES = 20_000
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_SUPPORTED = {  # required extensions whose data is plain glTF, or that affect only the look
-    "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform", "EXT_texture_webp",
-    "KHR_materials_specular", "KHR_materials_emissive_strength", "VRM", "VRMC_vrm",
+_MESHOPT, _DRACO = "EXT_meshopt_compression", "KHR_draco_mesh_compression"
+_SUPPORTED = {
+    _MESHOPT, _DRACO, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp",
 }  # fmt: skip
+_LOOKS = ("KHR_materials_", "VRM")  # extensions whose data is plain glTF
 
 Float64 = NDArray[np.float64]
 
@@ -40,43 +44,80 @@ def _reject_constant(word: str) -> float:
     raise ValueError(f"{word} is not valid JSON")
 
 
-class Glb:
-    """The two chunks of a file.
+def _chunks(data: bytes) -> dict[bytes, bytes]:
+    """Return the chunks of a GLB by their kind."""
+    if len(data) < 20 or data[:4] != b"glTF":
+        raise BadGlbError("it is not a binary glTF file")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2 or length > len(data):
+        raise BadGlbError(f"its header says version {version} and {length} of {len(data)} bytes")
+    chunks: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", data, at)
+        if at + 8 + size > length:
+            raise BadGlbError("a chunk is cut off")
+        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    return chunks
 
-    Raises ``UserError`` if the file cannot be read, and ``BadGlbError`` if it is not a valid GLB or
-    requires an unsupported extension.
+
+class Glb:
+    """A file with its buffers.
+
+    Raises ``UserError`` if the file cannot be read, and ``BadGlbError`` if it is not a valid glTF
+    or requires an unsupported extension.
     """
 
     def __init__(self, path: Path) -> None:
+        self._folder = path.parent
+        self._num_bytes = 0
+        text = data = self._read(path)
+        self._binary = b""
+        if path.suffix.lower() != ".gltf":
+            chunks = _chunks(data)
+            text, self._binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
         try:
-            if path.stat().st_size > MAX_BYTES:
-                raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB")
-            data = path.read_bytes()
-        except OSError as error:
-            raise UserError(f"cannot read {path}: {error.strerror}") from error
-        if len(data) < 20 or data[:4] != b"glTF":
-            raise BadGlbError("it is not a binary glTF file")
-        version, length = struct.unpack_from("<II", data, 4)
-        if version != 2 or length > len(data):
-            raise BadGlbError(
-                f"its header says version {version} and {length} of {len(data)} bytes"
-            )
-        chunks: dict[bytes, bytes] = {}
-        at = 12
-        while at + 8 <= length:
-            size, kind = struct.unpack_from("<I4s", data, at)
-            if at + 8 + size > length:
-                raise BadGlbError("a chunk is cut off")
-            chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-            at += 8 + size
-        try:
-            self.json: dict[str, Any] = json.loads(chunks[b"JSON"], parse_constant=_reject_constant)
-            missing = set(self.json.get("extensionsRequired", ())) - _SUPPORTED
-        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            self.json: dict[str, Any] = json.loads(text, parse_constant=_reject_constant)
+            needed = set(self.json.get("extensionsRequired", ()))
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise BadGlbError("its glTF description is damaged") from error
-        if missing:
-            raise BadGlbError(f"it needs {', '.join(sorted(missing))}; save it uncompressed")
-        self._binary = chunks.get(b"BIN\0", b"")
+        unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOKS)}
+        if unknown:
+            names = ", ".join(sorted(unknown))
+            raise BadGlbError(f"it needs {names}, which kouxing cannot read; export it without")
+        self._buffer = cache(self._load_buffer)
+        self._decompressed = cache(self._decompress)
+
+    def _allow(self, num_bytes: int) -> None:
+        self._num_bytes += num_bytes
+        if self._num_bytes > MAX_BYTES:
+            raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB")
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            self._allow(path.stat().st_size)
+            return path.read_bytes()
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise UserError(f"cannot read {path}: {reason}") from error
+
+    def _uri(self, uri: str) -> bytes:
+        """Return the data of a URI: base64, or a file in the folder of this file or below."""
+        prefix, _, encoded = uri.partition(",")
+        if prefix.startswith("data:"):
+            try:
+                return base64.b64decode(encoded) if prefix.endswith(";base64") else b""
+            except binascii.Error:
+                return b""
+        path = Path(urllib.parse.unquote(uri))
+        if path.is_absolute() or ".." in path.parts or ":" in uri or "\\" in uri:
+            raise BadGlbError(f"it refers to {uri!r}, which is not in its folder")
+        return self._read(self._folder / path)
+
+    def _load_buffer(self, index: int) -> bytes:
+        uri = self.item("buffers", index).get("uri")
+        return self._uri(str(uri)) if uri is not None else self._binary if index == 0 else b""
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
         """Return an item of one of the lists in the description."""
@@ -89,10 +130,40 @@ class Glb:
     def view(self, index: object) -> bytes:
         """Return the bytes of a buffer view."""
         view = self.item("bufferViews", index)
+        is_compressed = _MESHOPT in view.get("extensions", {})
+        return self._decompressed(index) if is_compressed else self._slice(view)
+
+    def _decompress(self, index: object) -> bytes:
+        from kouxing.services.driver.head.meshopt import decode_view  # noqa: PLC0415 - slow
+
+        compressed = self.item("bufferViews", index)["extensions"][_MESHOPT]
+        self._allow(int(compressed["count"]) * int(compressed["byteStride"]))
+        return decode_view(self._slice(compressed), compressed)
+
+    def _slice(self, view: dict[str, Any]) -> bytes:
         start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
-        if view.get("buffer", 0) != 0 or start < 0 or size < 0 or start + size > len(self._binary):
+        buffer = self._buffer(int(view.get("buffer", 0)))
+        if start < 0 or size < 0 or start + size > len(buffer):
             raise BadGlbError("a buffer view is outside the file")
-        return self._binary[start : start + size]
+        return buffer[start : start + size]
+
+    def attributes(self, primitive: dict[str, Any], names: Iterable[str]) -> dict[str, Float64]:
+        """Return some attributes (V, components) of a primitive, and its "indices" (N, 1)."""
+        accessors = {k: v for k, v in primitive["attributes"].items() if k in names}
+        if "indices" in primitive:
+            accessors["indices"] = primitive["indices"]
+        decoded = {}
+        if _DRACO in primitive.get("extensions", {}):
+            compressed = primitive["extensions"][_DRACO]
+            mesh = _decode_draco(self.view(compressed["bufferView"]))
+            decoded["indices"] = np.asarray(mesh.faces, np.float64).reshape(-1, 1)
+            for name in accessors.keys() & compressed["attributes"].keys():
+                item = self.item("accessors", accessors[name])
+                data = mesh.get_attribute_by_unique_id(compressed["attributes"][name])["data"]
+                decoded[name] = _to_float(data.astype(_TYPES[item["componentType"]]), item)
+        return {
+            name: self.accessor(index) for name, index in accessors.items() if name not in decoded
+        } | decoded
 
     def accessor(self, index: object) -> Float64:
         """Return an accessor's values (N, components); normalized values are -1 to 1."""
@@ -122,12 +193,7 @@ class Glb:
             values[rows[:, 0]] = self._strided(
                 what["bufferView"], int(what.get("byteOffset", 0)), (size, width), kind
             )
-        out = values.astype(np.float64)
-        if item.get("normalized"):
-            out = np.maximum(out / np.iinfo(kind).max, -1.0)
-        if not np.isfinite(out).all():
-            raise BadGlbError("a number is not finite")
-        return out
+        return _to_float(values, item)
 
     def image(self, texture: object) -> bytes:
         """Return the encoded image of a texture, or nothing if it is not in the file."""
@@ -138,13 +204,7 @@ class Glb:
         image = self.item("images", source)
         if "bufferView" in image:
             return self.view(image["bufferView"])
-        prefix, _, encoded = str(image.get("uri", "")).partition(";base64,")
-        if not prefix.startswith("data:"):
-            return b""
-        try:
-            return base64.b64decode(encoded)
-        except binascii.Error:
-            return b""
+        return self._uri(str(image["uri"])) if "uri" in image else b""
 
     def nodes(self) -> list[tuple[int, Float64]]:
         """Return the nodes of the scene with their world matrices (4, 4), parents first."""
@@ -175,6 +235,25 @@ class Glb:
         ):
             raise BadGlbError("an accessor is larger than its buffer view")
         return np.ndarray(shape, kind, data, start, (stride, kind.itemsize))
+
+
+def _decode_draco(data: bytes) -> Any:
+    import DracoPy  # noqa: PLC0415 - few files need it
+
+    try:
+        return DracoPy.decode(data)
+    except Exception as error:  # of its own classes
+        raise BadGlbError("its Draco data is damaged") from error
+
+
+def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Float64:
+    """Return numbers of an accessor; normalized ones are -1 to 1."""
+    out = values.astype(np.float64)
+    if accessor.get("normalized") and values.dtype.kind in "iu":
+        out = np.maximum(out / np.iinfo(values.dtype).max, -1.0)
+    if not np.isfinite(out).all():
+        raise BadGlbError("a number is not finite")
+    return out
 
 
 def _local_matrix(node: dict[str, Any]) -> Float64:

@@ -1,7 +1,8 @@
-"""A user's GLB as a head: its morph targets become the linear basis of FAPs.
+"""A user's GLB or VRM as a head: its shapes become the linear basis of FAPs.
 
-Targets are recognized by name: FAPs, ARKit's blendshapes, or Oculus' visemes (plus ARKit's shapes
-outside the mouth). For ARKit and Oculus, a FAP frame ``f`` is expressed by the shapes whose FAPs
+Shapes are recognized by name (``shared.face.shape_names``): FAPs, ARKit's blendshapes, Oculus'
+visemes, or VRM's vowels; the last two also with ARKit's or VRM's shapes outside the mouth. A FAP
+frame ``f`` is expressed by the shapes whose FAPs
 ``A`` are closest,
 
     w(f) = argmin |D (A^T w - f)|^2 + r^2 |w|^2 = (A D^2 A^T + r^2 I)^-1 A D^2 f
@@ -26,12 +27,14 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
-from kouxing.services.driver.head.glb_pieces import plain, read_pieces
+from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
 from kouxing.services.driver.head.head import Head, assemble
+from kouxing.services.driver.head.morphs import units_per_weight
 from kouxing.services.driver.head.pieces import Fields, Piece, pack, part_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.shapes import ARKIT, OCULUS
+from kouxing.shared.face.shape_names import choose_set, find_shapes
+from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
 
 EYE_DISTANCE_M = 0.055  # heads are scaled to this
 FAPU_SHARES = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
@@ -43,14 +46,18 @@ _EYE_RADIUS_M = 0.012
 _RIDGE_M = 0.001
 _TRAVEL_M = 0.01  # typical displacement of a feature point by a strong FAP
 _FADE = (-2.1, -3.2)  # heights relative to the eyes where the neck stops following the head
-_MIN_ARKIT, _MIN_OCULUS, _MIN_FAPS = 12, 8, 12
+_MIN_FAPS = 12
+_MAX_FACES_APART = 2.0  # distance of the parts of one face, in sizes of a part
+_STEEPER = 1.5  # how much farther the mouth is below the eyes along an axis that replaces y
 
-_FAP_NAMES = {plain(fap.name): fap for fap in FAPS[2:]}
-Names = dict[str, Float64]  # shape name as in a file: FAPs (68,) at weight 1
+_FAP_BY_NAME = {fap.name: fap for fap in FAPS[2:]}
+_NOT_MOUTH = re.compile("eye|brow|cheek|nose|blink|look")
+_SETS = {"arkit": ARKIT, "oculus": OCULUS, "vrm": VRM}
+Names = dict[str, Float64]  # shape: FAPs (68,) at weight 1
 
 
 def read_glb(path: Path) -> Head:
-    """Read a GLB whose morph targets are FAPs, ARKit shapes or Oculus visemes.
+    """Read a GLB or VRM whose shapes are FAPs, or ARKit's, Oculus' or VRM's.
 
     Raises ``UserError`` if the file is not such a GLB; the text says what is missing.
     """
@@ -58,55 +65,49 @@ def read_glb(path: Path) -> Head:
         glb = Glb(path)
         with np.errstate(invalid="ignore", over="ignore"):  # the results are checked
             pieces = read_pieces(glb)
-            names = sorted({name for piece in pieces for name in piece.shapes})
-            known = recognize(names)
-            return _head(path.stem, glb, pieces, known)
+            return _head(path.stem, glb, pieces, _recognize(pieces))
     except BadGlbError as error:
         raise UserError(f"{path}: {error}") from error
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as error:
         raise UserError(f"{path} is damaged or is not a GLB file ({error!r})") from error
 
 
-def recognize(names: list[str]) -> Names:
-    """Return the FAPs (68,) at weight 1 of each recognized target name, as ``plain`` returns it.
+def _recognize(pieces: list[Piece]) -> Names:
+    """Keep the known shapes of the pieces under their standard names; return their FAPs.
 
-    Raises ``BadGlbError`` if too few names are recognized.
+    Raises ``BadGlbError`` if the shapes cannot express speech.
     """
-    faps: Names = {name: np.zeros(NUM_FAPS) for name in _FAP_NAMES}
-    for name, fap in _FAP_NAMES.items():
-        angle = fap.fapu == "AU"
-        faps[name][fap.number - 1] = 1 / RADIANS_PER_ANGLE_UNIT if angle else FAP_UNITS_PER_FAPU
-    arkit, oculus = (
-        {
-            plain(name): row.astype(float)
-            for name, row in zip(shapes.names, shapes.basis, strict=True)
+    names = dict.fromkeys(
+        name for piece in pieces for name, shift in piece.shapes.items() if shift.any()
+    )
+    faps = {name: fap for name in names if (fap := re.split("[.:|]", name)[-1]) in _FAP_BY_NAME}
+    table: Names = {}
+    if len(faps) >= _MIN_FAPS:
+        for fap in _FAP_BY_NAME.values():
+            table[fap.name] = np.zeros(NUM_FAPS)
+            table[fap.name][fap.number - 1] = units_per_weight(fap.fapu)
+    else:
+        try:
+            set_name = choose_set(names)
+        except UserError as error:
+            raise BadGlbError(str(error)) from error
+        for kind, standard in _SETS.items():
+            for name, row in zip(standard.names, standard.basis, strict=True):
+                is_wanted = set_name != "arkit" and _NOT_MOUTH.match(name)
+                if row.any() and (kind == set_name or is_wanted):
+                    table[name] = row.astype(float)
+    for piece in pieces:
+        shape_of = faps or {
+            name: shape
+            for kind in {set_name: 0, **_SETS}
+            for name, shape in find_shapes(kind, piece.shapes, _SETS[kind].names).items()
         }
-        for shapes in (ARKIT, OCULUS)
-    )
-    oculus = {"viseme" + name: faps for name, faps in oculus.items() if faps.any()}
-    # Ready Player Me uses these names for vowels
-    oculus |= {
-        "viseme" + new: oculus["viseme" + old]
-        for new, old in (("i", "ih"), ("o", "oh"), ("u", "ou"))
-    }
-    still = {name: row for name, row in arkit.items() if not re.match("jaw|mouth|tongue", name)}
-    counts = []
-    for kind, minimum, table, rest in (
-        ("FAPs", _MIN_FAPS, faps, {}),
-        ("ARKit shapes", _MIN_ARKIT, arkit, {}),
-        ("Oculus visemes", _MIN_OCULUS, oculus, still),
-    ):
-        known = [name for name in names if name in table]
-        if len(known) >= minimum:
-            return {name: (table | rest)[name] for name in names if name in table or name in rest}
-        counts.append(f"{len(known)} of at least {minimum} {kind}")
-    seen = (
-        f" Its targets: {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}." if names else ""
-    )
-    raise BadGlbError(
-        f"too few of its morph targets have known names ({'; '.join(counts)}).{seen}"
-        " Name them as ARKit (jawOpen, mouthPucker, ...) or Oculus (viseme_aa, viseme_PP, ...) does"
-    )
+        shapes, piece.shapes = piece.shapes, {}
+        for name, shift in shapes.items():
+            if (shape := shape_of.get(name)) in table:
+                piece.shapes[shape] = piece.shapes.get(shape, 0.0) + shift
+    known = {name for piece in pieces for name in piece.shapes}
+    return {name: row for name, row in table.items() if name in known}
 
 
 # --- the head -------------------------------------------------------------------------------------
@@ -114,21 +115,20 @@ def recognize(names: list[str]) -> Names:
 
 def _head(name: str, glb: Glb, pieces: list[Piece], known: Names) -> Head:
     names = part_names(pieces)
+    _check_single_face(pieces, known)
+    eyes = _eyes(glb, pieces, names)
+    turn = _upright(eyes, _moved(pieces, [name for name in known if not _NOT_MOUTH.match(name)]))
     for piece in pieces:
-        piece.shapes = {name: shift for name, shift in piece.shapes.items() if name in known}
-    eyes = _eyes(pieces, names)
-    if eyes[0, 0] < eyes[1, 0]:  # it faces -z, like VRM 0
-        for piece in pieces:
-            piece.vertices *= [-1, 1, -1]
-            piece.shapes = {name: shift * [-1, 1, -1] for name, shift in piece.shapes.items()}
-        eyes *= [-1, 1, -1]
+        piece.vertices = piece.vertices @ turn.T
+        piece.shapes = {name: shift @ turn.T for name, shift in piece.shapes.items()}
+    eyes = eyes @ turn.T
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
         raise BadGlbError("both eyes, found by shapes or names, are at the same place")
     if eyes[0, 0] - eyes[1, 0] < 0.5 * unit:
         raise BadGlbError("its eyes are not side by side; y must be up and the face look along z")
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
-    pivot = _pivot(glb, middle, unit)
+    pivot = _pivot(glb, turn, middle, unit)
     world = np.concatenate([piece.vertices for piece in pieces])
     weight = _head_weight(pieces, (world[:, 1] - middle[1]) / unit)
     for piece in pieces:
@@ -160,8 +160,42 @@ def fade(height: Float64) -> Float64:
     return faded
 
 
-def _eyes(pieces: list[Piece], names: list[str]) -> Float64:
-    """Return the centers of the left and right eye (2, 3), from the eyeballs, lids or mouth."""
+def _check_single_face(pieces: list[Piece], known: Names) -> None:
+    """Raise ``BadGlbError`` if two meshes far from each other have a mouth."""
+    opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
+    places: list[Float64] = []
+    size = 0.0
+    for piece in pieces:
+        moved = np.linalg.norm(piece.shapes.get(opener, np.zeros((1, 3))), axis=1)
+        if moved.max() > 0:
+            shown = piece.vertices[moved > 0.1 * moved.max()]
+            places.append(shown.mean(axis=0))
+            size = max(size, float(np.linalg.norm(np.ptp(shown, axis=0))))
+    if places and np.linalg.norm(np.ptp(places, axis=0)) > _MAX_FACES_APART * size > 0:
+        raise BadGlbError("it has several faces; export only one avatar")
+
+
+def _upright(eyes: Float64, mouth: Float64 | None) -> Float64:
+    """Return the rotation by right angles (3, 3) after which y is up and the face looks along z."""
+    side = eyes[0] - eyes[1]
+    x = int(np.abs(side).argmax())
+    y = 1 if x != 1 else 2
+    sign = 1.0
+    if mouth is not None:
+        up = eyes.mean(axis=0) - mouth
+        other = 3 - x - y
+        if abs(up[other]) > _STEEPER * abs(up[y]):
+            y, sign = other, float(np.sign(up[other]))
+    turn = np.zeros((3, 3))
+    turn[0, x], turn[1, y] = np.sign(side[x]), sign
+    turn[2] = np.cross(turn[0], turn[1])
+    return turn
+
+
+def _eyes(glb: Glb, pieces: list[Piece], names: list[str]) -> Float64:
+    """Return the centers of the left and right eye (2, 3), from bones, eyeballs, lids or mouth."""
+    bones = {bone: number for number, bone in find_bones(glb).items()}
+    places = dict(glb.nodes())
     centers = []
     for side in ("left", "right"):
         balls = [
@@ -169,8 +203,10 @@ def _eyes(pieces: list[Piece], names: list[str]) -> Float64:
             for piece, name in zip(pieces, names, strict=True)
             if name.startswith(f"eye_{side}")
         ]
-        lids = _moved(pieces, [f"eyeblink{side}"])
-        if balls:
+        lids = _moved(pieces, [f"eyeBlink{side.title()}", f"blink{side.title()}"])
+        if bones.get(f"{side}Eye") in places:
+            centers.append(places[bones[f"{side}Eye"]][:3, 3])
+        elif balls:
             whole = np.concatenate(balls)
             centers.append((whole.min(axis=0) + whole.max(axis=0)) / 2)
         elif lids is not None:
@@ -184,6 +220,8 @@ def _eyes(pieces: list[Piece], names: list[str]) -> Float64:
     unit = width / _HEAD_WIDTH
     middle = (mouth if mouth is not None else skin.vertices.mean(axis=0)) - MOUTH * unit
     half = np.array([unit / 2, 0, 0])
+    if "VRM" in glb.json.get("extensions", {}):  # version 0 looks along -z
+        half = -half
     return np.stack([middle + half, middle - half])
 
 
@@ -198,13 +236,13 @@ def _moved(pieces: list[Piece], names: list[str]) -> Float64 | None:
     return place / total if total > 0 else None
 
 
-def _pivot(glb: Glb, middle: Float64, unit: float) -> Float64:
+def _pivot(glb: Glb, turn: Float64, middle: Float64, unit: float) -> Float64:
     """Return the position of the joint that the head rotates about."""
+    bones = find_bones(glb)
     for number, place in glb.nodes():
-        node = glb.item("nodes", number)
-        word = re.split(r"[.:|_ ]", str(node.get("name", "")).lower())[-1]
-        at = place[:3, 3]
-        if word == "head" and "mesh" not in node and np.linalg.norm(at - middle) < 4 * unit:
+        at = turn @ place[:3, 3]
+        is_joint = bones.get(number) == "head" and "mesh" not in glb.item("nodes", number)
+        if is_joint and np.linalg.norm(at - middle) < 4 * unit:
             return at
     return middle + PIVOT * unit
 
@@ -217,9 +255,9 @@ def _head_weight(pieces: list[Piece], height: Float64) -> Float64:
 
 def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:
     """Return each shape's weight per unit of every FAP (68,), by the module's equation."""
-    names = sorted(known)
+    names = sorted(known, key=str.lower)
     shapes = np.array([known[name] for name in names])
-    if names[0] in _FAP_NAMES:
+    if names[0] in _FAP_BY_NAME:
         return dict(zip(names, np.where(shapes > 0, 1 / np.maximum(shapes, 1), 0), strict=True))
     travel = _travel_m(gaze)
     matrix = shapes * travel

@@ -1,11 +1,17 @@
-"""Reads the meshes of a GLB as pieces in common axes, with morph targets and skeleton."""
+"""Reads the meshes of a GLB as pieces in common axes, with shapes and skeleton.
+
+The shapes of a mesh are its morph targets. In a VRM, an expression is also a shape: a weighted sum
+of morph targets of several meshes (``VRM`` of version 0, ``VRMC_vrm`` of version 1).
+"""
 
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
@@ -20,19 +26,12 @@ MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
 
 
-def plain(name: str) -> str:
-    """Reduce a target's name to its distinctive part: ``Face.mouthSmile_L`` is mouthsmileleft."""
-    word = re.split(r"[.:|]", name)[-1]
-    for short, side in (("l", "left"), ("r", "right")):
-        word = re.sub(rf"[_\- ]{short}$", side, word, flags=re.IGNORECASE)
-    return re.sub(r"[^a-z0-9]", "", word.lower())
-
-
 def read_pieces(glb: Glb) -> list[Piece]:
     """Return the triangles of the scene with everything that moves them."""
     nodes = glb.nodes()
     places = dict(nodes)
     turn_shares = _turn_shares(glb, places)
+    expressions = _expressions(glb)
     pieces: list[Piece] = []
     num_vertices = num_triangles = num_shifts = 0
     for number, place in nodes:
@@ -40,12 +39,13 @@ def read_pieces(glb: Glb) -> list[Piece]:
         if "mesh" not in node:
             continue
         mesh = glb.item("meshes", node["mesh"])
+        binds = expressions[f"node {number}"] + expressions[f"mesh {node['mesh']}"]
         for primitive in mesh["primitives"]:
-            if primitive.get("mode", 4) != 4:
+            if primitive.get("mode", 4) < 4:
                 continue  # points and lines
             count = int(glb.item("accessors", primitive["attributes"]["POSITION"])["count"])
             num_vertices += count
-            num_shifts += count * len(primitive.get("targets", []))
+            num_shifts += count * (len(primitive.get("targets", [])) + len(binds))
             for limit, count_so_far, what in (  # a small file may refer to the same data repeatedly
                 (MAX_VERTICES, num_vertices, "vertices; decimate it"),
                 (MAX_SHIFTS, num_shifts, "displacements; remove morph targets"),
@@ -54,7 +54,7 @@ def read_pieces(glb: Glb) -> list[Piece]:
             ):
                 if count_so_far > limit:
                     raise BadGlbError(f"it has more than {limit} {what}")
-            piece = _piece(glb, node, mesh, primitive, places, place, turn_shares)
+            piece = _piece(glb, node, mesh, primitive, places, place, turn_shares, binds)
             if piece.head_weight is None and turn_shares:
                 piece.head_weight = np.full(len(piece.vertices), turn_shares.get(number, 0.0))
             pieces.append(piece)
@@ -86,14 +86,52 @@ def _check_textures(pieces: list[Piece]) -> None:
 def _turn_shares(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
     """Return each node's share of the head rotation: 1 below a node "head", less on the neck."""
     share: dict[int, float] = {}
+    bones = find_bones(glb)
     for number in nodes:  # parents come first
-        node = glb.item("nodes", number)
-        word = re.split(r"[.:|_ ]", str(node.get("name", "")).lower())[-1]
-        if word in ("head", "neck"):
-            share[number] = 1.0 if word == "head" else max(0.4, share.get(number, 0.0))
-        for child in node.get("children", []):
+        bone = bones.get(number)
+        if bone in ("head", "neck"):
+            share[number] = 1.0 if bone == "head" else max(0.4, share.get(number, 0.0))
+        for child in glb.item("nodes", number).get("children", []):
             share[int(child)] = share.get(number, 0.0)
     return share if any(value == 1.0 for value in share.values()) else {}
+
+
+def find_bones(glb: Glb) -> dict[int, str]:
+    """Return the bones by their nodes: those of a VRM, otherwise nodes named "head" and "neck"."""
+    extensions = glb.json.get("extensions", {})
+    listed = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
+    named = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
+    if listed or named:
+        return {entry["node"]: entry["bone"] for entry in listed} | {
+            entry["node"]: bone for bone, entry in named.items()
+        }
+    words = [
+        re.split(r"[.:|_ ]", str(node.get("name", "")).lower())[-1]
+        for node in glb.json.get("nodes", [])
+    ]
+    return {number: word for number, word in enumerate(words) if word in ("head", "neck")}
+
+
+Binds = list[tuple[str, int, float]]  # name of an expression, target, weight
+
+
+def _expressions(glb: Glb) -> defaultdict[str, Binds]:
+    """Return the name, target and weight of a VRM's expressions, by "node N" or "mesh N"."""
+    found: defaultdict[str, Binds] = defaultdict(list)
+    extensions = glb.json.get("extensions", {})
+    groups = extensions.get("VRM", {}).get("blendShapeMaster", {}).get("blendShapeGroups", [])
+    for group in groups:
+        preset = group.get("presetName", "unknown")
+        name = group["name"] if preset == "unknown" else preset
+        for bind in group.get("binds", []):
+            weight = float(bind.get("weight", 100)) / 100
+            found[f"mesh {bind['mesh']}"].append((str(name), int(bind["index"]), weight))
+    kinds = extensions.get("VRMC_vrm", {}).get("expressions", {})
+    for name, expression in (kinds.get("custom", {}) | kinds.get("preset", {})).items():
+        for bind in expression.get("morphTargetBinds", []):
+            key = f"node {bind['node']}"
+            found[key].append((name, int(bind["index"]), float(bind.get("weight", 1))))
+    return found
 
 
 def _piece(
@@ -104,44 +142,34 @@ def _piece(
     places: dict[int, Float64],
     place: Float64,
     turn_shares: dict[int, float],
+    binds: Binds,
 ) -> Piece:
-    attributes = primitive["attributes"]
-    points = glb.accessor(attributes["POSITION"])
+    material = glb.item("materials", primitive["material"]) if "material" in primitive else {}
+    base, uv_name = _texture(material)
+    attributes = glb.attributes(
+        primitive, {"POSITION", "COLOR_0", "JOINTS_0", "WEIGHTS_0", uv_name}
+    )
+    points = attributes["POSITION"]
     count = len(points)
     index = np.arange(count)
-    if "indices" in primitive:
-        given = glb.accessor(primitive["indices"]).astype(np.int64)
+    if "indices" in attributes:
+        given = attributes["indices"].astype(np.int64)
         index = given[:, 0] if given.shape[1] == 1 else np.array([-1])
     if points.shape[1] != 3 or (len(index) and not 0 <= index.min() <= index.max() < count):
         raise BadGlbError("a triangle refers to a missing vertex")
-    uv = (
-        glb.accessor(attributes["TEXCOORD_0"])
-        if "TEXCOORD_0" in attributes
-        else np.zeros((count, 2))
-    )
-    material = glb.item("materials", primitive["material"]) if "material" in primitive else {}
-    surface = material.get("pbrMetallicRoughness", {})
-    colors = np.ones((count, 3)) * np.array(surface.get("baseColorFactor", [1.0] * 4))[:3]
+    uv = _moved_uv(attributes.get(uv_name, np.zeros((count, 2)))[:, :2], base)
+    factor = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4)
+    colors = np.ones((count, 3)) * np.array(factor)[:3]
     if "COLOR_0" in attributes:
-        colors *= glb.accessor(attributes["COLOR_0"])[:, :3]
-    texture = b""
-    if "baseColorTexture" in surface:
-        texture = glb.image(surface["baseColorTexture"]["index"])
+        colors *= attributes["COLOR_0"][:, :3]
+    texture = glb.image(base["index"]) if base else b""
     placed = np.broadcast_to(place, (count, 4, 4))
     weight = None
     if "skin" in node and "JOINTS_0" in attributes:
         placed, weight = _skinned(glb, node["skin"], attributes, places, turn_shares)
     if not len(uv) == len(colors) == len(placed) == count:
         raise BadGlbError("the attributes of a mesh have different lengths")
-    shapes = {}
-    targets = primitive.get("targets", [])
-    target_names = (mesh.get("extras") or {}).get("targetNames", [])
-    for name, target in zip(target_names, targets, strict=False):
-        if "POSITION" in target:
-            shift = glb.accessor(target["POSITION"])
-            if shift.shape != points.shape:
-                raise BadGlbError(f"morph target {name} does not match its mesh")
-            shapes[plain(str(name))] = np.einsum("vij,vj->vi", placed[:, :3, :3], shift)
+    shapes = _shapes(glb, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
@@ -149,8 +177,8 @@ def _piece(
     return Piece(
         name=str(node.get("name") or mesh.get("name") or "part"),
         vertices=vertices,
-        triangles=index[: len(index) // 3 * 3].reshape(-1, 3),
-        uv=uv[:, :2],
+        triangles=_corners(index, primitive.get("mode", 4)),
+        uv=uv,
         colors=colors,
         texture=texture,
         material=material,
@@ -159,10 +187,74 @@ def _piece(
     )
 
 
+def _texture(material: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """Return the reference to a material's texture, and the name of its coordinates."""
+    base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+    moved = base.get("extensions", {}).get("KHR_texture_transform", {})
+    return base, f"TEXCOORD_{moved.get('texCoord', base.get('texCoord', 0))}"
+
+
+def _moved_uv(uv: Float64, base: dict[str, Any]) -> Float64:
+    """Apply KHR_texture_transform."""
+    moved = base.get("extensions", {}).get("KHR_texture_transform")
+    if moved is None:
+        return uv
+    cos, sin = np.cos(moved.get("rotation", 0)), np.sin(moved.get("rotation", 0))
+    turn = np.array([[cos, -sin], [sin, cos]])
+    placed: Float64 = (uv * moved.get("scale", (1, 1))) @ turn + moved.get("offset", (0, 0))
+    return placed
+
+
+def _shapes(
+    glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any], placed: Float64, binds: Binds
+) -> dict[str, Float64]:
+    """Return the displacements (V, 3) of the expressions and morph targets by name."""
+    shifts = {}
+    for number, target in enumerate(primitive.get("targets", [])):
+        if "POSITION" in target:
+            shift = glb.accessor(target["POSITION"])
+            if shift.shape != placed.shape[:2]:
+                raise BadGlbError(f"morph target {number} does not match its mesh")
+            shifts[number] = np.einsum("vij,vj->vi", placed, shift)
+    shapes: dict[str, Float64] = {}
+    for name, number, weight in binds:
+        if number in shifts:
+            shapes[name] = shapes.get(name, 0.0) + weight * shifts[number]
+    for number, name in enumerate(_target_names(glb, mesh, primitive)):
+        if number in shifts:
+            shapes.setdefault(name, shifts[number])
+    return shapes
+
+
+def _corners(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+    """Return the corners (F, 3) of triangles, of a strip (5) or of a fan (6)."""
+    if mode == 4:
+        return index[: len(index) // 3 * 3].reshape(-1, 3)
+    if mode == 6:
+        return np.stack([np.full(max(len(index) - 2, 0), index[0]), index[1:-1], index[2:]], axis=1)
+    corners = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+    corners[1::2] = corners[1::2, ::-1]
+    return corners
+
+
+def _target_names(glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any]) -> list[str]:
+    """Return a name for each morph target; programs write them in different places."""
+    targets = primitive.get("targets", [])
+    for place in (primitive, mesh):
+        names = (place.get("extras") or {}).get("targetNames", [])
+        if names:
+            return [str(name) for name in names]
+    entries = [
+        glb.item("accessors", target["POSITION"]) if "POSITION" in target else {}
+        for target in targets
+    ]
+    return [str(entry.get("name", number)) for number, entry in enumerate(entries)]
+
+
 def _skinned(
     glb: Glb,
     skin: object,
-    attributes: dict[str, Any],
+    attributes: dict[str, Float64],
     places: dict[int, Float64],
     turn_shares: dict[int, float],
 ) -> tuple[Float64, Float64 | None]:
@@ -173,8 +265,7 @@ def _skinned(
     if "inverseBindMatrices" in entry:
         bind = glb.accessor(entry["inverseBindMatrices"])[: len(joints)]
         bones = bones @ bind.reshape(-1, 4, 4).transpose(0, 2, 1)
-    which = glb.accessor(attributes["JOINTS_0"]).astype(np.int64)
-    weights = glb.accessor(attributes["WEIGHTS_0"])
+    which, weights = attributes["JOINTS_0"].astype(np.int64), attributes["WEIGHTS_0"]
     if which.shape != weights.shape or (which.size and which.max() >= len(joints)):
         raise BadGlbError("a mesh refers to a missing joint")
     weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)

@@ -98,8 +98,8 @@ class Head:
             file = ASSETS / f"{path}.npz"
         if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
             raise UserError(
-                f"unknown head {str(path)!r}; give the path of an .npz or one of"
-                f" {', '.join(HEAD_NAMES)}"
+                f"unknown head {str(path)!r}; give the path of a .glb, .gltf, .vrm or .npz, or one"
+                f" of {', '.join(HEAD_NAMES)}"
             )
         try:
             return assemble(file.stem, read_arrays(file, MAX_BYTES), detail)

@@ -33,7 +33,7 @@ class Piece:
     texture: bytes
     material: dict[str, Any]
     head_weight: Float64 | None  # None without a skeleton
-    shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by plain target name
+    shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by name
 
 
 def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:

@@ -26,15 +26,18 @@ _RISE = 0.0114  # height of the camera above the center, as a share of its dista
 
 
 def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
-    """Read a built-in head, an ``.npz``, or a GLB with morph targets.
+    """Read a built-in head, an ``.npz``, or a GLB or VRM with shapes.
 
     Raises ``UserError`` if the head does not exist, or the file is not a head.
     """
     path = Path(name)
-    if path.suffix.lower() == ".glb":
+    if path.suffix.lower() in (".glb", ".gltf", ".vrm"):
         return read_glb(path)
-    if path.suffix.lower() in (".obj", ".gltf", ".stl", ".ply", ".fbx", ".wrl"):
-        raise UserError(f"{path} has no morph targets; see kouxing head import --help")
+    if path.suffix.lower() in (".obj", ".stl", ".ply", ".fbx", ".wrl"):
+        raise UserError(
+            f"{path}: export an avatar as .glb or .vrm. For a mesh without shapes, see"
+            " kouxing head import --help"
+        )
     return Head.load(path, detail)
 
 

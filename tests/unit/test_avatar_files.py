@@ -1,0 +1,197 @@
+"""Avatars as other programs write them are heads: VRM, compression, axes, places of names."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import DracoPy
+import numpy as np
+import pytest
+
+from kouxing.services.driver.head.glb_head import read_glb
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.scene import load_head
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
+from tests.glb_writer import read_chunks, write_chunks, write_glb
+from tests.meshes import meshes
+
+pytestmark = pytest.mark.unit
+
+JAW, AA = (shapes.basis[shapes.names.index(n)] for shapes, n in ((ARKIT, "jawOpen"), (VRM, "aa")))
+SHAPES = dict(zip(ARKIT.names, ARKIT.basis, strict=True))
+
+
+@pytest.fixture(scope="module")
+def original() -> Head:
+    return Head.load(detail="coarse")
+
+
+def error(head: Head, original: Head, faps: Any) -> float:
+    """Return the difference of the skins' displacements, relative to the displacement."""
+    shift, wanted = (
+        (model.deform(np.asarray(faps, np.float32)) - model.vertices)[model.part("skin").vertices]
+        / np.linalg.norm(model.eye_centers[0] - model.eye_centers[1])
+        for model in (head, original)
+    )
+    return float(np.linalg.norm(shift - wanted) / np.linalg.norm(wanted))
+
+
+def edit(path: Path, change: Callable[[dict[str, Any], bytearray], None]) -> Path:
+    document, binary = read_chunks(path)
+    change(document, binary)
+    write_chunks(path, document, binary)
+    return path
+
+
+def names_in_primitives(document: dict[str, Any], _binary: bytearray) -> None:
+    for mesh in document["meshes"]:
+        mesh["primitives"][0]["extras"] = mesh.pop("extras", {})
+
+
+def names_in_accessors(document: dict[str, Any], _binary: bytearray) -> None:
+    for mesh in document["meshes"]:
+        targets = mesh["primitives"][0].get("targets", [])
+        for target, name in zip(
+            targets, mesh.pop("extras", {}).get("targetNames", []), strict=True
+        ):
+            document["accessors"][target["POSITION"]]["name"] = name
+
+
+def z_up_in_centimeters(document: dict[str, Any], _binary: bytearray) -> None:
+    turned = {"children": document["scenes"][0]["nodes"], "scale": [100, 100, 100]}
+    document["nodes"].append(turned | {"rotation": [2**-0.5, 0, 0, 2**-0.5]})
+    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+
+
+def sideways(document: dict[str, Any], binary: bytearray) -> None:
+    z_up_in_centimeters(document, binary)
+    document["nodes"][-1]["rotation"] = [0, 2**-0.5, 0, 2**-0.5]
+
+
+def data_uri(document: dict[str, Any], binary: bytearray) -> None:
+    document["buffers"].append(
+        {
+            "byteLength": len(binary),
+            "uri": "data:application/octet-stream;base64," + base64.b64encode(binary).decode(),
+        }
+    )
+    for view in document["bufferViews"]:
+        view["buffer"] = 1
+
+
+def draco(document: dict[str, Any], binary: bytearray) -> None:
+    """Compress the first mesh, the skin, and remove its uncompressed positions."""
+    primitive = document["meshes"][0]["primitives"][0]
+    arrays = {}
+    for name, number, kind in (
+        ("points", primitive["attributes"]["POSITION"], "<f4"),
+        ("faces", primitive["indices"], "<u4"),
+    ):
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor.pop("bufferView")]
+        data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        arrays[name] = np.frombuffer(data, kind).reshape(-1, 3)
+    encoded = DracoPy.encode(**arrays, preserve_order=True, quantization_bits=16)
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(encoded)}
+    document["bufferViews"].append(view)
+    binary += encoded + b"\0" * (-len(encoded) % 4)
+    primitive["extensions"] = {
+        "KHR_draco_mesh_compression": {
+            "bufferView": len(document["bufferViews"]) - 1,
+            "attributes": {"POSITION": 0},
+        }
+    }
+    document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [names_in_primitives, names_in_accessors, z_up_in_centimeters, sideways, data_uri, draco],
+)
+def test_reads_files_of_other_programs(
+    original: Head, tmp_path: Path, change: Callable[[dict[str, Any], bytearray], None]
+) -> None:
+    head = read_glb(edit(write_glb(tmp_path / "my.glb", meshes(original, SHAPES)), change))
+    assert error(head, original, JAW) < 0.25
+    assert np.abs(head.eye_centers - original.eye_centers).max() < 0.01
+
+
+def test_reads_a_gltf_with_its_buffer_in_its_folder_only(original: Head, tmp_path: Path) -> None:
+    document, binary = read_chunks(write_glb(tmp_path / "my.glb", meshes(original, SHAPES)))
+    (tmp_path / "my face.bin").write_bytes(binary)
+    (tmp_path / "my.glb").unlink()
+    gltf = tmp_path / "my.gltf"
+    document["buffers"][0]["uri"] = "my%20face.bin"
+    gltf.write_text(json.dumps(document), encoding="utf-8")
+    assert error(load_head(str(gltf)), original, JAW) < 0.25
+    for uri in ("../my.bin", "/etc/hostname", "file:///etc/hostname", "%2e%2e/my.bin"):
+        document["buffers"][0]["uri"] = uri
+        gltf.write_text(json.dumps(document), encoding="utf-8")
+        with pytest.raises(UserError, match="not in its folder"):
+            load_head(str(gltf))
+
+
+def vowels(version: int) -> Callable[[dict[str, Any], bytearray], None]:
+    """Name the morph targets by number, and add them as the expressions of a VRM."""
+
+    def change(document: dict[str, Any], _binary: bytearray) -> None:
+        binds: dict[str, list[dict[str, Any]]] = {}
+        for number, mesh in enumerate(document["meshes"]):
+            for index, name in enumerate(mesh.pop("extras", {}).get("targetNames", [])):
+                bind = {("mesh", "node")[version]: number, "index": index}
+                binds.setdefault(name, []).append(bind | {"weight": (100, 1)[version]})
+        if version == 1:
+            presets = {name: {"morphTargetBinds": bound} for name, bound in binds.items()}
+            document["extensions"] = {"VRMC_vrm": {"expressions": {"preset": presets}}}
+            return
+        old = {"aa": "a", "ih": "i", "ou": "u", "ee": "e", "oh": "o"}
+        groups = [
+            {"name": "any", "presetName": old[name], "binds": bound}
+            for name, bound in binds.items()
+        ]
+        document["extensions"] = {"VRM": {"blendShapeMaster": {"blendShapeGroups": groups}}}
+        document["nodes"].append(
+            {"rotation": [0, 1, 0, 0], "children": document["scenes"][0]["nodes"]}
+        )
+        document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+
+    return change
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_a_vrm_with_five_vowels_speaks(original: Head, tmp_path: Path, version: int) -> None:
+    shapes = {name: VRM.basis[VRM.names.index(name)] for name in ("aa", "ih", "ou", "ee", "oh")}
+    path = edit(write_glb(tmp_path / "my.vrm", meshes(original, shapes)), vowels(version))
+    head = load_head(str(path))
+    assert error(head, original, AA) < 0.1
+    assert error(head, original, OCULUS.basis[OCULUS.names.index("ou")]) < 0.1
+    assert head.deform(AA)[head.part("skin").vertices][:, 2].max() > 0  # it looks along z
+
+
+@pytest.mark.parametrize(
+    ("kept", "shift", "said"),
+    [
+        (["eyeBlinkLeft", "jawOpen"], 0, "cannot speak: it has no shape mouthPucker of ARKit"),
+        ([], 0, "cannot speak: it has no shape jawOpen, mouthPucker of ARKit"),
+        (list(SHAPES), 1, "several faces; export only one"),
+    ],
+    ids=["no mouth", "no shapes", "two avatars"],
+)
+def test_says_why_an_avatar_cannot_speak(
+    original: Head, tmp_path: Path, kept: list[str], shift: float, said: str
+) -> None:
+    parts = meshes(original, {name: SHAPES[name] for name in kept})
+    path = write_glb(tmp_path / "my.glb", parts)
+
+    def double(document: dict[str, Any], _binary: bytearray) -> None:
+        count = len(document["nodes"])
+        document["nodes"] += [node | {"translation": [shift, 0, 0]} for node in document["nodes"]]
+        document["scenes"][0]["nodes"] += [count + i for i in range(count)]
+
+    with pytest.raises(UserError, match=said):
+        read_glb(edit(path, double) if shift else path)
