@@ -1,14 +1,63 @@
-// Streams a wav file (16 kHz, mono, 16 bits) and prints how far the jaw opens.
+// Streams a wav file and prints how far the jaw opens.
 //
-// usage: node client.mjs FILE.wav    (Node 18 or newer; npm install zeromq @msgpack/msgpack)
+// usage: node client.mjs FILE.wav [CONTROL-ADDRESS]
+// (Node 18 or newer; npm install zeromq @msgpack/msgpack)
 
 import { randomBytes } from "node:crypto";
 import { readFile } from "node:fs/promises";
 import { homedir } from "node:os";
+import { join } from "node:path";
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer, Subscriber } from "zeromq";
 
-const key = JSON.parse(await readFile("~/.local/state/kouxing/client.key".replace("~", homedir())));
+const EXTENSIBLE = 0xfffe;
+const [file, controlAddress = "tcp://127.0.0.1:5550"] = process.argv.slice(2);
+if (!file) fail("usage: node client.mjs FILE.wav [CONTROL-ADDRESS]");
+const state = process.env.XDG_STATE_HOME || join(homedir(), ".local", "state");
+const keyFile = join(state, "kouxing", "client.key");
+const key = JSON.parse(await readFile(keyFile, "utf8").catch(() => {
+  fail(`${keyFile} does not exist; start kouxing, or copy the file from its machine`);
+}));
+
+function fail(text) {
+  console.error(text);
+  process.exit(1);
+}
+
+/** Return the format of a wav file as open-session takes it, and its PCM. */
+async function readWav(path) {
+  const wav = await readFile(path).catch((error) => fail(error.message));
+  const chunks = {};
+  let at = wav.toString("latin1", 0, 4) === "RIFF" ? 12 : wav.length;
+  while (at + 8 <= wav.length) {
+    const size = wav.readUInt32LE(at + 4) || wav.length; // 0: the file was written as a stream
+    chunks[wav.toString("latin1", at, at + 4)] ??= wav.subarray(at + 8, at + 8 + size);
+    at += 8 + size + (size % 2);
+  }
+  const { "fmt ": header, data } = chunks;
+  if (!header || !data) fail(`${path} is not a wav file; convert yours: ffmpeg -i FILE speech.wav`);
+  const code = header.readUInt16LE(0) === EXTENSIBLE ? header.readUInt16LE(24) : header.readUInt16LE(0);
+  const width = header.readUInt16LE(14) / 8;
+  const isFloat = code === 3 && width === 4;
+  if (!isFloat && (code !== 1 || ![2, 3, 4].includes(width))) {
+    fail(`${path}: convert it to 16 bits: ffmpeg -i ${path} -c:a pcm_s16le speech.wav`);
+  }
+  let pcm = data;
+  if (!isFloat) {
+    pcm = Buffer.alloc(2 * Math.floor(data.length / width)); // the upper 16 bits
+    for (let i = 0; 2 * i < pcm.length; i++) data.copy(pcm, 2 * i, (i + 1) * width - 2, (i + 1) * width);
+  }
+  const numChannels = header.readUInt16LE(2);
+  return {
+    format: {
+      encoding: isFloat ? "f32le" : "s16le",
+      sample_rate_hz: header.readUInt32LE(4),
+      num_channels: numChannels,
+    },
+    pcm,
+    frameBytes: numChannels * (isFloat ? 4 : 2),
+  };
+}
 
 function connect(Kind, endpoint) {
   const [address, curveServerKey] = endpoint.split(" ");
@@ -26,10 +75,14 @@ function read([topic, body]) {
   return [topic.toString().split("/")[0], decode(body)];
 }
 
-const control = connect(Dealer, "tcp://127.0.0.1:5550 " + key.control);
-await send(control, "open-session", "", { request: "1", paced: false });
-const [answer, opened] = read(await control.receive());
-if (answer !== "session-opened") throw new Error(opened.text);
+const { format, pcm, frameBytes } = await readWav(file);
+const control = connect(Dealer, `${controlAddress} ${key.control}`);
+control.receiveTimeout = 5000; // ms
+await send(control, "open-session", "", { request: "1", paced: false, ...format });
+const [answer, opened] = read(await control.receive().catch(() => {
+  fail(`control does not answer at ${controlAddress}; start it with: kouxing run`);
+}));
+if (answer !== "session-opened") fail(opened.text);
 const { session, token } = opened;
 
 const faps = connect(Subscriber, opened.faps);
@@ -38,19 +91,22 @@ for (const kind of ["fap-frame", "end-of-faps", "joined"]) { // joined last
 }
 await faps.receive(); // joined: no later frame is missed
 
-async function speak(wav) {
+async function speak() {
   const audio = connect(Dealer, opened.audio);
-  const samples = wav.subarray(wav.indexOf("data") + 8);
+  const rate = format.sample_rate_hz;
+  const numFrames = Math.floor(pcm.length / frameBytes);
+  const step = Math.floor(rate / 50); // 20 ms
   let sequence = 1;
-  let media_time = 0;
-  for (; media_time < samples.length / 2; media_time += 320) { // 20 ms
-    const pcm = samples.subarray(2 * media_time, 2 * media_time + 640);
-    await send(audio, "audio-chunk", session, { token, sequence, media_time, pcm });
+  const timeAt = (frame) => Math.floor((frame * 16000) / rate);
+  for (let frame = 0; frame < numFrames; frame += step) {
+    const end = Math.min(frame + step, numFrames);
+    const chunk = pcm.subarray(frame * frameBytes, end * frameBytes);
+    await send(audio, "audio-chunk", session, { token, sequence, media_time: timeAt(frame), pcm: chunk });
     sequence += 1;
   }
-  await send(audio, "audio-chunk", session, { token, sequence, media_time, last: true });
+  await send(audio, "audio-chunk", session, { token, sequence, media_time: timeAt(numFrames), last: true });
 }
-const speaking = speak(await readFile(process.argv[2])); // while frames are received
+const speaking = speak(); // while frames are received
 
 for await (const message of faps) {
   const [kind, frame] = read(message);

@@ -1,20 +1,56 @@
-"""Streams a wav file (16 kHz, mono, 16 bits) and prints how far the jaw opens.
+"""Streams a wav file and prints how far the jaw opens.
 
-usage: client.py FILE.wav    (pip install pyzmq msgpack)
+usage: client.py FILE.wav [CONTROL-ADDRESS]    (pip install pyzmq msgpack)
 """
 
 import json
+import os
 import secrets
 import struct
 import sys
-import wave
 from pathlib import Path
 
 import msgpack
 import zmq
 
+MAX_WAIT_MS = 5000  # for an answer of control
+
+if len(sys.argv) < 2:
+    sys.exit("usage: client.py FILE.wav [CONTROL-ADDRESS]")
+control_address = [*sys.argv, "tcp://127.0.0.1:5550"][2]
+state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+key_file = Path(state, "kouxing", "client.key")
+if not key_file.is_file():
+    sys.exit(f"{key_file} does not exist; start kouxing, or copy the file from its machine")
+key = json.loads(key_file.read_text(encoding="utf-8"))
 context = zmq.Context()
-key = json.loads(Path("~/.local/state/kouxing/client.key").expanduser().read_text(encoding="utf-8"))
+
+
+def read_wav(path):
+    """Return the format of a wav file as `open-session` takes it, and its PCM."""
+    file = path.read_bytes() if path.is_file() else b""
+    chunks, at = {}, 12
+    while file[:4] == b"RIFF" and at + 8 <= len(file):
+        kind, size = struct.unpack_from("<4sI", file, at)
+        size = size or len(file)  # the file was written as a stream
+        chunks.setdefault(kind, file[at + 8 : at + 8 + size])
+        at += 8 + size + size % 2
+    if not {b"fmt ", b"data"} <= chunks.keys():
+        sys.exit(f"{path} is not a wav file; convert yours: ffmpeg -i FILE speech.wav")
+    header, pcm = chunks[b"fmt "], chunks[b"data"]
+    code, num_channels, rate_hz, _, _, num_bits = struct.unpack_from("<HHIIHH", header)
+    if code == 0xFFFE:  # extensible
+        (code,) = struct.unpack_from("<H", header, 24)
+    if code == 1 and num_bits in (24, 32):
+        width = num_bits // 8
+        pcm = pcm[: len(pcm) // width * width]
+        upper = bytearray(len(pcm) // width * 2)  # the upper 16 bits
+        upper[::2], upper[1::2] = pcm[width - 2 :: width], pcm[width - 1 :: width]
+        pcm = bytes(upper)
+    elif (code, num_bits) not in {(1, 16), (3, 32)}:
+        sys.exit(f"{path}: convert it to 16 bits: ffmpeg -i {path} -c:a pcm_s16le speech.wav")
+    encoding = "f32le" if code == 3 else "s16le"
+    return {"encoding": encoding, "sample_rate_hz": rate_hz, "num_channels": num_channels}, pcm
 
 
 def connect(kind, endpoint):
@@ -40,8 +76,12 @@ def receive(socket):
     return topic.decode().split("/")[0], msgpack.unpackb(body)
 
 
-control = connect(zmq.DEALER, "tcp://127.0.0.1:5550 " + key["control"])
-send(control, "open-session", "", request="1", paced=False)
+audio_format, samples = read_wav(Path(sys.argv[1]))
+control = connect(zmq.DEALER, f"{control_address} {key['control']}")
+send(control, "open-session", "", request="1", paced=False, **audio_format)
+if not control.poll(MAX_WAIT_MS):
+    context.destroy(linger=0)
+    sys.exit(f"control does not answer at {control_address}; start it with: kouxing run")
 kind, opened = receive(control)
 if kind != "session-opened":
     sys.exit(opened["text"])
@@ -53,22 +93,25 @@ for kind in ("fap-frame", "end-of-faps", "joined"):  # joined last
 receive(faps)  # joined: from now on, no frame is missed
 
 audio = connect(zmq.DEALER, opened["audio"])
-sequence, media_time, is_last = 0, 0, False
-with wave.open(sys.argv[1]) as file:
-    while not is_last:
-        pcm = file.readframes(320)  # 20 ms
-        sequence, is_last = sequence + 1, not pcm
-        send(
-            audio,
-            "audio-chunk",
-            session,
-            token=token,
-            sequence=sequence,
-            media_time=media_time,
-            pcm=pcm,
-            last=is_last,
-        )
-        media_time += len(pcm) // 2
+rate_hz = audio_format["sample_rate_hz"]
+frame_bytes = audio_format["num_channels"] * (4 if audio_format["encoding"] == "f32le" else 2)
+sequence, num_sent, is_last = 0, 0, False  # num_sent: samples per channel
+while not is_last:
+    begin, num_frames = num_sent * frame_bytes, rate_hz // 50  # 20 ms
+    num_frames = min(num_frames, len(samples) // frame_bytes - num_sent)
+    pcm = samples[begin : begin + num_frames * frame_bytes]
+    sequence, is_last = sequence + 1, not pcm
+    send(
+        audio,
+        "audio-chunk",
+        session,
+        token=token,
+        sequence=sequence,
+        media_time=num_sent * 16000 // rate_hz,
+        pcm=pcm,
+        last=is_last,
+    )
+    num_sent += num_frames
 
 while (message := receive(faps))[0] == "fap-frame":
     values = struct.unpack("<68f", message[1]["values"])

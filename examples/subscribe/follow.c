@@ -8,6 +8,7 @@
    proto/PROTOCOL.md describes all messages and lists the names of the weights. */
 
 #define _POSIX_C_SOURCE 200809L
+#include <errno.h>
 #include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -165,6 +166,7 @@ static void connect_to(void *socket, const char *endpoint, const Key *key) {
 /* Receive the two parts of a message; `body` is valid until the next call. */
 static Bytes receive(void *socket, char *topic, size_t capacity, zmq_msg_t *body) {
   int size = zmq_recv(socket, topic, capacity - 1, 0);
+  if (size < 0 && zmq_errno() == EAGAIN) fail("control does not answer; start it with: kouxing run");
   if (size < 0 || zmq_msg_recv(body, socket, 0) < 0) fail(zmq_strerror(zmq_errno()));
   topic[(size_t)size < capacity ? (size_t)size : capacity - 1] = '\0';
   const uint8_t *data = zmq_msg_data(body);
@@ -239,6 +241,9 @@ int main(int num_arguments, char **arguments) {
   char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1], events[MAX_ENDPOINT + 1];
   snprintf(endpoint, sizeof endpoint, "%s %s", address, key.control);
   void *control = zmq_socket(context, ZMQ_DEALER);
+  int max_wait_ms = 5000, linger_ms = 0;
+  zmq_setsockopt(control, ZMQ_RCVTIMEO, &max_wait_ms, sizeof max_wait_ms);
+  zmq_setsockopt(control, ZMQ_LINGER, &linger_ms, sizeof linger_ms);
   connect_to(control, endpoint, &key);
   while (!find_session(control, wanted, name, endpoint))
     nanosleep(&(struct timespec){.tv_nsec = 500000000}, NULL);

@@ -17,9 +17,18 @@ import { Dealer, Subscriber } from "zeromq";
 const JAW_OPEN = 24; // index in ARKit's names
 const [wanted = "", controlAddress = "tcp://127.0.0.1:5550"] = process.argv.slice(2);
 const state = process.env.XDG_STATE_HOME || join(homedir(), ".local", "state");
-const key = JSON.parse(await readFile(join(state, "kouxing", "client.key"), "utf8"));
+const keyFile = join(state, "kouxing", "client.key");
+const key = JSON.parse(await readFile(keyFile, "utf8").catch(() => {
+  fail(`${keyFile} does not exist; start kouxing, or copy the file from its machine`);
+}));
 
 let numRequests = 0;
+
+/** Print a message and exit. */
+function fail(text) {
+  console.error(text);
+  process.exit(1);
+}
 
 /** Connect to an endpoint: an address and the server's public key. */
 function connect(Kind, endpoint) {
@@ -38,7 +47,9 @@ function read([topic, body]) {
 async function ask(control, kind, session, fields = {}) {
   const body = { version: 3, session, request: String(++numRequests), ...fields };
   await control.send([`${kind}/${session}/`, encode(body)]);
-  return read(await control.receive())[1];
+  return read(await control.receive().catch(() => {
+    fail(`control does not answer at ${controlAddress}; start it with: kouxing run`);
+  }))[1];
 }
 
 /** Return whether a frame is newer than another. After a move some frames arrive twice. */
@@ -79,6 +90,7 @@ async function follow(endpoint) {
 }
 
 const control = connect(Dealer, `${controlAddress} ${key.control}`);
+control.receiveTimeout = 5000; // ms
 const { session, endpoints } = await find(control);
 const { services } = await ask(control, "status-request", "");
 const { events } = services.find(({ service }) => service === "control").endpoints;

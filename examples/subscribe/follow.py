@@ -20,10 +20,14 @@ import zmq
 
 wanted, control_address = (*sys.argv[1:], *("", "tcp://127.0.0.1:5550")[len(sys.argv) - 1 :])
 state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-key = json.loads(Path(state, "kouxing", "client.key").read_text(encoding="utf-8"))
+key_file = Path(state, "kouxing", "client.key")
+if not key_file.is_file():
+    sys.exit(f"{key_file} does not exist; start kouxing, or copy the file from its machine")
+key = json.loads(key_file.read_text(encoding="utf-8"))
 context = zmq.Context()
 numbers = itertools.count(1)  # of requests
 JAW_OPEN = 24  # index in ARKit's names
+MAX_WAIT_MS = 5000  # for an answer of control
 
 
 def connect(socket, endpoint):
@@ -43,6 +47,9 @@ def ask(control, kind, session, **fields):
     """Send a request; return the kind and the fields of the answer."""
     body = {"version": 3, "session": session, "request": str(next(numbers)), **fields}
     control.send_multipart([f"{kind}/{session}/".encode(), msgpack.packb(body)])
+    if not control.poll(MAX_WAIT_MS):
+        context.destroy(linger=0)
+        sys.exit(f"control does not answer at {control_address}; start it with: kouxing run")
     return receive(control)
 
 

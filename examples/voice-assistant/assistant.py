@@ -13,6 +13,7 @@ import asyncio
 import itertools
 import math
 import sys
+import threading
 from urllib.parse import urlsplit, urlunsplit
 
 import aiohttp
@@ -21,6 +22,7 @@ RATE_HZ = 16000
 PITCH_HZ = 140
 VOWELS_HZ = ((850, 1300), (300, 2300), (320, 800), (480, 850), (420, 1400))  # formants: a i u o e
 SYLLABLE_S = 0.2
+MESSAGE_BYTES = 2**16  # 2 s
 
 
 def answer(text):
@@ -50,16 +52,24 @@ async def speak(face, text):
     start_s = asyncio.get_running_loop().time()
     sent_s = 0.0
     async for pcm in synthesize(text):
-        await face.send_bytes(pcm)
+        for begin in range(0, len(pcm), MESSAGE_BYTES):  # a whole sentence can be a large piece
+            await face.send_bytes(pcm[begin : begin + MESSAGE_BYTES])
         sent_s += len(pcm) / 2 / RATE_HZ
     await asyncio.sleep(start_s + sent_s - asyncio.get_running_loop().time())
 
 
-async def converse(face):
-    """Answer the user until the input ends."""
+def read_lines(loop, lines):
+    """Put the lines of the standard input into a queue; None at its end."""
+    for line in sys.stdin:
+        loop.call_soon_threadsafe(lines.put_nowait, line.strip())
+    loop.call_soon_threadsafe(lines.put_nowait, None)
+
+
+async def converse(face, lines):
+    """Answer the user until an empty line or the end of the input."""
     speaking = None
     for number in itertools.count(1):
-        line = (await asyncio.to_thread(sys.stdin.readline)).strip()
+        line = await lines.get()
         if speaking is not None and not speaking.done() and line:
             speaking.cancel()
             await face.send_json({"flush": True})
@@ -83,12 +93,22 @@ async def main(gateway):
         if opened["type"] != "opened":
             raise SystemExit(opened["text"])
         print("the face is session", opened["session"], flush=True)
-        conversation = asyncio.create_task(converse(face))
+        loop, lines = asyncio.get_running_loop(), asyncio.Queue()
+        threading.Thread(target=read_lines, args=(loop, lines), daemon=True).start()
+        conversation = asyncio.create_task(converse(face, lines))
         async for message in face:  # until all is spoken and the gateway closes
             if message.type is aiohttp.WSMsgType.TEXT:
                 raise SystemExit(message.json()["text"])
+        if not conversation.done():
+            raise SystemExit("the gateway has closed the connection; start the assistant again")
         await conversation
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1] if len(sys.argv) > 1 else "ws://127.0.0.1:8080"))
+    address = sys.argv[1] if len(sys.argv) > 1 else "ws://127.0.0.1:8080"
+    try:
+        asyncio.run(main(address))
+    except aiohttp.WSServerHandshakeError as error:
+        sys.exit(f"{address} rejected the connection ({error.status}); copy the page's token")
+    except (aiohttp.ClientError, OSError):
+        sys.exit(f"cannot reach the gateway at {address}; start it with: kouxing run")

@@ -1,4 +1,4 @@
-"""One client's audio on its way into a session, passed on at once or at real-time speed."""
+"""One client's audio on its way into a session, passed on at once or in real time."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import contextlib
 from collections.abc import AsyncIterator
 
 from aiohttp import WSMessage, WSMsgType, web
+from kouxing_client import KouxingError
 
 from kouxing.services.gateway.audio_sessions import AudioSession
 from kouxing.services.gateway.limits import COMMAND_S, RateLimit
-from kouxing.services.gateway.pcm_format import PcmFormat
+from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
 
-MAX_AHEAD_S = 30.0  # audio that may be queued; then the client must wait
+MAX_QUEUED_BYTES = 12 * 1024 * 1024  # 32 s of 48 kHz stereo float; then the client must wait
+MAX_LIVE_S = 1.0  # a longer message is not from a microphone
 PIECE_S = 0.04  # duration of the pieces in which queued audio is passed on
 KEEP_ALIVE_S = 20.0  # without audio, until a piece of silence keeps the session open
 _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR}
@@ -22,23 +24,23 @@ class AudioInput:
     """Passes a client's audio on to its session.
 
     If ``is_ahead``, audio may arrive faster than real time, as synthesized speech does. It is then
-    queued here and passed on in real time, and an interruption drops the queue.
+    queued here and passed on in real time, and an interruption drops the queue. Without it, only
+    messages of more than a second are queued, and those that follow before the queue is empty.
     """
 
     def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, is_ahead: bool) -> None:
         self._session = session
         self._format = pcm_format
+        self._is_ahead = is_ahead
         self._is_first = True
+        self._incomplete = b""  # part of a sample, or of a file's header
         self._drained: asyncio.Task[None] | None = None  # done when all audio is passed on
         self._rate_limit = RateLimit()
-        self._queue = RealTimeQueue(session, pcm_format) if is_ahead else None
+        self._queue = RealTimeQueue(session, pcm_format, keep_alive=is_ahead)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Pass on queued audio while the context is open."""
-        if self._queue is None:
-            yield
-            return
         task = asyncio.create_task(self._queue.run())
         try:
             yield
@@ -46,31 +48,43 @@ class AudioInput:
             task.cancel()
 
     async def push(self, pcm: bytes) -> None:
-        """Take the audio of a binary message; return when more may be read.
+        """Take the audio of a binary message of any length; return when more may be read.
 
         Raises
         ------
         UserError
             If the data does not have the announced format.
         """
-        num_frames = self._format.num_frames(pcm, is_first=self._is_first)
-        self._is_first = self._is_first and not pcm
-        if self._queue is not None:
+        self._format.check_message(pcm)
+        pcm = self._incomplete + pcm
+        if self._is_first and len(pcm) < HEADER_BYTES:
+            self._incomplete = pcm
+            return
+        await self._pass_on(pcm)
+
+    async def _pass_on(self, pcm: bytes) -> None:
+        num_frames = len(pcm) // self._format.frame_bytes
+        end = num_frames * self._format.frame_bytes
+        pcm, self._incomplete = pcm[:end], pcm[end:]
+        self._format.check_samples(pcm, is_first=self._is_first)
+        self._is_first = False
+        duration_s = num_frames / self._format.sample_rate_hz
+        if self._is_ahead or duration_s > MAX_LIVE_S or not self._queue.is_empty:
             await self._queue.put(pcm)
         else:
             self._session.send(pcm, num_frames)
-            await self._rate_limit.wait(num_frames / self._format.sample_rate_hz)
+            await self._rate_limit.wait(duration_s)
 
     async def flush(self) -> None:
         """Interrupt: drop queued audio and audio whose face is not shown yet."""
-        if self._queue is not None:
-            self._queue.clear()
+        self._incomplete = b""
+        self._queue.clear()
         await self._session.flush()
 
-    def end(self) -> None:
+    async def end(self) -> None:
         """Mark the end of the audio: ``messages`` ends when the queue is empty."""
-        draining = self._queue.wait_until_empty() if self._queue is not None else asyncio.sleep(0)
-        self._drained = asyncio.create_task(draining)
+        await self._pass_on(self._incomplete)
+        self._drained = asyncio.create_task(self._queue.wait_until_empty())
 
     async def messages(self, client: web.WebSocketResponse) -> AsyncIterator[WSMessage]:
         """Yield a client's messages until it leaves or, after ``end``, all audio is passed on."""
@@ -94,18 +108,24 @@ class AudioInput:
 class RealTimeQueue:
     """Audio that arrived early. It is passed on in real time."""
 
-    def __init__(self, session: AudioSession, pcm_format: PcmFormat) -> None:
+    def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, keep_alive: bool) -> None:
         self._session = session
         self._format = pcm_format
         self._piece_bytes = round(PIECE_S * pcm_format.sample_rate_hz) * pcm_format.frame_bytes
+        self._keep_alive_s = KEEP_ALIVE_S if keep_alive else None
         self._queued = bytearray()
         self._not_empty = asyncio.Event()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether all audio is passed on."""
+        return not self._queued
 
     async def put(self, pcm: bytes) -> None:
         """Queue audio; return when there is room for more."""
         self._queued += pcm
         self._not_empty.set()
-        while self._duration_s(self._queued) > MAX_AHEAD_S:
+        while len(self._queued) > MAX_QUEUED_BYTES:
             await asyncio.sleep(PIECE_S)
 
     def clear(self) -> None:
@@ -127,17 +147,17 @@ class RealTimeQueue:
                 due_s = loop.time()
             piece = bytes(self._queued[: self._piece_bytes])
             del self._queued[: self._piece_bytes]
-            self._session.send(piece, len(piece) // self._format.frame_bytes)
-            due_s += self._duration_s(piece)
+            try:
+                self._session.send(piece, len(piece) // self._format.frame_bytes)
+            except KouxingError:  # the session is over; its errors are reported elsewhere
+                self._queued.clear()
+            due_s += len(piece) / self._format.frame_bytes / self._format.sample_rate_hz
             await asyncio.sleep(due_s - loop.time())
 
     async def _wait_for_audio(self) -> None:
         """Return once audio is queued. After a long pause, queue a piece of silence."""
         self._not_empty.clear()
         try:
-            await asyncio.wait_for(self._not_empty.wait(), KEEP_ALIVE_S)
+            await asyncio.wait_for(self._not_empty.wait(), self._keep_alive_s)
         except TimeoutError:
             self._queued += bytes(self._piece_bytes)
-
-    def _duration_s(self, pcm: bytes | bytearray) -> float:
-        return len(pcm) / self._format.frame_bytes / self._format.sample_rate_hz

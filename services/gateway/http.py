@@ -10,7 +10,7 @@ import re
 from collections.abc import AsyncIterator, Collection
 from pathlib import Path
 
-from aiohttp import WSCloseCode, web
+from aiohttp import WSCloseCode, WSMsgType, web
 
 import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
@@ -23,9 +23,17 @@ from kouxing.shared.page_heads import page_heads_folder
 PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
 PING_S = 20.0  # a browser that has vanished is detected within this time
-MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message
+MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message, unless it has audio
+LINGER_S = 1.0  # data is still read, and discarded, after an invalid message
+MAX_REASON_BYTES = 123  # of a close frame, RFC 6455
 MAX_UPLOAD_BYTES = 8 * 1024 * 1024
 FACE_MESH_FRAME = "face-mesh.html"
+_CLOSE_REASONS: dict[int, str] = {  # of the closes that aiohttp makes
+    WSCloseCode.OK: "the connection has ended",
+    WSCloseCode.PROTOCOL_ERROR: "the data is not a valid WebSocket message",
+    WSCloseCode.INVALID_TEXT: "a text message is not valid UTF-8",
+    WSCloseCode.MESSAGE_TOO_BIG: "a message is larger than {}; send it in smaller messages",
+}
 _PAGE_SUFFIXES = {".html", ".js", ".css", ".svg", ".glb", ".webp"}
 _FACE_MESH_SUFFIXES = {".js", ".wasm", ".data", ".binarypb"}
 _HEADERS = {  # of every answer
@@ -47,6 +55,29 @@ _IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
 _NO_MODULES = f"the page's JavaScript modules are missing; run 'npm ci' in {PAGE}"
 
 
+class _WebSocket(web.WebSocketResponse):
+    """A WebSocket that gives a reason whenever it closes."""
+
+    def __init__(self, max_message_bytes: int, ping_s: float | None) -> None:
+        # aiohttp rejects messages of the limit itself
+        super().__init__(
+            heartbeat=ping_s, max_msg_size=max_message_bytes + 1, timeout=1.0, compress=False
+        )
+        self._max_size = f"{max_message_bytes >> 10} KiB"
+
+    async def close(
+        self, *, code: int = WSCloseCode.OK, message: bytes = b"", drain: bool = True
+    ) -> bool:
+        reason = message or _CLOSE_REASONS.get(code, "").format(self._max_size).encode()
+        reason = reason[:MAX_REASON_BYTES].decode(errors="ignore").encode()  # whole letters
+        if code in _CLOSE_REASONS and code != WSCloseCode.OK and not self.closed:
+            # The client may still send. It would lose the reason if the connection closed now.
+            with contextlib.suppress(ConnectionError):
+                await self.send_frame(code.to_bytes(2, "big") + reason, WSMsgType.CLOSE)
+                await asyncio.sleep(LINGER_S)
+        return await super().close(code=code, message=reason, drain=drain)
+
+
 class WebSockets:
     """The browsers' open WebSockets."""
 
@@ -59,7 +90,12 @@ class WebSockets:
 
     @contextlib.asynccontextmanager
     async def open(
-        self, request: web.Request, quota: ConnectionQuota
+        self,
+        request: web.Request,
+        quota: ConnectionQuota,
+        *,
+        max_message_bytes: int = MAX_MESSAGE_BYTES,
+        ping_s: float | None = PING_S,
     ) -> AsyncIterator[web.WebSocketResponse]:
         """Answer a request with a WebSocket that is open while the context is.
 
@@ -71,9 +107,7 @@ class WebSockets:
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
         with quota.hold(request):
-            browser = web.WebSocketResponse(
-                heartbeat=PING_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=1.0, compress=False
-            )
+            browser = _WebSocket(max_message_bytes, ping_s)
             await browser.prepare(request)
             self._open.add(browser)
             try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 from kouxing_client import KouxingError
 
 from kouxing.services.gateway import wire
@@ -17,6 +17,7 @@ from kouxing.shared.logs import LOG
 
 MAX_MICROPHONES = 16
 HELLO_TIMEOUT_S = 10.0
+MAX_MESSAGE_BYTES = 4 * 1024 * 1024  # 43 s of 48 kHz mono
 
 
 class Microphones:
@@ -32,13 +33,19 @@ class Microphones:
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one microphone until it is turned off."""
-        async with self._web_sockets.open(request, self._quota) as browser:
+        # No pings: while the queue is full, nothing is read, and no answer to a ping either.
+        async with self._web_sockets.open(
+            request, self._quota, max_message_bytes=MAX_MESSAGE_BYTES, ping_s=None
+        ) as browser:
             self._session_names[browser] = ""
             try:
                 await self._stream(browser)
+                await browser.close(message=b"all audio was passed on")
             except (UserError, KouxingError) as error:
                 with contextlib.suppress(ConnectionError):
                     await browser.send_str(error_text(error))
+                reason = str(error).encode()
+                await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=reason)
             finally:
                 del self._session_names[browser]
         return browser
@@ -90,6 +97,6 @@ class Microphones:
                 if command.lips:
                     await session.set_lips(command.lips)
                 if command.eof:
-                    audio_input.end()
+                    await audio_input.end()
             for error in session.errors():
                 await browser.send_str(error_text(error))

@@ -13,6 +13,7 @@ from kouxing.shared.errors import UserError
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 RATES_HZ = (8000, 48000)
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
+HEADER_BYTES = 12  # enough to recognize a file
 _FILES = {  # by their first bytes
     b"RIFF": "a WAV file",
     b"OggS": "an Ogg file",
@@ -58,28 +59,29 @@ class PcmFormat:
         channels = "mono" if self.num_channels == 1 else "stereo"
         return f"{self.encoding} samples, {self.sample_rate_hz} Hz {channels}, without a header"
 
-    def num_frames(self, pcm: bytes, *, is_first: bool) -> int:
-        """Return the number of samples per channel in a binary message.
-
-        The first message would have the header of a file.
+    def check_message(self, message: bytes) -> None:
+        """Check a binary message.
 
         Raises
         ------
         UserError
-            If the data does not have this format; the text says what was expected.
+            If it is JSON.
+        """
+        if message[:1] == b"{" and _is_json(message):
+            raise UserError(f"expected {self}; this is JSON: send it as a text message")
+
+    def check_samples(self, pcm: bytes, *, is_first: bool) -> None:
+        """Check whole samples. The first ones may be the header of a file.
+
+        Raises
+        ------
+        UserError
+            If they do not have this format; the text says what was expected.
         """
         if is_first and (kind := _file_kind(pcm)):
             raise UserError(f"expected {self}; this begins like {kind}")
-        if pcm[:1] == b"{" and _is_json(pcm):
-            raise UserError(f"expected {self}; this is JSON: send it as a text message")
-        num_frames, rest = divmod(len(pcm), self.frame_bytes)
-        if rest:
-            raise UserError(
-                f"expected {self}: a multiple of {self.frame_bytes} bytes, got {len(pcm)}"
-            )
         if self.encoding == "f32le":
             self._check_level(np.frombuffer(pcm, "<f4"))
-        return num_frames
 
     def _check_level(self, samples: np.ndarray) -> None:
         peak = float(np.abs(samples).max(initial=0.0))

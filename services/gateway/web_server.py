@@ -26,6 +26,8 @@ IDLE_TIMEOUT_S = 10.0  # until a request arrives, and until the next one
 BODY_TIMEOUT_S = 70.0  # for the body on unlimited paths; an upload is answered before that
 ANSWER_TIMEOUT_S = 120.0  # to send a file; a head has 5 MB
 BACKLOG = 128
+KEEPALIVE_S = 20  # without data, until a client that has vanished is looked for
+_KEEPALIVE_PROBES, _PROBE_S = 3, 5
 _CHECK_S = 1.0
 _RETRY_S = 1.0  # when the system has no free descriptor
 
@@ -52,6 +54,19 @@ def bind_port(host: str, port: int) -> socket.socket:
             f"gateway.host: cannot listen on {host!r}: {error.strerror}; "
             "use 127.0.0.1 or an address of this host"
         ) from None
+
+
+def _enable_keepalive(connection: socket.socket) -> None:
+    """Let the system close the connection of a client that has vanished, in 35 s."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    options = (
+        ("TCP_KEEPIDLE", KEEPALIVE_S),
+        ("TCP_KEEPINTVL", _PROBE_S),
+        ("TCP_KEEPCNT", _KEEPALIVE_PROBES),
+    )
+    for name, value in options:
+        if hasattr(socket, name):  # depends on the system
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 class WebServer:
@@ -140,6 +155,7 @@ class WebServer:
             accepted.close()
             self._on_refused(address)
             return
+        _enable_keepalive(accepted)
         connection = loop.create_task(self._serve(accepted))
         self._connections.add(connection)
         connection.add_done_callback(self._connections.discard)

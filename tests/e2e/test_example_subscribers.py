@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from kouxing_client import Client
 
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream_into
@@ -17,6 +18,7 @@ from tests.scripted_system import Gateway
 from tests.system import ROOT, VOWELS_FILE, System, free_port
 
 FOLDER = ROOT / "examples" / "subscribe"
+STREAM_CLIENTS = ROOT / "examples" / "stream"
 STREAM = ROOT / "examples" / "unity" / "KouxingStream.cs"
 NODE = str(Path(sys.executable).with_name("node"))
 
@@ -36,6 +38,52 @@ def programs(tmp_path: Path) -> list[list[str]]:
         [NODE, str(tmp_path / "follow.mjs")],
         [str(program)],
     ]
+
+
+@pytest.mark.parametrize("wav", ["mono 16", "stereo 24", "float 48k"])
+def test_the_clients_stream_wav_files(system: System, tmp_path: Path, wav: str) -> None:
+    samples, _ = soundfile.read(VOWELS_FILE, dtype="float32")
+    samples, rate_hz, form = {
+        "mono 16": (samples, 16000, "PCM_16"),
+        "stereo 24": (np.stack([samples, samples], axis=1), 16000, "PCM_24"),
+        "float 48k": (np.repeat(samples, 3), 48000, "FLOAT"),
+    }[wav]
+    soundfile.write(tmp_path / "said.wav", samples, rate_hz, form, format="WAVEX")
+    shutil.copy(STREAM_CLIENTS / "client.mjs", tmp_path)
+    (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
+    for program in (
+        [sys.executable, str(STREAM_CLIENTS / "client.py")],
+        [NODE, str(tmp_path / "client.mjs")],
+    ):
+        arguments = [*program, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
+        output = subprocess.run(arguments, check=True, stdout=subprocess.PIPE, text=True).stdout
+        jaw = [float(line.split()[-1]) for line in output.splitlines()]
+        assert len(jaw) == pytest.approx(50 * len(samples) / rate_hz, abs=50)
+        assert max(jaw) - min(jaw) > 100
+
+
+def test_without_a_server_each_program_prints_one_line(
+    programs: list[list[str]], tmp_path: Path
+) -> None:
+    shutil.copy(STREAM_CLIENTS / "client.mjs", tmp_path)
+    clients = [
+        [sys.executable, str(STREAM_CLIENTS / "client.py")],
+        [NODE, f"{tmp_path}/client.mjs"],
+    ]
+    address = f"tcp://127.0.0.1:{free_port()}"
+    assistant = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
+    running = [
+        subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for command in [
+            *([*program, "", address] for program in programs),
+            *([*client, str(VOWELS_FILE), address] for client in clients),
+            [*assistant, address.replace("tcp", "ws")],
+        ]
+    ]
+    for process in running:
+        (line,) = process.communicate(timeout=60)[1].splitlines()
+        assert "start it with: kouxing run" in line
+        assert process.returncode == 1
 
 
 def test_follow_a_session_to_its_end(system: System, programs: list[list[str]]) -> None:

@@ -18,6 +18,7 @@ from kouxing_client.base import MAX_UNACKNOWLEDGED
 from numpy.typing import NDArray
 from pythonosc.osc_bundle import OscBundle
 
+from kouxing.services.gateway.microphone import MAX_MESSAGE_BYTES
 from kouxing.services.gateway.sample import SAMPLE_FILE, SAMPLE_TEXT
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -269,6 +270,24 @@ async def test_a_session_gets_the_mouth_profile_of_its_microphone(
     assert system.profiles == [profile]
 
 
+@pytest.mark.parametrize("ahead", [False, True])
+@async_test
+async def test_the_largest_message_is_spoken_in_real_time(
+    own_system: ScriptedSystem, own_gateway: GatewayProcess, *, ahead: bool
+) -> None:
+    def num_bytes() -> int:
+        return sum(len(message.pcm) for message in own_system.audio_messages)
+
+    async with connected(own_gateway.page, "microphone") as (microphone,):
+        await microphone.send_json({"sample_rate_hz": 48000, "ahead": ahead})
+        await receive_json(microphone, "opened")
+        await microphone.send_bytes(bytes(MAX_MESSAGE_BYTES))
+        await until(lambda: num_bytes() > 0)
+        assert num_bytes() < MAX_MESSAGE_BYTES / 2
+        await microphone.send_json({"flush": True})
+        await until(lambda: bool(own_system.flushed))
+
+
 @async_test
 async def test_bad_audio_is_refused_with_a_reason(
     system: ScriptedSystem, gateway: GatewayProcess
@@ -277,19 +296,22 @@ async def test_bad_audio_is_refused_with_a_reason(
     for messages, reason in (
         (['{"sample_rate_hz": 4000}'], "sample_rate_hz"),
         ([b"\x00\x00"], "describes the audio"),
-        ([hello, b"\x00\x00\x00"], "multiple of 2"),
+        ([hello, b"RIFF" + bytes(40)], "WAV file"),
     ):
         async with connected(gateway.page, "microphone") as (microphone,):
             for message in messages:
                 send = microphone.send_str if isinstance(message, str) else microphone.send_bytes
                 await send(message)  # type: ignore[arg-type]
-            assert reason in (await receive_json(microphone, "error"))["text"]
+            text = (await receive_json(microphone, "error"))["text"]
+            assert reason in text
+            assert (await microphone.receive(60)).extra == text[:123]  # of the close
     async with connected(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)
         await receive_json(microphone, "opened")
-        await microphone.send_bytes(bytes(300 * 1024))
-        assert (await microphone.receive(60)).type is aiohttp.WSMsgType.CLOSE
-        assert microphone.close_code == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
+        await microphone.send_bytes(bytes(MAX_MESSAGE_BYTES + 1))
+        closing = await microphone.receive(60)
+        assert closing.data == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
+        assert closing.extra == "a message is larger than 4096 KiB; send it in smaller messages"
     system.refuse = True
     async with connected(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)

@@ -10,7 +10,7 @@ from collections.abc import Coroutine
 import numpy as np
 import pytest
 
-from kouxing.services.gateway.audio_input import MAX_AHEAD_S, AudioInput
+from kouxing.services.gateway.audio_input import MAX_QUEUED_BYTES, AudioInput
 from kouxing.services.gateway.limits import RateLimit
 from kouxing.services.gateway.pcm_format import PcmFormat, check_text
 from kouxing.shared.errors import UserError
@@ -22,9 +22,7 @@ FLOAT = PcmFormat(sample_rate_hz=16000, encoding="f32le")
 @pytest.mark.parametrize(
     ("pcm_format", "pcm", "error"),
     [
-        (PCM16, bytes(3), "s16le samples, 16000 Hz mono.*multiple of 2 bytes, got 3"),
-        (FLOAT, bytes(6), "multiple of 4 bytes, got 6"),
-        (PCM16, b"RIFF" + bytes(40), "without a header; this begins like a WAV file"),
+        (PCM16, b"RIFF" + bytes(40), "s16le.*without a header; this begins like a WAV file"),
         (PCM16, b"\x1aE\xdf\xa3" + bytes(100), "WebM, the format of MediaRecorder"),
         (PCM16, b"\0\0\0\x20ftypM4A " + bytes(20), "an MP4 file"),
         (PCM16, json.dumps({"audio": "AAAA"}).encode(), "this is JSON: send it as a text message"),
@@ -34,8 +32,42 @@ FLOAT = PcmFormat(sample_rate_hz=16000, encoding="f32le")
     ],
 )
 def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, error: str) -> None:
-    with pytest.raises(UserError, match=error):
-        pcm_format.num_frames(pcm, is_first=True)
+    async def speak(chunk: int) -> None:
+        audio_input = AudioInput(FakeSession(), pcm_format, is_ahead=False)  # type: ignore[arg-type]
+        for begin in range(0, len(pcm), chunk):
+            await audio_input.push(pcm[begin : begin + chunk])
+        await audio_input.end()
+
+    for chunk in (len(pcm), 3 if "JSON" not in error else len(pcm)):
+        with pytest.raises(UserError, match=error):
+            run(speak(chunk))
+
+
+@pytest.mark.parametrize("is_ahead", [False, True])
+@pytest.mark.parametrize("chunk", [1, 999, 100_001])
+@pytest.mark.parametrize(
+    ("pcm_format", "pcm"),
+    [
+        (PCM16, b"\0\1RIFF"),
+        (FLOAT, np.array([1.5, -1.5] * 900, "<f4").tobytes()),
+        (PcmFormat(sample_rate_hz=48000, num_channels=2), bytes(range(250)) * 800),
+    ],
+)
+def test_accepts_pieces_of_any_length(
+    pcm_format: PcmFormat, pcm: bytes, chunk: int, *, is_ahead: bool
+) -> None:
+    async def speak() -> None:
+        session = FakeSession(pcm_format.frame_bytes)
+        audio_input = AudioInput(session, pcm_format, is_ahead=is_ahead)  # type: ignore[arg-type]
+        async with audio_input.running():
+            for begin in range(0, len(pcm), chunk):
+                await audio_input.push(pcm[begin : begin + chunk])
+            await audio_input.push(b"\0")  # an incomplete sample at the end is dropped
+            await audio_input.end()
+            await asyncio.sleep(5.0)
+        assert session.pcm == pcm
+
+    run(speak())
 
 
 def test_rejects_audio_in_text_messages() -> None:
@@ -48,12 +80,13 @@ def test_rejects_audio_in_text_messages() -> None:
 class FakeSession:
     """Collects the audio that it receives."""
 
-    def __init__(self) -> None:
+    def __init__(self, frame_bytes: int = 2) -> None:
         self.pcm = b""
         self.num_flushes = 0
+        self._frame_bytes = frame_bytes
 
     def send(self, pcm: bytes, num_frames: int) -> None:
-        assert len(pcm) == 2 * num_frames
+        assert len(pcm) == self._frame_bytes * num_frames
         self.pcm += pcm
 
     async def flush(self) -> None:
@@ -113,7 +146,7 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
         session = FakeSession()
         audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
         async with audio_input.running():
-            await audio_input.push(b"\1\0" * 16000 * (int(MAX_AHEAD_S) + 3))
+            await audio_input.push(bytes(MAX_QUEUED_BYTES + 3 * 16000 * 2))
             assert 2.5 < asyncio.get_running_loop().time() < 3.5
             await audio_input.flush()
             assert session.num_flushes == 1
@@ -122,6 +155,23 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
             await audio_input.push(b"\2\0" * 320)
             await asyncio.sleep(1.0)
         assert session.pcm[num_before:] == b"\2\0" * 320
+
+    run(speak())
+
+
+def test_a_sentence_in_one_message_is_passed_on_in_real_time() -> None:
+    sentence, next_message = b"\1\0" * 16000 * 6, b"\2\0" * 320
+
+    async def speak() -> None:
+        session = FakeSession()
+        audio_input = AudioInput(session, PCM16, is_ahead=False)  # type: ignore[arg-type]
+        async with audio_input.running():
+            await audio_input.push(sentence)
+            await audio_input.push(next_message)
+            await asyncio.sleep(3.0)
+            assert 2.9 < len(session.pcm) / 32000 < 3.1
+            await asyncio.sleep(60.0)
+        assert session.pcm == sentence + next_message, "no silence for a silent microphone"
 
     run(speak())
 

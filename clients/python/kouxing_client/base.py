@@ -98,6 +98,7 @@ class BaseSession:
         self._signal = core.signal
         self._options = options
         self._num_added = 0  # audio messages
+        self._incomplete = b""  # part of a sample
         self._has_finished = False
 
     @property
@@ -155,19 +156,28 @@ class BaseSession:
         errors = self._core.errors
         return [errors.popleft() for _ in range(len(errors))]
 
-    def _num_frames(self, pcm: bytes) -> int:
+    @property
+    def _frame_bytes(self) -> int:
+        self._check_sender()
+        options = self._options or {}
+        return int(SAMPLE_BYTES[options["encoding"]] * options["num_channels"])
+
+    def _check_sender(self) -> None:
         if self._options is None:
             raise KouxingError("another program opened this session, and sends its audio")
-        frame_bytes: int = SAMPLE_BYTES[self._options["encoding"]] * self._options["num_channels"]
-        if len(pcm) % frame_bytes:
-            raise KouxingError(f"{len(pcm)} bytes are not whole samples of {frame_bytes} bytes")
-        return len(pcm) // frame_bytes
+
+    def _num_frames(self, pcm: bytes) -> int:
+        num_frames, rest = divmod(len(pcm), self._frame_bytes)
+        if rest:
+            raise KouxingError(f"{len(pcm)} bytes are not whole samples; use push for any length")
+        return num_frames
 
     def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
         """Yield messages of PCM and their number of samples per channel."""
-        pcm = to_pcm(audio, (self._options or {}).get("encoding", "s16le"))
-        self._num_frames(pcm)
+        pcm = self._incomplete + to_pcm(audio, (self._options or {}).get("encoding", "s16le"))
+        end = len(pcm) // self._frame_bytes * self._frame_bytes
         self._check()
+        pcm, self._incomplete = pcm[:end], pcm[end:]
         for chunk in split(pcm, CHUNK_BYTES):
             yield chunk, self._num_frames(chunk)
 
@@ -177,7 +187,7 @@ class BaseSession:
         self._thread.call(lambda: self._core.add_audio(num_frames, {"pcm": pcm}))
 
     def _finish(self) -> None:
-        self._num_frames(b"")
+        self._check_sender()
         self._check()
         if not self._has_finished:
             self._has_finished = True
@@ -188,7 +198,8 @@ class BaseSession:
         return self._thread.submit(lambda core: core.request(kind, self.name, **fields))
 
     def _flush(self) -> Future[Fields]:
-        self._num_frames(b"")
+        self._check_sender()
+        self._incomplete = b""
 
         def flush(core: ClientCore) -> Future[Fields]:
             if self._core.stream is not None:

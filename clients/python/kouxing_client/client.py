@@ -130,8 +130,8 @@ class Session(BaseSession):
         Parameters
         ----------
         audio
-            Bytes of PCM in the session's encoding, or numbers (16-bit integers, or floats within
-            ±1): a list, an ``array`` or a NumPy array of shape ``(n,)`` or ``(n, channels)``.
+            Bytes of PCM in the session's encoding, of any length, or numbers (16-bit integers, or
+            floats within ±1): a list, an ``array`` or a NumPy array of shape ``(n,)`` or ``(n, channels)``.
         timeout_s
             How long to wait until the recognizer takes more audio; None: without limit.
 
