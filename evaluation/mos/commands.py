@@ -25,16 +25,11 @@ def new(
     title: Annotated[str, typer.Option(help="Title of the page. Default: the folder.")] = "",
     reference: Annotated[str, typer.Option(help="Condition used as hidden reference.")] = "",
     anchor: Annotated[str, typer.Option(help="Condition used as low anchor.")] = "",
-    condition: Annotated[
-        list[str] | None, typer.Option(help="Condition to include; repeatable. Default: all.")
-    ] = None,
 ) -> None:
     """Create a study from videos named CONDITION/SENTENCE.mp4."""
     from kouxing.evaluation.mos.study import new_study
 
-    study = new_study(
-        folder, title=title, reference=reference, anchor=anchor, conditions=condition or ()
-    )
+    study = new_study(folder, title=title, reference=reference, anchor=anchor)
     size = f"{len(study.sentences)} sentences x {len(study.conditions)} conditions"
     print_message(f"created a study of {size}; next: kouxing mos serve {folder}")
 
@@ -89,4 +84,4 @@ def report(
     print_report(study, results, Console())
     if picture is not None:
         save_figure(draw_boxes(study, answers), picture)
-    write_json(json_file, asdict(results))
+    write_json(json_file, {"opinions": [asdict(opinion) for opinion in results]})

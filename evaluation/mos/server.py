@@ -53,9 +53,7 @@ class ListeningTest:
             client_max_size=MAX_BODY_BYTES,
         )
         application.on_response_prepare.append(http.add_headers)
-        application.add_routes(routes)
-        application.router.add_get("/", _send_file)
-        application.router.add_get("/{name}", _send_file)
+        application.add_routes([*routes, web.get("/", _send_file), web.get("/{name}", _send_file)])
         return application
 
     async def _add_judge(self, _request: web.Request) -> web.Response:
@@ -91,13 +89,13 @@ class ListeningTest:
         return await self._show_state(request)
 
     def _judge(self, request: web.Request) -> int:
-        judge = self._store.find_judge(request.query.get("judge", ""))
+        judge = self._store.judges.get(request.query.get("judge", ""))
         if judge is None:
             raise web.HTTPNotFound(text="this judge is unknown\n")
         return judge
 
     def _next_place(self, judge: int) -> int | None:
-        places, last = places_of_judge(judge, self._study), self._store.last_place(judge)
+        places, last = places_of_judge(judge, self._study), self._store.last_places.get(judge)
         place = min(places) if last is None else last + 1
         return place if place in places else None
 
@@ -118,9 +116,7 @@ async def serve(
     server = WebServer(
         listening,
         endpoint.tls,
-        on_refused=lambda address: LOG.warning(
-            "refused a connection from %s: too many are open", address
-        ),
+        on_refused=lambda address: LOG.warning("rejected %s: too many connections", address),
         on_bad_request=lambda: LOG.warning("dropped a request that is not HTTP"),
         address_share=config.address_share,
     )
@@ -140,14 +136,10 @@ async def _send_file(request: web.Request) -> web.StreamResponse:
 async def _read_answer(request: web.Request) -> dict[str, Any]:
     try:
         answer: dict[str, Any] = await request.json()
-        place, scores = answer["place"], [answer[scale] for scale in SCALES]
-        is_valid = (
-            all(type(value) is int for value in (place, *scores))
-            and all(1 <= score <= 5 for score in scores)
-            and answer["language"] in LANGUAGES
-        )
+        numbers = [answer[name] for name in ("place", *SCALES)]
+        is_valid = all(type(number) is int for number in numbers)
+        if is_valid and {*numbers[1:]} <= {1, 2, 3, 4, 5} and answer["language"] in LANGUAGES:
+            return answer
     except (ValueError, TypeError, KeyError, RecursionError):
-        is_valid = False
-    if not is_valid:
-        raise web.HTTPBadRequest(text="send JSON with a place, scores of 1 to 5, and a language\n")
-    return answer
+        pass
+    raise web.HTTPBadRequest(text="send JSON with a place, scores of 1 to 5, and a language\n")

@@ -50,8 +50,8 @@ class Store:
             raise UserError(
                 f"{folder}: another process is serving this study; stop it first"
             ) from None
-        self._judges: dict[str, int] = {}  # number by token
-        self._last_places: dict[int, int] = {}
+        self.judges: dict[str, int] = {}  # number by token
+        self.last_places: dict[int, int] = {}  # that a judge has scored
         for line in _read_lines(path):
             self._note(line)
         self._file.write("\n")  # ends a line that a crash has cut
@@ -62,19 +62,11 @@ class Store:
 
     def add_judge(self) -> str | None:
         """Add a judge and return their token, or None if there are MAX_JUDGES."""
-        if len(self._judges) >= MAX_JUDGES:
+        if len(self.judges) >= MAX_JUDGES:
             return None
         token = secrets.token_urlsafe(16)
-        self._append([{"judge": len(self._judges), "token": token, "unix_s": time.time()}])
+        self._append([{"judge": len(self.judges), "token": token, "unix_s": time.time()}])
         return token
-
-    def find_judge(self, token: str) -> int | None:
-        """Return the number of the judge with a token."""
-        return self._judges.get(token)
-
-    def last_place(self, judge: int) -> int | None:
-        """Return the last place that a judge has scored."""
-        return self._last_places.get(judge)
 
     def add(self, answers: Sequence[Answer]) -> None:
         """Save the scores of one video."""
@@ -89,9 +81,9 @@ class Store:
 
     def _note(self, line: dict[str, Any]) -> None:
         if "token" in line:
-            self._judges[line["token"]] = line["judge"]
+            self.judges[line["token"]] = line["judge"]
         else:
-            self._last_places[line["judge"]] = line["place"]
+            self.last_places[line["judge"]] = line["place"]
 
 
 def read_answers(folder: Path) -> list[Answer]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -28,7 +27,7 @@ LANGUAGES = ("zh", "en")  # of the page
 SCALES = ("sync", "realism")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Study:
     """Contents of ``study.json``."""
 
@@ -41,14 +40,7 @@ class Study:
     files: dict[tuple[str, str], Path] = field(repr=False)  # by sentence and condition
 
 
-def new_study(
-    folder: Path,
-    *,
-    title: str = "",
-    reference: str = "",
-    anchor: str = "",
-    conditions: Collection[str] = (),
-) -> Study:
+def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str = "") -> Study:
     """Find the videos ``CONDITION/SENTENCE.mp4`` of a folder and write ``study.json``.
 
     Raises UserError if the folder already is a study, lacks videos, or has one without sound.
@@ -57,15 +49,14 @@ def new_study(
     if file.exists():
         raise UserError(f"{file} exists, and answers may refer to it; use another folder")
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
-    _check_names(conditions, {path.parent.name for path in videos})
     content = {
         "title": title or folder.resolve().name,
         "reference": reference,
         "anchor": anchor,
         "stimuli": [
-            {"sentence": path.stem, "condition": name, "file": str(path.relative_to(folder))}
+            {"sentence": path.stem, "condition": name, "file": f"{name}/{path.name}"}
             for path in videos
-            if (name := path.parent.name) in conditions or not conditions
+            if (name := path.parent.name)
         ],
     }
     study = _parse(folder, content)
@@ -101,27 +92,16 @@ def _parse(folder: Path, content: Any) -> Study:
         files[str(entry["sentence"]), str(entry["condition"])] = path
     if not files:
         raise UserError(f"{folder} has no videos; name them CONDITION/SENTENCE.mp4")
-    study = Study(
-        folder=root,
-        title=str(content["title"]),
-        sentences=tuple(dict.fromkeys(sentence for sentence, _ in files)),
-        conditions=tuple(dict.fromkeys(condition for _, condition in files)),
-        reference=str(content["reference"]),
-        anchor=str(content["anchor"]),
-        files=files,
-    )
-    for sentence, condition in product(study.sentences, study.conditions):
+    sentences, conditions = (tuple(dict.fromkeys(names)) for names in zip(*files, strict=True))
+    for sentence, condition in product(sentences, conditions):
         if (sentence, condition) not in files:
             raise UserError(f"sentence {sentence!r} has no video in condition {condition!r}")
-    _check_names([name for name in (study.reference, study.anchor) if name], study.conditions)
-    return study
-
-
-def _check_names(names: Collection[str], conditions: Collection[str]) -> None:
-    for name in names:
-        if name not in conditions:
+    title, reference, anchor = (str(content[key]) for key in ("title", "reference", "anchor"))
+    for name in (reference, anchor):
+        if name and name not in conditions:
             known = ", ".join(sorted(conditions))
             raise UserError(f"no condition is named {name!r}; choose from {known}")
+    return Study(root, title, sentences, conditions, reference, anchor, files)
 
 
 def williams_design(num_conditions: int) -> NDArray[np.int64]:

@@ -183,7 +183,6 @@ def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served
     result = CliRunner().invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     report = json.loads(figures.read_text())
-    assert (report["num_judges"], report["num_finished"]) == (2, 2)
     means = {
         f"{opinion['scale']} {opinion['condition']}": opinion["of_all"]["value"]
         for opinion in report["opinions"]

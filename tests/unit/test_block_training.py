@@ -70,14 +70,6 @@ def test_a_block_needs_only_its_right_context(block_length: int) -> None:
         assert (outputs(network, changed, block_length)[block] - whole[block]).abs().max() > 1e-4
 
 
-def test_a_single_block_is_read_like_a_window() -> None:
-    network = small_network()
-    laid = layout(9, 9)
-    features = torch.randn(2, 9, 96)
-    read = network.readout.read(features, laid).flatten(1, 2)
-    torch.testing.assert_close(read, network.readout(features), rtol=0, atol=1e-5)
-
-
 def test_the_teacher_gets_the_clean_audio(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_DISTURB_PROB", 0.0)
     batch = block_batch(RECORDINGS, 0, 1)
@@ -95,7 +87,7 @@ def test_the_teacher_gets_the_clean_audio(monkeypatch: pytest.MonkeyPatch) -> No
     assert (disturbed.frames[0] - batch.frames[0]).abs().mean() > 0.05
 
 
-@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("number", range(2))
 def test_codecs_and_clipping_do_not_shift_the_audio(
     number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

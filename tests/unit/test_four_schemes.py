@@ -10,7 +10,6 @@ import pytest
 import soundfile
 from typer.testing import CliRunner
 
-from kouxing.corpora.speech_corpus import Utterance
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.four_schemes import (
     Condition,
@@ -21,10 +20,8 @@ from kouxing.evaluation.lips.four_schemes import (
     without_corrections,
 )
 from kouxing.evaluation.lips.measures import rms_jerk
-from kouxing.evaluation.lips.scheme_scores import first_hypotheses, is_decreasing
-from kouxing.evaluation.lips.scheme_videos import tracked_frames
+from kouxing.evaluation.lips.scheme_scores import first_hypotheses
 from kouxing.evaluation.lips.schemes import drop_first_hypotheses
-from kouxing.evaluation.lips.sentences import choose
 from kouxing.evaluation.mos.commands import app as mos
 from kouxing.services.driver.video import film
 from kouxing.services.lip_models import lip_model_info
@@ -33,7 +30,7 @@ from kouxing.services.synthesizer.face_animator import Frame
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.media_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
-from tests.lips import JAW, WIDTH, clip_of, phone
+from tests.lips import phone
 from tests.videos import write_video
 
 pytestmark = pytest.mark.unit
@@ -41,28 +38,11 @@ pytestmark = pytest.mark.unit
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
 
-def test_interpolates_tracked_lips() -> None:
-    time_s, faps = np.array([0.0, 0.1, 0.2]), np.full((3, len(MOUTH_FAPS)), np.nan)
-    faps[:, JAW] = 0.0, np.nan, 100.0
-    mouth = tracked_frames(clip_of(time_s, faps), np.array([0.05, 0.1, 0.9]))
-    np.testing.assert_allclose(mouth[:, 2], [25.0, 50.0, 100.0])
-    assert not mouth[:, 3:].any()
-    faps[:, WIDTH] = -50.0
-    mouth = tracked_frames(clip_of(time_s, faps), np.array([0.05]))
-    assert mouth[0, [5, 52]].tolist() == [-50.0, -50.0], "outer lips follow the inner ones"
-
-
 def test_jerk_is_the_third_derivative() -> None:
     time_s = np.arange(50) / 50.0
     assert rms_jerk([time_s**3, -(time_s**3)], 50.0) == pytest.approx(6.0)
     assert rms_jerk([time_s**2], 50.0) == pytest.approx(0.0, abs=1e-6)
     assert rms_jerk([np.zeros(3)], 50.0) is None
-
-
-def test_an_order_holds_if_every_scheme_is_worse_than_the_one_before() -> None:
-    assert is_decreasing(np.array([1.0, 0.8, 0.7, 0.6]))
-    assert not is_decreasing(np.array([1.0, 0.8, 0.8, 0.6]))
-    assert not is_decreasing(np.array([1.0, 0.7, 0.8, 0.6]))
 
 
 def test_times_the_first_hypothesis_of_each_phone() -> None:
@@ -153,30 +133,6 @@ def test_live_schemes_use_the_recognizers_rule() -> None:
         output = RecognizerOutput(nothing, events, has_paper_rule)
         assert face_input(Condition(3, lips, "gmm"), output) == live
         assert face_input(Condition(4, lips, "gmm"), output) == next_phone
-
-
-def utterance(name: str, speaker: str, seconds: float) -> Utterance:
-    return Utterance(
-        utterance_id=name,
-        path=Path(name),
-        speaker=speaker,
-        split="test",
-        seconds=seconds,
-        phones=(0,),
-        syllables=(1,),
-    )
-
-
-def test_chooses_sentences_of_all_speakers_near_4_s() -> None:
-    utterances = [
-        utterance("a-long", "A", 9.0),
-        utterance("a-usual", "A", 4.1),
-        utterance("a-short", "A", 3.0),
-        utterance("b-long", "B", 8.0),
-    ]
-    assert [each.utterance_id for each in choose(utterances, 2)] == ["a-usual", "b-long"]
-    assert [each.utterance_id for each in choose(utterances, 3)] == ["a-short", "a-usual", "b-long"]
-    assert len(choose(utterances)) == 4
 
 
 def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:

@@ -94,15 +94,6 @@ def test_a_resting_mouth_has_no_closures() -> None:
     assert closures_at(1.0, np.minimum(mouth((1.0, 1.0)), 99.0)).made == 0
 
 
-def test_real_lips_agree_with_themselves() -> None:
-    real = mouth((0.5, 0.52), (1.0, 1.6), (2.0, 2.0), (2.4, 3.6))
-    real_s, shut_s = real_closures(TIME_S, real), real_closed(TIME_S, real)
-    assert len(shut_s) == 2 + 31 + 1 + 61
-    assert closures(real_s, shut_s, TIME_S, real) == Detections(4, 4, 4, 4)
-    late = np.interp(TIME_S - 0.2, TIME_S, real)  # too late but in the pauses, which last
-    assert closures(real_s, shut_s, TIME_S, late) == Detections(4, 0, 4, 2)
-
-
 def test_finds_openings_in_any_range() -> None:
     curve = mouth((0.5, 1.0), (2.0, 2.2))
     # three tenths of the way from the last shut frame to the first open one

@@ -20,10 +20,8 @@ from kouxing.evaluation.lips.schemes import (
     RecognizedClip,
     Scheme,
     is_speech,
-    labials,
     live_events,
     loudness_frames,
-    quietest_moments,
 )
 from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool, score_clip
 from kouxing.evaluation.lips.viseme_fit import fit_clip, fit_figure, viseme_errors
@@ -118,17 +116,6 @@ def test_measures_lag_openings_and_closures() -> None:
     assert score.closures.real == score.openings == score.bpm == 0
 
 
-def test_skips_measures_that_a_clip_lacks() -> None:
-    time_s = np.arange(0.0, 1.0, 0.04)
-    jaw_only = np.full((len(time_s), len(MOUTH_FAPS)), np.nan)
-    jaw_only[:, MOUTH_FAPS.index(3)] = 10.0
-    made = {"made": np.random.default_rng(0).normal(size=(51, NUM_FAPS))}
-    score = scores_of(recognized(clip_of(time_s, jaw_only)), made)[0]
-    assert list(score.curves) == ["jaw"]
-    assert score.closures.real == score.openings == 0
-    assert score.closures.recall is None
-
-
 def test_speech_is_loud_voice_activity() -> None:
     samples = np.full(3 * SAMPLE_RATE_HZ, 0.1, dtype=np.float32)
     samples[SAMPLE_RATE_HZ : 2 * SAMPLE_RATE_HZ] = 1e-4  # a pause that voice activity spans
@@ -189,25 +176,6 @@ def test_loudness_opens_the_mouth() -> None:
     assert faps[17, 4] < -100.0
     assert abs(loudness_frames(samples, 0.0)[17, 4]) < 1.0
     np.testing.assert_array_equal(loudness_frames(samples, 0.3), faps)
-
-
-def test_finds_the_quietest_moment_of_a_phone() -> None:
-    phones = utterance(4, 20)
-    closing = [phone for phone in phones if phone.symbol == "b"]
-    samples = np.random.default_rng(0).normal(0.0, 0.1, 8 * SAMPLE_RATE_HZ).astype(np.float32)
-    quiet_s = [phone.onset_s + 0.3 * phone.duration_s for phone in closing]
-    for time_s in quiet_s:
-        middle = round(time_s * SAMPLE_RATE_HZ)
-        samples[middle - 200 : middle + 200] = 0.0
-    clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    results = labials(recognized(clip, phones))
-    np.testing.assert_allclose(quietest_moments(clip, results), quiet_s, atol=0.011)
-    # only phones in the model's language count
-    english = replace(clip, language="en")
-    assert labials(recognized(english, phones)) == []
-    theirs = replace(INVENTORY, code="en", visemes={**INVENTORY.visemes, "d": (("b", 1.0),)})
-    lips = replace(recognized(english, phones), inventory=theirs)
-    assert {phone.symbol for phone in labials(lips)} == {"b", "d"}
 
 
 def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: str = "zh") -> None:

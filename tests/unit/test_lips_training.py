@@ -20,7 +20,6 @@ from kouxing.services.recognizer.lip_predictor import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import Phone
 from kouxing.training.lips import recipe
 from kouxing.training.lips.positions import Speech
 from kouxing.training.lips.recipe import (
@@ -74,13 +73,6 @@ def test_targets_are_the_delayed_lips() -> None:
     assert targets[1, 0, CLOSURE] == 0
     early = targets_at(clip, None, CLOSED_AT, np.array([0.05]), [0.0])
     assert early[0, 0, CLOSURE] == 1
-
-
-def test_the_lip_touches_the_teeth_in_f() -> None:
-    clip = clip_with(np.zeros(51))
-    phone = Phone(index=0, symbol="f", onset_s=0.5, duration_s=0.1, confidence=1.0, final=True)
-    targets = targets_at(clip, [phone], CLOSED_AT, np.array([0.45, 0.55, 0.65]), [0.0])
-    assert targets[:, 0, -1].tolist() == [0, 1, 0]
 
 
 def test_lips_touch_in_the_lowest_tenth_of_the_range() -> None:

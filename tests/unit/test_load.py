@@ -7,14 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, cast
 
-import numpy as np
 import pytest
 from kouxing_client import FapFrame, Session
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import bench_app
 from kouxing.evaluation.system import latency
-from kouxing.evaluation.system.load import Load, Spoken, Step, voiced
+from kouxing.evaluation.system.load import Load, Spoken, Step
 
 pytestmark = pytest.mark.unit
 
@@ -48,13 +47,6 @@ def test_ignores_frames_at_rest() -> None:
     arrived_s = dict(spoken.arrived_s)
     spoken.record(second)
     assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
-
-
-def test_speakers_differ_in_voice_and_position() -> None:
-    text = np.sin(np.cumsum(np.linspace(0.01, 1.0, 16_000))).astype(np.float32)
-    sounds = [voiced(text, number) for number in range(12)]
-    assert np.array_equal(sounds[0], text)
-    assert len({sound.tobytes() for sound in sounds}) == len(sounds)
 
 
 def _step(number: int, worst_p95_ms: float) -> Step:

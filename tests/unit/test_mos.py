@@ -78,14 +78,6 @@ def test_every_condition_follows_every_other_equally_often(n: int) -> None:
     assert len(set(pairs.values())) <= 1
 
 
-@pytest.mark.parametrize("num_conditions", [1, 2, 3, 4])
-@pytest.mark.parametrize("num_sentences", [1, 3, 8])
-def test_a_judge_sees_every_video_once(num_conditions: int, num_sentences: int) -> None:
-    study = study_of(SENTENCES[:num_sentences], CONDITIONS[:num_conditions])
-    for judge in range(9):
-        assert sorted(order_of(judge, study)) == sorted(study.files)
-
-
 def test_consecutive_judges_see_every_condition_at_every_place() -> None:
     orders = [order_of(judge, study_of(SENTENCES, CONDITIONS)) for judge in range(4, 8)]
     for cells in zip(*orders, strict=True):
@@ -94,15 +86,6 @@ def test_consecutive_judges_see_every_condition_at_every_place() -> None:
         sentences = [sentence for sentence, _ in order]
         for block in range(0, len(sentences) - 4, 4):
             assert len(set(sentences[block : block + 8])) == 8, "a sentence returns too soon"
-
-
-@pytest.mark.parametrize("roles", [("real", "still"), ("", "")])
-def test_practice_shows_the_extremes_first(roles: tuple[str, str]) -> None:
-    study = study_of(SENTENCES, CONDITIONS, reference=roles[0], anchor=roles[1])
-    places = places_of_judge(0, study)
-    assert list(places) == list(range(-2, len(study.files)))
-    expected = roles if any(roles) else CONDITIONS[:2]
-    assert (places[-2][1], places[-1][1]) == expected
 
 
 def test_creates_a_study_from_folders(folder: Path) -> None:
@@ -114,14 +97,13 @@ def test_creates_a_study_from_folders(folder: Path) -> None:
 
 
 def test_rejects_a_study_with_gaps_or_unknown_conditions(folder: Path) -> None:
-    with pytest.raises(UserError, match="no condition is named 'ideal'"):
+    with pytest.raises(
+        UserError, match="no condition is named 'ideal'; choose from late, live, real, still"
+    ):
         new_study(folder, reference="ideal")
-    with pytest.raises(UserError, match="choose from late, live, real, still"):
-        new_study(folder, conditions=["ideal"])
     (folder / "late" / "c.mp4").unlink()
     with pytest.raises(UserError, match="sentence 'c' has no video in condition 'late'"):
         new_study(folder)
-    assert len(new_study(folder, conditions=["real", "live"]).files) == 16
 
 
 def test_rejects_videos_without_sound(folder: Path) -> None:
@@ -163,14 +145,14 @@ def answers_of(judge: int, place: int, condition: str, score: int, sentence: str
 def test_answers_survive_a_crash_in_the_middle_of_a_line(tmp_path: Path) -> None:
     store = Store(tmp_path)
     token = store.add_judge() or ""
-    assert store.find_judge("") is None
+    assert "" not in store.judges
     store.add(answers_of(0, 0, "live", 4, "a"))
     store.close()
     with (tmp_path / ANSWERS).open("a") as file:
         file.write('{"judge": 0, "pla')
     store = Store(tmp_path)
-    assert store.find_judge(token) == 0
-    assert store.last_place(0) == 0
+    assert store.judges[token] == 0
+    assert store.last_places[0] == 0
     store.add(answers_of(0, 1, "live", 5, "b"))
     store.close()
     assert [answer.score for answer in read_answers(tmp_path)] == [4, 4, 5, 5]
@@ -191,7 +173,7 @@ def test_limits_the_number_of_judges(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("kouxing.evaluation.mos.store.MAX_JUDGES", 2)
     store = Store(tmp_path)
     tokens = [store.add_judge() for _ in range(3)]
-    assert [token and store.find_judge(token) for token in tokens] == [0, 1, None]
+    assert [token and store.judges[token] for token in tokens] == [0, 1, None]
     store.close()
 
 
@@ -221,15 +203,6 @@ def test_intervals_are_over_judges() -> None:
     assert mean.value == pytest.approx(3.8)
     assert mean.half_width == pytest.approx(4.3027 * np.sqrt(1.5 * 4.16) / 5, abs=1e-4)
     assert mean_of(scores_of([3, 4])).half_width is None
-
-
-def test_reports_means_with_and_without_outliers() -> None:
-    opinion = opinion_of("sync", "live", scores_of([4, 4, 4, 5], [4, 5, 5, 1]))
-    assert opinion.num_outliers == 1
-    # The judges' means are 17/4 and 14/3; sums exceed theirs by -5/7 and 5/7, t(0.975, 1) = 12.706.
-    assert opinion.without_outliers.value == pytest.approx(31 / 7)
-    assert opinion.without_outliers.half_width == pytest.approx(12.706 * 10 / 7 / 7, abs=1e-3)
-    assert opinion.of_all.value == pytest.approx(4.0)
 
 
 def test_box_plots_leave_out_practice() -> None:
@@ -263,7 +236,6 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     assert result.exit_code == 0, result.output
     assert files[0].stat().st_size > 1000
     figures = json.loads(files[1].read_text())
-    assert (figures["num_judges"], figures["num_finished"]) == (2, 1)
     means = {each["condition"]: each["of_all"]["value"] for each in figures["opinions"]}
     assert means == pytest.approx(given)
     text = StringIO()

@@ -15,7 +15,6 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import (
     read_archive,
     shipped_phone_lm,
-    write_archive,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
@@ -99,16 +98,6 @@ def test_smooths_like_witten_and_bell() -> None:
     assert step(graph, after_5_2, 4) > step(graph, after_5_2, 3)
 
 
-def test_n_grams_do_not_cross_pauses() -> None:
-    grams = grams_of(
-        estimate_phone_lm([stream_of([[1, 2], [3, 4], [5]] * 3, MANDARIN)], MANDARIN, order=6)
-    )
-    assert max(map(len, grams)) == 4
-    assert all(SIL not in gram[1:-1] for gram in grams)
-    assert {(SIL, 1, 2, SIL), (SIL, 3, 4, SIL), (SIL, 5, SIL)} <= grams.keys()
-    assert not {(2, 3), (2, SIL, 3), (4, 5), (SIL, SIL)} & grams.keys()
-
-
 @pytest.mark.parametrize("max_ngrams", [20, 100, 400])
 def test_keeps_about_the_requested_number_of_n_grams(max_ngrams: int) -> None:
     stream = wandering()
@@ -122,17 +111,6 @@ def test_keeps_about_the_requested_number_of_n_grams(max_ngrams: int) -> None:
     assert grams_of(kept).keys() <= grams_of(whole).keys()
     all_grams = grams_of(whole)
     assert grams_of(kept) == pytest.approx({gram: all_grams[gram] for gram in grams_of(kept)})
-
-
-def test_keeps_the_most_informative_n_grams() -> None:
-    """1 2 is as frequent as its phones make it; 3 is always followed by 4."""
-    rng = np.random.default_rng(0)
-    some = [rng.permutation([1, 2, 5, 6, 7, 8]).tolist() for _ in range(50)]
-    phone_lm = estimate_phone_lm(
-        [stream_of([*some, *[[3, 4]] * 30], MANDARIN)], MANDARIN, order=2, max_ngrams=12
-    )
-    assert (3, 4) in grams_of(phone_lm)
-    assert (1, 2) not in grams_of(phone_lm)
 
 
 # --- words drawn from a language model
@@ -298,17 +276,6 @@ def test_trains_on_texts_and_corpora(corpus: Path, tmp_path: Path) -> None:
     assert other.read_bytes() == output.read_bytes()
 
 
-def test_corpus_sentences_get_a_hundredth_of_the_weight(corpus: Path, tmp_path: Path) -> None:
-    text = written(tmp_path / "a.txt", "你好。\n" * 1000)
-    output = tmp_path / "l.npz"
-    train_phone_lm([corpus], [text], output, MANDARIN, order=2, report=lambda _: None)
-    num_spoken = 1 + len(SENTENCE)
-    times = round(0.012 * 5000 / num_spoken)
-    expected = (times + 0.5) / (5000 + times * num_spoken - 1 + NUM_PHONES / 2)
-    found = Table.of(load_phone_lm(output, MANDARIN)).log_prob[INDEX["m"],]
-    assert found == pytest.approx(np.log(expected), abs=0.03)
-
-
 def test_rejects_unreadable_texts_and_empty_input(tmp_path: Path) -> None:
     output = tmp_path / "lm.npz"
     foreign = tmp_path / "foreign.txt"
@@ -323,18 +290,6 @@ def test_rejects_unreadable_texts_and_empty_input(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no text to count"):
         train_phone_lm([], [], output, MANDARIN)
     assert not output.exists()
-
-
-def test_rejects_files_without_a_phone_lm(tmp_path: Path) -> None:
-    path = tmp_path / "lm.npz"
-    with pytest.raises(UserError, match=r"lm\.npz"):
-        load_phone_lm(path, MANDARIN)
-    path.write_bytes(b"no archive")
-    with pytest.raises(UserError, match=r"lm\.npz"):
-        load_phone_lm(path, MANDARIN)
-    write_archive(path, {"language": np.array("mandarin"), "phones": np.array(MANDARIN.phones)})
-    with pytest.raises(UserError, match=r"lm\.npz has no phone language model: lm_children is"):
-        load_phone_lm(path, MANDARIN)
 
 
 def test_a_model_does_not_store_the_shipped_phone_lm(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from kouxing.evaluation.lips.speaking_rates import (
     STILL,
     accuracy_of,
     bounds,
-    mean_mouths,
     scale_openings,
 )
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
@@ -45,14 +44,6 @@ def test_scales_every_speaker_to_the_same_opening() -> None:
     assert np.nanmax(scaled[0][:, MOUTH_FAPS.index(52)]) == pytest.approx(0.0)
     np.testing.assert_allclose(scaled[0], 2.0 * scaled[2])
     assert scaled[1][4] == pytest.approx(real[4], rel=0.1)
-
-
-def test_mean_mouths_ignore_unmeasured_values() -> None:
-    mouths = np.array([[1.0, 2.0], [9.0, 9.0], [3.0, np.nan], [5.0, np.nan], [0.0, np.nan]])
-    np.testing.assert_array_equal(mean_mouths(["a", "b", "a", "a", "i"], mouths), [[3.0, 2.0]])
-    unmeasured = np.where([True, False], mouths, np.nan)
-    np.testing.assert_array_equal(mean_mouths(["a"] * 5, unmeasured), [[3.6, np.nan]])
-    assert mean_mouths([], mouths[:0]).shape == (0, 2)
 
 
 def test_bounds_of_one_opening_and_of_a_still_mouth() -> None:

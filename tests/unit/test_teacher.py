@@ -90,7 +90,7 @@ def test_the_encoder_computes_its_formulas() -> None:
     np.testing.assert_allclose(found, np.hstack(after[1:]), atol=1e-4)
 
 
-@pytest.mark.parametrize("num_frames", [1, 2, 19, 20, 21, 45])
+@pytest.mark.parametrize("num_frames", [1, 20, 45])
 def test_cuts_long_recordings_into_pieces(num_frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(teacher, "_PIECE_FRAMES", 20)
     encoder = whole_encoder()
@@ -101,21 +101,6 @@ def test_cuts_long_recordings_into_pieces(num_frames: int, monkeypatch: pytest.M
     for start in range(0, num_frames, 20):
         alone = encoder.features(samples[160 * start : 160 * (start + 20) + 240])
         np.testing.assert_array_equal(features[start // 2 : start // 2 + 10], alone)
-
-
-def test_a_position_encodes_two_frames() -> None:
-    """A click in the middle of two frames is largest in the position whose output they are."""
-    encoder = whole_encoder()
-    with torch.no_grad():
-        for parameter in encoder.parameters():
-            parameter.zero_()  # layers change nothing
-        encoder.positions.zero_()
-        encoder.first.weight[:, :, 1] = 1 / NUM_MELS
-        encoder.second.weight[:, :, 1] = 1 / 32
-    for pair in (0, 1, 17, 48):
-        samples = np.zeros(16_000, np.int16)
-        samples[320 * pair + 280] = 20_000
-        assert encoder.features(samples)[:, 0].argmax() == pair
 
 
 # --- the readout

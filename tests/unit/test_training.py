@@ -20,7 +20,6 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.features import NUM_BANDS
 from kouxing.services.recognizer.search.decoder import Segment
 from kouxing.services.recognizer.search.forced_path import (
-    segments_of_path,
     utterance_graph,
     viterbi_path,
 )
@@ -36,7 +35,7 @@ from kouxing.training.gmm.estimation import (
 )
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
-from kouxing.training.training_set import Example, load_examples, speech_span
+from kouxing.training.training_set import Example, load_examples
 from tests.languages import MANDARIN, SIL
 
 pytestmark = pytest.mark.unit
@@ -186,14 +185,6 @@ def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
         read_corpus(tmp_path, RowErrors(), MANDARIN)
 
 
-@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "long"])
-def test_reports_invalid_lengths(seconds: str, tmp_path: Path) -> None:
-    write_corpus(tmp_path, [f"a\t0.wav\tA\tx\tMIT\ttrain\t{seconds}\t你\tni3"])
-    errors = RowErrors()
-    assert read_corpus(tmp_path, errors, MANDARIN) == []
-    assert len(errors.messages) == 1
-
-
 def test_pinyin_takes_precedence_over_the_text(tmp_path: Path) -> None:
     """Polyphones, er-hua, ü and syllables without an initial; the text is not asked."""
     write_corpus(
@@ -263,16 +254,10 @@ def test_uses_the_cache_and_reports_unreadable_audio(
     np.testing.assert_array_equal(first[0], again[0])
 
 
-def test_trims_long_silence() -> None:
-    log_mel = np.full((400, 41), 7.0, np.float16)
-    log_mel[150:250] = 18.0
-    assert len(log_mel[speech_span(log_mel)]) == 150
-
-
 # --- paths
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first_state = np.arange(len(MANDARIN) + 1)  # one state each: sil a sil b sil
@@ -302,22 +287,6 @@ def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
     assert len(path) == num_frames
 
 
-def test_pauses_are_optional_and_phones_are_not() -> None:
-    graph = utterance_graph([0, 21], [2], FIRST_STATE, silence=SIL)
-    wanted = np.repeat([0, 1, 2, 3, 4, 5], 2)  # the positions of b and a, no pause
-    scores = np.full((12, len(graph.states)), -20.0, np.float32)
-    scores[np.arange(12), wanted + 3] = 0.0
-    half = np.full(len(MANDARIN) * 3, np.log(0.5), np.float32)
-    path, _ = viterbi_path(scores, graph, half, half)
-    assert [(MANDARIN.phones[u.phone], u.start, u.end) for u in segments_of_path(path, graph)] == [
-        ("b", 0, 6),
-        ("a", 6, 12),
-    ]
-    path, likelihood = viterbi_path(scores[:5], graph, half, half)
-    assert len(path) == 0
-    assert likelihood == -np.inf
-
-
 # --- estimation
 
 
@@ -339,17 +308,6 @@ def test_the_likelihood_never_falls() -> None:
             now = frames.realign(hmm)
             assert now >= before - 1e-3
             before = now
-
-
-def test_one_gaussian_has_mean_and_variance() -> None:
-    frames = frame_set(10)
-    hmm = estimate(frames, first_estimate(frames, FIRST_STATE))
-    state = int(FIRST_STATE[SIL])
-    x = frames.features[frames.states == state]
-    floor = 0.05 * frames.features.var(axis=0)
-    np.testing.assert_allclose(hmm.mixtures.means[state, 0], x.mean(axis=0), atol=1e-3)
-    expected = np.maximum(x.var(axis=0), floor)
-    np.testing.assert_allclose(hmm.mixtures.covars[state, 0], expected, rtol=1e-2, atol=1e-3)
 
 
 def test_decorrelation_keeps_the_likelihood() -> None:

@@ -4,15 +4,14 @@
 import { languageFor } from "./language.js";
 
 // The five grades of ITU-T P.910 (absolute category rating), best first.
-const GRADES = [
-  [5, "Excellent", "优"], [4, "Good", "良"], [3, "Fair", "中"], [2, "Poor", "差"], [1, "Bad", "劣"],
-];
+const GRADES = [[5, "Excellent", "优"], [4, "Good", "良"], [3, "Fair", "中"], [2, "Poor", "差"], [1, "Bad", "劣"]];
 const RETRY_MS = 2000;
 
 const element = (name) => document.getElementById(name);
 const secrets = new URLSearchParams(location.hash.slice(1)); // a fragment is never sent
 const scales = [...document.querySelectorAll("fieldset[data-scale]")];
 const address = (path) => `${path}?${secrets}`;
+const say = (en, zh) => (document.documentElement.lang === "zh" ? zh : en);
 let place = null;
 
 /** Send a request; return the answer, or show the error and throw it. */
@@ -24,7 +23,7 @@ async function request(path, body) {
     return await answer.json();
   } catch (error) {
     if (error.status === 404) showPart("welcome"); // this study does not know the judge
-    notify(`${say({ en: "This did not work. Please try again.", zh: "未能送达，请重试。" })} (${error.message})`);
+    notify(`${say("This did not work. Please try again.", "未能送达，请重试。")} (${error.message})`);
     throw error;
   }
 }
@@ -36,6 +35,7 @@ function notify(text) {
 
 function showPart(shown) {
   for (const name of ["welcome", "task", "end"]) element(name).hidden = name !== shown;
+  element("begin").disabled = false;
 }
 
 function show(state) {
@@ -47,26 +47,27 @@ function show(state) {
   element("practice").hidden = place >= 0;
   element("progress").value = Math.max(place, 0);
   element("scores").reset();
-  setDisabled(true);
-  element("send").disabled = true;
+  for (const part of [...scales, element("send")]) part.disabled = true;
   element("play").disabled = false;
   element("video").src = address(`stimulus/${place}`);
   scrollTo(0, 0);
 }
 
-function setDisabled(isDisabled) {
-  for (const scale of scales) scale.disabled = isDisabled;
-}
-
-/** Return the text in the page's language, "en" or "zh". */
-function say(texts) {
-  return texts[document.documentElement.lang];
-}
-
 function chooseLanguage(language) {
   document.documentElement.lang = language;
-  element("progress").ariaLabel = say({ en: "rated videos", zh: "已评视频" });
-  element("language").textContent = say({ en: "中文", zh: "English" });
+  element("progress").ariaLabel = say("rated videos", "已评视频");
+  element("language").textContent = say("中文", "English");
+}
+
+/** Run an action with its button disabled, so that a second click does nothing. */
+async function once(button, action) {
+  element(button).disabled = true;
+  try {
+    await action();
+  } catch (error) {
+    element(button).disabled = false;
+    notify(element("notice").textContent || error.message);
+  }
 }
 
 for (const scale of scales) {
@@ -77,48 +78,33 @@ for (const scale of scales) {
     scale.insertAdjacentHTML("beforeend", `<label>${input}${texts}</label>`);
   }
 }
-element("language").addEventListener("click", () => {
-  chooseLanguage(document.documentElement.lang === "zh" ? "en" : "zh");
-});
-element("begin").addEventListener("click", async () => {
-  element("begin").disabled = true; // a second click must not add a second judge
-  try {
-    secrets.set("judge", (await request("judges", {})).judge);
-    history.replaceState(null, "", `#${secrets}`);
-    show(await request("state"));
-  } finally {
-    element("begin").disabled = false;
-  }
-});
-element("play").addEventListener("click", async () => {
-  element("play").disabled = true;
-  try {
-    element("video").currentTime = 0;
-    await element("video").play();
-  } catch (error) {
-    element("play").disabled = false;
-    notify(`${say({ en: "The video cannot be played.", zh: "无法播放。" })} (${error.message})`);
-  }
-});
+element("language").addEventListener("click", () => chooseLanguage(say("zh", "en")));
+element("begin").addEventListener("click", () => once("begin", async () => {
+  secrets.set("judge", (await request("judges", {})).judge);
+  history.replaceState(null, "", `#${secrets}`);
+  show(await request("state"));
+}));
+element("play").addEventListener("click", () => once("play", async () => {
+  element("video").currentTime = 0;
+  await element("video").play();
+}));
 element("video").addEventListener("pause", () => { // a phone pauses it when another app is opened
   element("play").disabled = element("video").ended;
 });
-element("video").addEventListener("ended", () => setDisabled(false));
+element("video").addEventListener("ended", () => {
+  for (const scale of scales) scale.disabled = false;
+});
 element("video").addEventListener("error", () => {
-  notify(say({ en: "The video did not load. Please reload the page.", zh: "视频未能加载，请刷新页面。" }));
+  notify(say("The video did not load. Please reload the page.", "视频未能加载，请刷新页面。"));
 });
 element("scores").addEventListener("change", () => {
   element("send").disabled = scales.some((scale) => !scale.querySelector(":checked"));
 });
-element("scores").addEventListener("submit", async (event) => {
+element("scores").addEventListener("submit", (event) => {
   event.preventDefault();
   const scores = [...new FormData(event.target)].map(([name, value]) => [name, Number(value)]);
-  element("send").disabled = true; // a second click must not send again
-  try {
-    show(await request("answers", { place, ...Object.fromEntries(scores), language: document.documentElement.lang }));
-  } catch {
-    element("send").disabled = false;
-  }
+  const answer = { place, ...Object.fromEntries(scores), language: document.documentElement.lang };
+  once("send", async () => show(await request("answers", answer)));
 });
 addEventListener("hashchange", () => location.reload()); // another judge's address
 chooseLanguage(languageFor(navigator.languages));
