@@ -50,10 +50,7 @@ class AudioInput:
     async def push(self, pcm: bytes) -> None:
         """Take the audio of a binary message of any length; return when more may be read.
 
-        Raises
-        ------
-        UserError
-            If the data does not have the announced format.
+        Raises ``UserError`` if the data does not have the announced format.
         """
         self._format.check_message(pcm)
         pcm = self._incomplete + pcm

@@ -36,10 +36,7 @@ class AudioSession:
     def send(self, pcm: bytes, num_frames: int) -> None:
         """Send ``num_frames`` samples per channel; drop them if the recognizer is too slow.
 
-        Raises
-        ------
-        KouxingError
-            If the session is over.
+        Raises ``KouxingError`` if the session is over.
         """
         if not self.is_closed and not self._session.try_push(pcm):
             self.skip(num_frames)
@@ -60,10 +57,7 @@ class AudioSession:
     def errors(self) -> list[Refused]:
         """Return the recognizer's errors since the last call.
 
-        Raises
-        ------
-        KouxingError
-            If the session is over.
+        Raises ``KouxingError`` if the session is over.
         """
         return [] if self.is_closed else self._session.take_errors()
 
@@ -101,10 +95,7 @@ class AudioSessions:
     async def open(self, session: str = "", **options: object) -> AsyncIterator[AudioSession]:
         """Open a session; on leaving, wait for its last frame and close it.
 
-        Raises
-        ------
-        KouxingError
-            If control refuses or does not answer.
+        Raises ``KouxingError`` if control refuses or does not answer.
         """
         if self._client is None or self._client.is_closed:
             self._client = AsyncClient(

@@ -23,12 +23,9 @@ _VALID_DAYS = 397  # browsers reject certificates that are valid for longer
 def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     """Return the TLS context of a PEM file with a certificate and its private key.
 
-    If the file does not exist, it is created with a self-signed certificate for the hosts.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be read or written, or does not contain a certificate and its key.
+    If the file does not exist, it is created with a self-signed certificate for the hosts. Raises
+    ``UserError`` if the file cannot be read or written, or does not contain a certificate and its
+    key.
     """
     try:
         if not certificate.exists():

@@ -99,10 +99,7 @@ class WebSockets:
     ) -> AsyncIterator[web.WebSocketResponse]:
         """Answer a request with a WebSocket that is open while the context is.
 
-        Raises
-        ------
-        web.HTTPServiceUnavailable
-            If the quota is used up or the gateway is stopping.
+        Raises ``web.HTTPServiceUnavailable`` if the quota is used up or the gateway is stopping.
         """
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
@@ -201,10 +198,7 @@ async def _serve_offers(_request: web.Request) -> web.StreamResponse:
 def _find(folder: Path, name: str, suffixes: Collection[str]) -> Path:
     """Return a file of a folder.
 
-    Raises
-    ------
-    web.HTTPNotFound
-        If the file does not exist or its suffix is not one of ``suffixes``.
+    Raises ``web.HTTPNotFound`` if the file does not exist or its suffix is not one of ``suffixes``.
     """
     path = folder / name
     if path.parent != folder or path.suffix not in suffixes or not path.is_file():

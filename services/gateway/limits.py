@@ -45,10 +45,7 @@ class ConnectionQuota:
     def hold(self, request: web.Request) -> Iterator[None]:
         """Count the connection of a request while the context is open.
 
-        Raises
-        ------
-        web.HTTPServiceUnavailable
-            If a limit is reached.
+        Raises ``web.HTTPServiceUnavailable`` if a limit is reached.
         """
         address = request.remote or ""
         if not self.acquire(address):

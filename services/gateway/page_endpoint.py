@@ -28,10 +28,7 @@ class PageEndpoint:
 def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     """Return the endpoint that a configuration describes, on a port that is already bound.
 
-    Raises
-    ------
-    UserError
-        If the certificate can neither be read nor created.
+    Raises ``UserError`` if the certificate can neither be read nor created.
     """
     host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")

@@ -28,10 +28,7 @@ _FILES = {  # by their first bytes
 class PcmFormat:
     """Sample rate, number of channels and encoding of raw PCM.
 
-    Raises
-    ------
-    UserError
-        If a field is out of range; the text names the field.
+    Raises ``UserError`` if a field is out of range; the text names the field.
     """
 
     sample_rate_hz: int
@@ -62,10 +59,7 @@ class PcmFormat:
     def check_message(self, message: bytes) -> None:
         """Check a binary message.
 
-        Raises
-        ------
-        UserError
-            If it is JSON.
+        Raises ``UserError`` if it is JSON.
         """
         if message[:1] == b"{" and _is_json(message):
             raise UserError(f"expected {self}; this is JSON: send it as a text message")
@@ -73,10 +67,7 @@ class PcmFormat:
     def check_samples(self, pcm: bytes, *, is_first: bool) -> None:
         """Check whole samples. The first ones may be the header of a file.
 
-        Raises
-        ------
-        UserError
-            If they do not have this format; the text says what was expected.
+        Raises ``UserError`` if they do not have this format; the text says what was expected.
         """
         if is_first and (kind := _file_kind(pcm)):
             raise UserError(f"expected {self}; this begins like {kind}")

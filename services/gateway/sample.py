@@ -28,10 +28,7 @@ class Sample:
     async def speak(self) -> None:
         """Speak the sentence in real time.
 
-        Raises
-        ------
-        KouxingError
-            If no session can be opened.
+        Raises ``KouxingError`` if no session can be opened.
         """
         loop = asyncio.get_running_loop()
         source = open_audio(SAMPLE_FILE)

@@ -55,10 +55,7 @@ class ShapeEncoder:
 def parse_shape_query(query: Mapping[str, str]) -> ShapeEncoder | None:
     """Return the encoder that a URL's query asks for; None if it asks for no shapes.
 
-    Raises
-    ------
-    UserError
-        If the shape set or the format does not exist.
+    Raises ``UserError`` if the shape set or the format does not exist.
     """
     shape_set, message_format = query.get("shapes", ""), query.get("format", FORMATS[0])
     if shape_set and shape_set not in SHAPE_SETS:

@@ -35,10 +35,7 @@ _RETRY_S = 1.0  # when the system has no free descriptor
 def bind_port(host: str, port: int) -> socket.socket:
     """Return a listening socket.
 
-    Raises
-    ------
-    UserError
-        If the address is not available; the text names the configuration key.
+    Raises ``UserError`` if the address is not available; the text names the configuration key.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:

@@ -51,10 +51,7 @@ class Peer:
     async def answer(self, offer: str) -> str:
         """Return the SDP answer to a client's offer. It contains all candidates.
 
-        Raises
-        ------
-        UserError
-            If the text is not an offer with an audio track in Opus.
+        Raises ``UserError`` if the text is not an offer with an audio track in Opus.
         """
         try:
             await self._connection.setRemoteDescription(RTCSessionDescription(offer, "offer"))

@@ -61,10 +61,7 @@ class Hello:
 def parse_hello(message: str) -> Hello:
     """Return the first message of a microphone.
 
-    Raises
-    ------
-    UserError
-        If a field is missing or out of range; the text names the field.
+    Raises ``UserError`` if a field is missing or out of range; the text names the field.
     """
     fields = parse_object(message)
     pcm_format = PcmFormat(
@@ -103,10 +100,7 @@ class MicrophoneCommand:
 def parse_command(message: str) -> MicrophoneCommand:
     """Return a later text message of a microphone.
 
-    Raises
-    ------
-    UserError
-        If the message is not a JSON object or a field is out of range.
+    Raises ``UserError`` if the message is not a JSON object or a field is out of range.
     """
     check_text(message, "binary messages of samples, or a JSON object")
     fields = parse_object(message)
@@ -131,10 +125,7 @@ def _parse_lips(fields: Mapping[str, object]) -> str:
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     """Return the face settings of a viewer's command; None if it contains none.
 
-    Raises
-    ------
-    UserError
-        If a name is unknown or a number is out of range.
+    Raises ``UserError`` if a name is unknown or a number is out of range.
     """
     expressions, hold_s = fields.get("express"), fields.get("hold_s", DEFAULT_HOLD_S)
     settings: dict[str, Any] = {}
@@ -153,10 +144,7 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
 def parse_object(message: str) -> dict[str, object]:
     """Return the object of a JSON message.
 
-    Raises
-    ------
-    UserError
-        If the message is not a JSON object.
+    Raises ``UserError`` if the message is not a JSON object.
     """
     try:
         fields = json.loads(message)

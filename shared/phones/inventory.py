@@ -134,10 +134,7 @@ class PhoneInventory:
 def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
     """Read the inventory of a language in ``BUILT_IN`` or of an entry point.
 
-    Raises
-    ------
-    UserError
-        If the language is not installed, or its table is not valid.
+    Raises ``UserError`` if the language is not installed, or its table is not valid.
     """
     package = BUILT_IN.get(language)
     if package is None:

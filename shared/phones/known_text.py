@@ -47,10 +47,7 @@ def _difference(one: Syllable, other: Syllable) -> float:
 def characters_of(text: str, inventory: PhoneInventory) -> Characters:
     """Return the spoken characters of a text, each with its phones.
 
-    Raises
-    ------
-    UserError
-        If the text cannot be read, or does not have one character per syllable.
+    Raises ``UserError`` if the text cannot be read, or does not have one character per syllable.
     """
     characters = "".join(inventory.readable.findall(text))
     syllables = inventory.pronounce(characters)

@@ -29,12 +29,7 @@ def format_phones(
     """Write phones in the order of their onsets as ``table``, ``csv``, ``json`` or ``textgrid``.
 
     ``total_s`` is the length of the recording. A TextGrid and JSON also contain the syllables of a
-    known text.
-
-    Raises
-    ------
-    UserError
-        If the style is unknown.
+    known text. Raises ``UserError`` if the style is unknown.
     """
     if style not in _STYLES:
         raise UserError(f"unknown format {style!r}; choose from {', '.join(_STYLES)}")

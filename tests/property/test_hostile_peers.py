@@ -216,7 +216,7 @@ def synthesizer() -> tuple[Service, Socket, Socket]:
 
 
 @pytest.mark.parametrize("worker", [recognizer, synthesizer])
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(actions=ACTIONS)
 def test_a_worker_answers_after_anything(
     worker: Callable[[], tuple[Service, Socket, Socket]], actions: list[tuple[str, Any]]

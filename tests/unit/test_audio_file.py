@@ -33,19 +33,15 @@ def test_resamples_rates_above_48_khz(tmp_path: Path) -> None:
     np.testing.assert_allclose(read[1000:-1000, 0], expected[1000:-1000], atol=1e-3)
 
 
-@pytest.mark.slow
-def test_reads_an_hour_in_little_memory(tmp_path: Path) -> None:
-    with soundfile.SoundFile(tmp_path / "hour.flac", "w", 8000, 1) as file:
-        for _ in range(60):
-            file.write(np.zeros(60 * 8000, np.float32))
+def test_reads_a_long_file_in_little_memory(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "long.flac", np.zeros(600 * 8000, np.float32), 8000)
     tracemalloc.start()
-    source = open_audio(tmp_path / "hour.flac", block_s=1.0)
+    source = open_audio(tmp_path / "long.flac", block_s=1.0)
     num_samples = sum(len(block) for block in source.blocks)
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert num_samples == 3600 * 8000
-    assert source.duration_s == 3600
-    assert peak_bytes < 5e6
+    assert (num_samples, source.duration_s) == (600 * 8000, 600)
+    assert peak_bytes < 1e6
 
 
 def test_rejects_a_file_without_samples(tmp_path: Path) -> None:

@@ -111,10 +111,7 @@ def phones_of_syllable(syllable: str) -> tuple[str, ...]:
 def pronounce(text: str) -> list[tuple[str, ...]]:
     """Return the phones of each syllable of a text, in Chinese characters or in pinyin.
 
-    Raises
-    ------
-    UserError
-        If a part of the text cannot be read.
+    Raises ``UserError`` if a part of the text cannot be read.
     """
     transcript = transcribe(text)
     if transcript.dropped:
