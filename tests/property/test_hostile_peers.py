@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zmq
@@ -54,7 +54,7 @@ WORKERS = [
     (("recognizer", ("audio", "phones")), ("synthesizer", ("faps", "phone_input")))
 ]  # fmt: skip
 START = dataclasses.replace(
-    next(sample for sample in SAMPLES if isinstance(sample, StartSession)),
+    cast(StartSession, SAMPLES["start-session"]),
     paced=False,
     endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
 )
@@ -89,7 +89,7 @@ def values_like(value: object) -> st.SearchStrategy[Any]:
 @st.composite
 def messages(draw: st.DrawFn) -> Message:
     """Draw a message of any kind, of which up to three fields have invalid values."""
-    sample = draw(st.sampled_from(SAMPLES))
+    sample = draw(st.sampled_from([*SAMPLES.values()]))
     names = [field.name for field in dataclasses.fields(sample)]
     changed = draw(st.lists(st.sampled_from(names), max_size=3, unique=True))
     values = {name: draw(values_like(getattr(sample, name))) for name in changed}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -21,9 +21,7 @@ from tests.system import free_port
 pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"
 RATE_HZ = 50
-START = replace(
-    next(sample for sample in SAMPLES if isinstance(sample, StartSession)), epoch=1, endpoints={}
-)
+START = replace(cast(StartSession, SAMPLES["start-session"]), epoch=1, endpoints={})
 
 
 class Watched(SynthesizerService):
