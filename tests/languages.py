@@ -114,11 +114,6 @@ def flat_language(inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
     return Table(log_probs, {}).tree(inventory)
 
 
-def random_language(rng: np.random.Generator) -> PhoneLanguageModel:
-    """Draw a small phone language model."""
-    return Table.draw(rng, [0, 21, 30, SIL], order=3).tree()
-
-
 def random_topology(
     states_per_phone: int, rng: np.random.Generator, language: PhoneLanguageModel | None = None
 ) -> Topology:

@@ -11,17 +11,11 @@ from hypothesis import strategies as st
 from kouxing.corpora.scoring import count_errors
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.front_end.features import (
-    Differences,
-    LogMel,
-    cepstra,
-    with_differences,
-)
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
-from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRule, OutputRuleConfig
+from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import (
     FrameScores,
     SpeechEnd,
@@ -32,8 +26,6 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Waveform
 from tests.live_streams import LiveStream
 from tests.system import DEMO
-
-pytestmark = pytest.mark.property
 
 HELLO = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
 NOISE = np.random.default_rng(0).normal(0, 0.1, 12_000).astype(np.float32)
@@ -54,11 +46,6 @@ def last_phone_after(decoder: Decoder, row: np.ndarray) -> LastPhone:
     return decoder.last_phone
 
 
-def settled_rows(model: AcousticModel) -> np.ndarray:
-    events = score_recording(model, HELLO, 16_000)
-    return np.concatenate([event.settled for event in events if isinstance(event, FrameScores)])
-
-
 def recognize_chunks(chunks: list[np.ndarray], rate_hz: int) -> list[StreamOutput]:
     stream = LiveStream(the_model(), sample_rate_hz=rate_hz)
     outputs = [output for chunk in chunks for output in stream.feed(chunk)] + stream.finish()
@@ -66,7 +53,7 @@ def recognize_chunks(chunks: list[np.ndarray], rate_hz: int) -> list[StreamOutpu
 
 
 @pytest.mark.slow
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(cuts=CUTS, rate_hz=st.sampled_from([16_000, 44_100]))
 def test_chunks_do_not_affect_phones(cuts: list[int], rate_hz: int) -> None:
     assert recognize_chunks(pieces(HELLO, cuts), rate_hz) == recognize_chunks([HELLO], rate_hz)
@@ -74,28 +61,25 @@ def test_chunks_do_not_affect_phones(cuts: list[int], rate_hz: int) -> None:
 
 @pytest.mark.slow
 @settings(max_examples=6)
-@given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 20))
+@given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 12))
 def test_other_sessions_do_not_affect_scores(seed: int, num_sessions: int) -> None:
     model, rng = the_model(), np.random.default_rng(seed)
     frames = model.create_front_end().accept_waveform(HELLO)
     parts = [frames[start : start + 40] for start in rng.integers(0, 150, num_sessions)]
     streams = [model.create_stream() for _ in parts]
-    found: list[list[np.ndarray]] = [[] for _ in parts]
-    at = [0] * num_sessions
-    while min(at) < 40:
-        work, who = [], []
-        for number, part in enumerate(parts):
-            step = int(rng.integers(13)) if at[number] < 40 else 0
-            if step:
-                work.append((streams[number], part[at[number] : at[number] + step]))
-                who.append(number)
-                at[number] += step
-        for number, rows in zip(who, model.score(work), strict=True):
-            found[number].append(rows)
-    for part, stream, scores in zip(parts, streams, found, strict=True):
+    scores: list[list[np.ndarray]] = [[] for _ in parts]
+    at = np.zeros(num_sessions, int)
+    while (at < 40).any():
+        ready = [number for number in np.flatnonzero(at < 40) if rng.random() < 0.9]
+        steps = rng.integers(1, 13, num_sessions)
+        work = [(streams[n], parts[n][at[n] : at[n] + steps[n]]) for n in ready]
+        at[ready] += steps[ready]
+        for number, rows in zip(ready, model.score(work), strict=True):
+            scores[number].append(rows)
+    for part, stream, rows_of in zip(parts, streams, scores, strict=True):
         alone = model.create_stream()
         whole = np.concatenate([alone.score(part), alone.score(None)])
-        np.testing.assert_array_equal(np.concatenate([*scores, stream.score(None)]), whole)
+        np.testing.assert_array_equal(np.concatenate([*rows_of, stream.score(None)]), whole)
 
 
 @settings(max_examples=30)
@@ -105,17 +89,6 @@ def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
     parts = [resampler.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
     whole = to_16_khz(NOISE, rate_hz)
     np.testing.assert_array_equal(np.concatenate([*parts, resampler.finish()]), whole)
-
-
-@settings(max_examples=30)
-@given(cuts=CUTS, half_width=st.integers(1, 3))
-def test_chunks_do_not_affect_features(cuts: list[int], half_width: int) -> None:
-    log_mel, differences = LogMel(), Differences(half_width)
-    parts = [
-        differences.append(cepstra(log_mel.accept_waveform(piece))) for piece in pieces(NOISE, cuts)
-    ]
-    whole = with_differences(cepstra(LogMel().accept_waveform(NOISE)), half_width)
-    np.testing.assert_array_equal(np.concatenate([*parts, differences.finish()]), whole)
 
 
 @settings(max_examples=30)
@@ -129,22 +102,22 @@ def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
 
 
 @settings(max_examples=50)
-@given(
-    phones=st.lists(st.integers(0, 3), max_size=60),
-    num_stable_frames=st.integers(1, 6),
-    before=st.just(9),
-)
-def test_output_rule_matches_the_paper(
-    phones: list[int], num_stable_frames: int, before: int
-) -> None:
+@given(phones=st.lists(st.integers(0, 3), max_size=60), num_stable_frames=st.integers(1, 6))
+def test_output_rule_matches_the_paper(phones: list[int], num_stable_frames: int) -> None:
     """Compare with Li 2011, eq. 4."""
-    rule = OutputRule(OutputRuleConfig(num_stable_frames, 0.0), last_emitted=before)
-    last = before
+    last = 9
+    rule = OutputRule(OutputRuleConfig(num_stable_frames, 0.0), last_emitted=last)
     for t, phone in enumerate(phones):
         recent = phones[max(0, t - num_stable_frames + 1) : t + 1]
         expected = len(recent) == num_stable_frames and set(recent) == {phone} and phone != last
         assert rule.update(phone, 0.1) == expected
         last = phone if expected else last
+
+
+def test_frames_with_low_confidence_do_not_count() -> None:
+    rule = OutputRule(OutputRuleConfig(2, 0.7), last_emitted=0)
+    frames = [(1, 0.9), (1, 0.6), (1, 0.8), (1, 0.7), (2, 0.9), (3, 0.9), (3, 0.9)]
+    assert [frame for frame, scored in enumerate(frames) if rule.update(*scored)] == [3, 6]
 
 
 @settings(max_examples=25)
@@ -190,54 +163,23 @@ def test_a_search_continues_from_the_state_of_another(
 
 def test_withdraws_surplus_phones() -> None:
     model = the_model()
-    silence = model.inventory.silence
-    rows = settled_rows(model)
+    events = score_recording(model, HELLO, 16_000)
+    rows = np.concatenate([event.settled for event in events if isinstance(event, FrameScores)])
     decoder = LiveDecoder(model.topology, OutputRuleConfig(1, 0.0))
-    events = decoder.decode([SpeechStart(0)])
+    outputs = decoder.decode([SpeechStart(0)])
     for start in range(0, len(rows), 10):  # provisional scores of other sounds
         other = np.roll(rows, 50, axis=0)[start : start + 20]
-        events += decoder.decode([FrameScores(rows[start : start + 10], other)])
-    events += decoder.decode([SpeechEnd(len(rows))])
-    phones = [event for event in events if isinstance(event, Phone)]
+        outputs += decoder.decode([FrameScores(rows[start : start + 10], other)])
+    outputs += decoder.decode([SpeechEnd(len(rows))])
+    phones = [output for output in outputs if isinstance(output, Phone)]
     finals = [phone for phone in phones if phone.final]
     assert [phone.index for phone in finals] == list(range(len(finals)))
     assert {phone.index for phone in phones} == {phone.index for phone in finals}
     withdrawn = [phone for phone in finals if phone.is_withdrawn]
     assert len(withdrawn) > 1
-    assert {phone.symbol for phone in withdrawn} == {silence}
+    assert {phone.symbol for phone in withdrawn} == {model.inventory.silence}
     left = [phone for phone in finals if not phone.is_withdrawn]
     for one, two in pairwise(left):
         assert one.onset_s + one.duration_s <= two.onset_s + 1e-9
     expected = [phone.symbol for phone in recognize(model, HELLO, 16_000)]
-    found = [phone.symbol for phone in left]
-    assert count_errors(expected[1:], found).rate < 0.2
-
-
-def test_correct_provisional_scores_give_the_same_phones_earlier() -> None:
-    model = the_model()
-    rows = settled_rows(model)
-
-    def phones(num_provisional: int) -> tuple[list[Phone], list[int]]:
-        """Return all phones, and the newest known frame when each was emitted."""
-        decoder = LiveDecoder(model.topology, MODEL_RULES["neural"])
-        decoder.decode([SpeechStart(0)])
-        found: list[Phone] = []
-        frames: list[int] = []
-        for start in range(0, len(rows), 10):
-            settled = rows[start : start + 10]
-            provisional = rows[start + 10 : start + 10 + num_provisional]
-            events = decoder.decode([FrameScores(settled, provisional)])
-            found += [event for event in events if isinstance(event, Phone)]
-            frames += [start] * (len(found) - len(frames))
-        events = decoder.decode([SpeechEnd(len(rows))])
-        return found + [event for event in events if isinstance(event, Phone)], frames
-
-    expected, late = phones(0)
-    found, early = phones(20)
-    assert [phone.symbol for phone in found if phone.final] == [
-        phone.symbol for phone in expected if phone.final
-    ]
-    first = {phone.index: phone for phone in reversed(found)}
-    assert first == {phone.index: phone for phone in reversed(expected)}
-    assert len(first) > 10
-    assert sum(late) - sum(early) > 15 * len(early)
+    assert count_errors(expected[1:], [phone.symbol for phone in left]).rate < 0.2

@@ -3,8 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -14,33 +12,27 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import FaceAnimator
-from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend, log_weights, softmax
-from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     VISEME_INDEX,
 )
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
-from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from tests import lips
 from tests.lips import INVENTORY, LIPS, advance, make_face
 
-pytestmark = pytest.mark.property
-
 PARAMETERS = LIPS.parameters
 FRAME_S = 0.02
-examples = settings(max_examples=40)
+examples = settings(max_examples=20)
 few_examples = settings(max_examples=12)
 CLOSED = 20.0  # FAP units: 0.5 mm on a face
 CLOSED_IN_HASTE = 35.0  # recognized less than two frames before the apex
-# One frame step: from wide open to closed within 20 ms, if a closure is recognized very late.
-LARGEST_STEP = 900.0
 # Jaw, width and protrusion have no closures.
 UNHURRIED_FAPS = (3, 6, 7, 14, 16, 17, 53, 54)
+LARGEST_STEP, LARGEST_STEP_UNHURRIED, LARGEST_TURN_UNHURRIED = 250.0, 60.0, 40.0
 FINE_RATE_HZ = 240.0
-LARGEST_FINE_STEP, LARGEST_FINE_STEP_UNHURRIED, LARGEST_FINE_TURN_UNHURRIED = 250.0, 60.0, 40.0
 
 symbols = st.one_of(
     st.sampled_from(INVENTORY.phones), st.sampled_from(["b", "p", "m", "f", "a", "u"])
@@ -67,20 +59,6 @@ def closure_error(faps: NDArray[np.floating], time_s: NDArray[np.float64], phone
     apex_s = phone.onset_s + min(0.5 * phone.duration_s, EDGE_S)
     near = np.abs(time_s - apex_s) <= FRAME_S + 1e-6
     return float(np.abs(faps[near][:, np.array(inner) - 1] - target).max(axis=1).min())
-
-
-@examples
-@given(phones=utterances(), time_s=st.floats(-1e6, 1e6))
-def test_curves_stay_in_the_hull_of_the_targets(phones: list[Phone], time_s: float) -> None:
-    timeline = build_timeline(phones, INVENTORY)
-    times = np.array([time_s, 0.3, 0.5, 1.0])
-    if len(timeline.viseme):
-        weights = softmax(log_weights(PARAMETERS, timeline, times))
-        np.testing.assert_allclose(weights.sum(axis=0), 1.0)
-    curve = blend(PARAMETERS, timeline, times)
-    hull = np.vstack([PARAMETERS.target, PARAMETERS.neutral])
-    assert (curve >= hull.min(axis=0) - 1e-6).all()
-    assert (curve <= hull.max(axis=0) + 1e-6).all()
 
 
 levels = st.lists(st.floats(-90.0, 0.0), max_size=40)
@@ -170,7 +148,7 @@ def run(
 
 
 @pytest.mark.slow
-@examples
+@few_examples
 @given(
     emitted=revised_utterances(),
     cuts=st.lists(st.floats(0.0, 3.0), max_size=20),
@@ -186,17 +164,19 @@ def test_any_chunking_gives_identical_frames(
     np.testing.assert_array_equal(whole, cut)
 
 
-@examples
+@few_examples
 @given(emitted=revised_utterances(), delay_s=st.floats(0.0, 0.3))
 def test_a_bad_recognizer_causes_no_jump(
     emitted: list[tuple[float, Phone | SpeechChange]], delay_s: float
 ) -> None:
-    faps = run(emitted, make_face(delay_s=delay_s))
+    """Position and velocity cannot change much between frames 4 ms apart."""
+    faps = run(emitted, make_face(delay_s=delay_s, frame_rate_hz=FINE_RATE_HZ))
     assert np.isfinite(faps).all()
     steps = np.diff(faps, axis=0)
+    unhurried = steps[:, np.array(UNHURRIED_FAPS) - 1]
     assert np.abs(steps).max() < LARGEST_STEP
-    assert np.abs(np.diff(steps, axis=0)).max() < 2.0 * LARGEST_STEP
-    assert np.abs(steps[:, np.array(UNHURRIED_FAPS) - 1]).max() < 260.0
+    assert np.abs(unhurried).max() < LARGEST_STEP_UNHURRIED
+    assert np.abs(np.diff(unhurried, axis=0)).max() < LARGEST_TURN_UNHURRIED
     # slow speech exceeds the targets by up to 15 %
     hull = 1.15 * np.vstack([PARAMETERS.target, PARAMETERS.neutral])
     mouth = faps[:, np.array(MOUTH_FAPS) - 1]
@@ -206,55 +186,19 @@ def test_a_bad_recognizer_causes_no_jump(
 
 
 @few_examples
-@given(emitted=revised_utterances(), delay_s=st.floats(0.0, 0.3))
-def test_position_and_velocity_are_continuous(
-    emitted: list[tuple[float, Phone | SpeechChange]], delay_s: float
-) -> None:
-    # neither can change much between frames 4 ms apart
-    face = make_face(delay_s=delay_s, frame_rate_hz=FINE_RATE_HZ)
-    faps = run(emitted, face)
-    steps = np.diff(faps, axis=0)
-    slow = np.array(UNHURRIED_FAPS) - 1
-    assert np.abs(steps).max() < LARGEST_FINE_STEP
-    assert np.abs(steps[:, slow]).max() < LARGEST_FINE_STEP_UNHURRIED
-    assert np.abs(np.diff(steps[:, slow], axis=0)).max() < LARGEST_FINE_TURN_UNHURRIED
-
-
-@examples
-@given(emitted=revised_utterances(), frame=st.integers(1, 100), delay_s=st.floats(0.0, 0.3))
-def test_flush_rests_within_150_ms(
-    emitted: list[tuple[float, Phone | SpeechChange]], frame: int, delay_s: float
-) -> None:
+@given(phones=utterances(), frame=st.integers(1, 100), delay_s=st.floats(0.0, 0.3))
+def test_flush_rests_within_150_ms(phones: list[Phone], frame: int, delay_s: float) -> None:
     face = make_face(delay_s=delay_s)
-    flush_s = frame * FRAME_S
-    for time_s, item in emitted:
-        if time_s <= flush_s + delay_s:
-            advance(face, time_s)
-            if isinstance(item, Phone):
-                face.process(item)
-    advance(face, flush_s + delay_s)
+    now_s = frame * FRAME_S + delay_s
+    for phone in phones:
+        if phone.onset_s + delay_s <= now_s:
+            advance(face, phone.onset_s + delay_s)
+            face.process(phone)
+    advance(face, now_s)
     face.flush()
-    after = advance(face, flush_s + delay_s + 0.5)
+    after = advance(face, now_s + 0.5)
     assert after
     assert all(not faps.round(3).any() for time_s, faps in after if time_s > after[0][0] + 0.13)
-
-
-@examples
-@given(
-    values=st.lists(st.floats(-3000.0, 3000.0, width=32), min_size=66, max_size=66),
-    rate_hz=st.floats(1.0, 240.0),
-    name=st.text("abc 0123.\\:", max_size=20),
-)
-def test_fap_files_round_trip(values: list[float], rate_hz: float, name: str) -> None:
-    faps = np.zeros((2, NUM_FAPS), dtype=np.float32)
-    faps[1, 2:] = values
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "some.fap"
-        write_fap(path, FapAnimation(name, rate_hz, faps))
-        again = read_fap(path)
-    np.testing.assert_array_equal(again.faps, faps)
-    assert again.frame_rate_hz == pytest.approx(rate_hz)
-    assert again.name == (" ".join(name.split()) or "kouxing")
 
 
 def sound(seed: int) -> list[SoundEvent]:
@@ -267,18 +211,10 @@ def sound(seed: int) -> list[SoundEvent]:
         if rng.random() < 0.05 or number == 5:
             is_speaking = not is_speaking
             events.append(SpeechChange(active=is_speaking, time_s=now_s))
-        if (
-            rng.random() < 0.15 and number > 8
-        ):  # after a lip frame the visemes do not move the mouth
-            phone = Phone(
-                index=number,
-                symbol=str(rng.choice(["b", "p", "m", "f", "a", "u", "t"])),
-                onset_s=max(0.0, now_s - 0.12),
-                duration_s=0.08,
-                confidence=rng.random(),
-                final=rng.random() < 0.5,
-            )
-            events.append(phone)
+        if rng.random() < 0.15 and number > 8:  # after a lip frame, visemes do not move the mouth
+            symbol = str(rng.choice(["b", "p", "m", "f", "a", "u", "t"]))
+            onset_s, final = max(0.0, now_s - 0.12), bool(rng.random() < 0.5)
+            events.append(lips.phone(number, symbol, onset_s, 0.08, final=final))
         if is_speaking and rng.random() < 0.9:
             opening = min(max(opening + rng.uniform(-60.0, 60.0), 0.0), 300.0)
             frame = LipPositions(

@@ -10,8 +10,6 @@ from kouxing.services.recognizer.acoustic.load import SHIPPED, load_model, model
 from kouxing.shared.audio_file import read_audio
 from tests.system import DEMO
 
-pytestmark = pytest.mark.unit
-
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 
 
@@ -25,7 +23,7 @@ def frames(model: AcousticModel) -> np.ndarray:
     return model.create_front_end().accept_waveform(HELLO)
 
 
-@pytest.mark.parametrize("num_frames", [0, 1, 2, 3, 28, 29, 30, 37])
+@pytest.mark.parametrize("num_frames", [0, 1, 29, 30])
 def test_scores_every_frame_once(model: AcousticModel, frames: np.ndarray, num_frames: int) -> None:
     stream = model.create_stream()
     for _ in range(2):

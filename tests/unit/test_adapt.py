@@ -13,25 +13,16 @@ from typer.testing import CliRunner
 
 from kouxing.corpora.commands import adapt_app, track_app
 from kouxing.corpora.lip_clips import read_clip
-from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.video.film import render_video
 from kouxing.services.driver.video.writer import VideoWriter
-from kouxing.services.live_chain import LiveChain
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.mouth_profiles.landmark_file import landmark_file
-from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, lip_tracks
-from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.e2e.following import samples_of_file
-from tests.heads import load
 from tests.system import DEMO
 from tests.unit.test_face_landmarks import FACE
 
-pytestmark = pytest.mark.unit
 PICTURES = Path(__file__).parents[1] / "golden"
 RUNNER = CliRunner()
 
@@ -69,30 +60,6 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
     assert np.median(jaw[32:53]) > 80
     assert np.isnan(depth).all()
     assert np.isnan(clip.faps[55:]).all()
-
-
-@pytest.mark.slow
-def test_tracks_the_lips_of_a_rendered_head(tmp_path: Path) -> None:
-    """The head turns and nods while it speaks. Its true FAPs are known."""
-    samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * 16_000]
-    visemes = "dynamic-visemes"
-    settings = SynthesizerConfig(lips=visemes)
-    chain = LiveChain(load_model(), load_lip_model(name=visemes), synthesizer=settings)
-    frames = chain.accept_waveform(samples)
-    for time_s, faps in frames:
-        faps[FAP_NUMBER["head_yaw"] - 1] = 1e4 * np.sin(4 * time_s)
-        faps[FAP_NUMBER["head_pitch"] - 1] = 5e3 * np.sin(3 * time_s)
-    renderer = Renderer(load("woman", "coarse"), 320, 240)
-    render_video(frames, tmp_path / "me.mp4", renderer, frame_rate_hz=25.0, samples=samples)
-    renderer.close()
-    run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me")
-    clip = read_clip(tmp_path / "me.json")
-    frame_s = np.array([time_s for time_s, _ in frames])
-    mouth = np.array([faps[[fap - 1 for fap in MOUTH_FAPS]] for _, faps in frames])
-    true = np.stack([np.interp(clip.time_s, frame_s, fap) for fap in mouth.T], axis=1)
-    made, tracked = (lip_measures(lip_tracks(faps)) for faps in (true, clip.faps))
-    for measure in range(len(MEASURES)):
-        assert np.corrcoef(made[:, measure], tracked[:, measure])[0, 1] > 0.65, MEASURES[measure]
 
 
 def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
@@ -133,8 +100,3 @@ def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     assert found["before"]["width"] is None
     curve = found["curves"]["opening"]
     assert len(found["curves"]["time_s"]) == len(curve["before"]) == len(curve["tracked"]) > 100
-
-
-def test_names_missing_files(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"cannot read .*nobody\.json: No such file"):
-        run(adapt_app, tmp_path / "nobody.json", "-o", tmp_path / "me.mouth")

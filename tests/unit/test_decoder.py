@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.search import decoder as search
-from kouxing.services.recognizer.search.decoder import Decoder, LastPhone, Segment, segments_after
+from kouxing.services.recognizer.search.decoder import Decoder, LastPhone, Segment
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
-from tests.languages import MANDARIN, NUM_PHONES, SIL, Gram, Table, random_topology
-
-pytestmark = pytest.mark.unit
+from tests.languages import MANDARIN, NUM_PHONES, SIL, Table, random_topology
 
 
 def last_phone_after(decoder: Decoder, scores: NDArray[np.float32]) -> LastPhone:
@@ -64,7 +62,7 @@ def brute_force(
     return list(max(complete, key=lambda path: path.score).ended)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("order", "kept", "states_per_phone", "num_frames"),
     [(2, 1.0, 2, 8), (2, 1.0, 3, 9), (3, 1.0, 2, 9), (3, 0.5, 2, 9), (4, 0.6, 1, 7)],
@@ -86,65 +84,22 @@ def test_finds_the_best_of_all_paths(
     assert decoder.final_path() == brute_force(model, table, scores, phones)
 
 
-def clear_scores(
-    sequence: list[int], model: Topology, frames_per_state: int, contrast: float = 50.0
-) -> NDArray[np.float32]:
-    """Return scores of a clear sequence of phones."""
-    rows = []
-    for phone in sequence:
-        for state in range(model.first_state[phone], model.first_state[phone + 1]):
-            row = np.full(model.num_states, -contrast, np.float32)
-            row[state] = 0.0
-            rows += [row] * frames_per_state
-    return np.array(rows)
-
-
 def test_decodes_clear_speech() -> None:
     model = random_topology(5, np.random.default_rng(0))
     sequence = [SIL, 3, 30, 12, 45, SIL]
+    scores = np.full((60, model.num_states), -50.0, np.float32)
+    states = np.concatenate(
+        [np.arange(*model.first_state[[phone, phone + 1]]) for phone in sequence]
+    )
+    scores[np.arange(60), np.repeat(states, 2)] = 0.0
     decoder = Decoder(model)
-    scores = clear_scores(sequence, model, frames_per_state=2)
     last = [last_phone_after(decoder, row) for row in scores]
-    assert [segment.phone for segment in decoder.final_path()] == sequence
-    assert [(s.start, s.end) for s in decoder.final_path()] == [
-        (t, t + 10) for t in range(0, 60, 10)
-    ]
+    path = [Segment(phone, 10 * k, 10 * k + 10) for k, phone in enumerate(sequence)]
+    assert decoder.final_path() == path
+    assert decoder.path_since(14) == [Segment(3, 14, 20), *path[2:-1]]
     assert [phone for phone, _, _ in last[::10]] == sequence
     assert last[25][:2] == (30, 20)
     assert all(0 < confidence <= 1 for _, _, confidence in last)
-
-
-def test_speech_that_ends_within_a_phone_keeps_the_earlier_phones() -> None:
-    model = random_topology(5, np.random.default_rng(0))
-    decoder = Decoder(model)
-    decoder.advance(clear_scores([3, 30, 12], model, frames_per_state=2)[:23])
-    assert decoder.final_path() == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 23)]
-
-
-def test_the_language_model_decides_between_equal_scores() -> None:
-    """30 and 31 score the same; 30 follows 3, and 31 follows 4."""
-    singles: dict[Gram, float] = {(phone,): -4.0 for phone in range(NUM_PHONES)}
-    language = Table(singles | {(3, 30): -0.1, (4, 31): -0.1}, {(3,): -3.0, (4,): -3.0}).tree()
-    model = random_topology(3, np.random.default_rng(0), language)
-    decoder = Decoder(model)
-    scores = clear_scores([3, 30, 4, 30], model, frames_per_state=2)
-    for phone in (30, 31):
-        states = slice(model.first_state[phone], model.first_state[phone + 1])
-        scores[6:12, states] = scores[18:, states] = 0.0
-    decoder.advance(scores)
-    assert [segment.phone for segment in decoder.final_path()] == [3, 30, 4, 31]
-
-
-def test_long_speech_needs_bounded_memory() -> None:
-    rng = np.random.default_rng(1)
-    model = random_topology(5, rng)
-    sequence = rng.permutation(np.arange(SIL)).tolist() * 8  # 472 phones, 4720 frames
-    decoder = Decoder(model)
-    decoder.advance(clear_scores(sequence, model, frames_per_state=2, contrast=2.0))
-    assert len(decoder._shared) > 300
-    assert len(decoder._records) < 2 * search._MIN_RECORDS
-    assert [segment.phone for segment in decoder.final_path()] == sequence
-    assert [segment.phone for segment in decoder.path_since(4000)] == sequence[400:-1]
 
 
 def crowded_language() -> PhoneLanguageModel:
@@ -183,25 +138,3 @@ def test_limits_the_number_of_tokens() -> None:
     path = decoder.final_path()
     assert (path[0].start, path[-1].end) == (0, 60)
     assert all(one.end == two.start for one, two in pairwise(path))
-
-
-def test_interleaved_searches_are_independent() -> None:
-    model = random_topology(3, np.random.default_rng(0), crowded_language())
-    scores = np.random.default_rng(1).normal(scale=4.0, size=(2, 40, model.num_states))
-    together = [Decoder(model), Decoder(model)]
-    for rows in scores.astype(np.float32).transpose(1, 0, 2):
-        for decoder, row in zip(together, rows, strict=True):
-            decoder.advance(row[None])
-    for decoder, rows in zip(together, scores.astype(np.float32), strict=True):
-        alone = Decoder(model)
-        alone.advance(rows)
-        assert decoder.final_path() == alone.final_path()
-
-
-def test_path_since_returns_the_phones_before_the_last() -> None:
-    model = random_topology(5, np.random.default_rng(0))
-    decoder = Decoder(model)
-    decoder.advance(clear_scores([3, 30, 12, 45], model, frames_per_state=2)[:35])
-    assert decoder.path_since(0) == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 30)]
-    assert decoder.path_since(14) == [Segment(30, 14, 20), Segment(12, 20, 30)]
-    assert segments_after([Segment(1, 0, 4)], 4) == []

@@ -15,7 +15,6 @@ from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 
-pytestmark = pytest.mark.unit
 NUM_FRAMES = 60
 QUIET = np.full(NUM_FRAMES, -60.0)
 NOSE_TO_MOUTH, WIDTH = 2.0, 5.0
@@ -59,10 +58,7 @@ def levels(speaking_db: float = -20.0) -> NDArray[np.float64]:
         (14, (0, -1, 0), 5, -512),
         (308, (0.5, 0, 0), 6, 102.4),
         (78, (0.5, 0, 0), 7, -102.4),
-        (78, (0, 0.5, 0), 13, 256),
-        (402, (0, -1, 0), 10, -512),
         (39, (0, 1, 0), 56, -512),
-        (291, (0.5, 0, 0), 53, 102.4),
     ],
 )
 def test_the_motion_of_a_point_is_its_fap_in_any_head_pose(
@@ -121,17 +117,13 @@ def replaced(at: int, part: bytes) -> bytes:
         (b"", "not a landmark file"),
         (b"\xff\xff\xff\xff" + CONTENT[4:], "not a landmark file"),
         (CONTENT[: 4 + HEADER_BYTES], "truncated"),
-        (CONTENT[:-1], "truncated"),
         (with_header(times=2**60), "truncated"),
-        (with_header(times=True), "whole numbers"),
         (with_header(times=49), "only 49 frames"),
         (with_header(points=468), "468 landmarks"),
         (with_header(sample_rate_hz=4000), "4000 Hz"),
         (b"\x04\x00\x00\x00null" + BODY, "whole numbers"),
         (replaced(8, np.float64(np.nan).tobytes()), "times"),
-        (replaced(8, np.float64(9.0).tobytes()), "times"),
         (replaced(8 * NUM_FRAMES, np.float32(np.nan).tobytes()), "pixels"),
-        (replaced(8 * NUM_FRAMES, np.float32(1e9).tobytes()), "pixels"),
         (CONTENT[: 4 + HEADER_BYTES + NUM_FRAMES * (8 + 12 * 43) + 20], "second of audio"),
     ],
 )

@@ -25,8 +25,6 @@ from kouxing.shared.phones.inventory import load_inventory
 from tests.lips import phone
 from tests.system import DEMO
 
-pytestmark = pytest.mark.unit
-
 LIPS = load_lip_model(name="ferguson")
 TABLE = load_table(load_inventory())
 LOWER_LIP = 4  # column of FAP 5
@@ -69,33 +67,9 @@ def test_openings_of_phones_and_rest_in_silence() -> None:
     assert made[60:].max() < 0.05  # energy shows the end long before voice activity does
 
 
-def test_energy_opens_the_mouth_before_the_first_phone() -> None:
-    no_phones = [event for event in SAID if not isinstance(event, Phone)]
-    made = openings(no_phones)
-    assert made[26] > 0.5
-    assert made[50:].max() < 0.05  # sound without phones is not speech
-
-
-def test_an_unfinished_vowel_lasts_as_long_as_its_sound() -> None:
-    made = openings(
-        [
-            replace(event, duration_s=0.15, final=False)
-            if isinstance(event, Phone) and event.symbol == "a"
-            else event
-            for event in SAID
-        ]
-    )
-    assert made[42] > 1.5
-    assert np.diff(made[33:]).max() < 0.05  # falls once, and stays closed
-    assert made[62:].max() < 0.05
-
-
 def test_no_jump_at_revisions_and_interruptions() -> None:
-    revised: list[SoundEvent] = [
-        replace(event, symbol="u") if isinstance(event, Phone) and event.index else event
-        for event in SAID
-    ]
-    made = openings([*SAID[:-60], *(event for event in revised if isinstance(event, Phone))])
+    phones = [event for event in SAID if isinstance(event, Phone)]
+    made = openings([*SAID[:-60], phones[0], replace(phones[1], symbol="u")])
     assert np.abs(np.diff(made)).max() < 2.0
     face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
     before = openings(SAID[:42], face)
@@ -107,10 +81,8 @@ def test_no_jump_at_revisions_and_interruptions() -> None:
 
 
 def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
-    samples, rate_hz = read_audio(DEMO / "hello-female.wav")
-    samples = to_16_khz(samples, rate_hz)[:32_000]
+    samples = to_16_khz(*read_audio(DEMO / "hello-female.wav"))[:32_000]
     settings = SynthesizerConfig(lips="ferguson", idle_motion_seed=0, expressiveness=1.0)
-    assert settings.delay_ms == 160.0
     made = []
     for chunk in (32_000, 333):
         chain = LiveChain(load_model(), LIPS, synthesizer=settings)
@@ -120,9 +92,8 @@ def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
         made.append(np.array([faps for _, faps in frames + chain.input_finished()]))
     np.testing.assert_array_equal(made[0], made[1])
     opening = 5.0 * made[0][:, LOWER_LIP] / WIDEST
-    assert opening.max() > 2.5
     assert opening.min() >= 0.0
-    assert opening.max() <= 5.0
+    assert 2.5 < opening.max() <= 5.0
 
 
 def test_error_for_a_language_without_a_table() -> None:

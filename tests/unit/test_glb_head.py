@@ -22,8 +22,6 @@ from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
 from tests.heads import neutral_faps
 from tests.meshes import meshes
 
-pytestmark = pytest.mark.unit
-
 SHAPES = {name: ARKIT.basis[row] for row, name in enumerate(ARKIT.names)}
 VISEME_SHAPES = dict(zip(OCULUS.names, OCULUS.basis, strict=True))
 ORDER = np.random.default_rng(3).permutation(52)
@@ -59,26 +57,30 @@ def test_reads_an_exported_head_unchanged(original: Head, tmp_path: Path) -> Non
     pictures = []
     for model in (original, head):
         renderer = Renderer(model, 96, 72, samples=0, camera=camera(model))
-        pictures.append(renderer.draw(np.asarray(faps, np.float32)).astype(float))
+        pictures.append(renderer.draw(faps.astype(np.float32)).astype(float))
         renderer.close()
     assert np.abs(pictures[0] - pictures[1]).mean() < 3
 
 
 @pytest.mark.parametrize(
-    "rename",
+    ("rename", "unit"),
     [
-        lambda n: n,
-        lambda n: "Face_BS." + n,
-        lambda n: n.replace("Left", "_L").replace("Right", "_R"),
+        (lambda n: n, (1, 1, 1)),
+        (lambda n: "Face_BS." + n, (-250, 250, -250)),  # turned around, with other units
+        (lambda n: n.replace("Left", "_L").replace("Right", "_R"), (1, 1, 1)),
     ],
     ids=["plain", "prefixed", "sides"],
 )
-def test_reads_arkit_shapes_in_any_order(
-    original: Head, tmp_path: Path, rename: Callable[[str], str]
+def test_reads_arkit_shapes_in_any_order_unit_and_position(
+    original: Head, tmp_path: Path, rename: Callable[[str], str], unit: tuple[int, int, int]
 ) -> None:
     shapes = {rename(ARKIT.names[row]): ARKIT.basis[row] for row in ORDER}
-    shapes |= {"somethingElse": ARKIT.basis[0]}
-    head = read_glb(write_glb(tmp_path / "my.glb", meshes(original, shapes)))
+    parts = meshes(original, shapes | {"somethingElse": ARKIT.basis[0]})
+    for part in parts:
+        part.vertices = (part.vertices + np.array([0.01, 6, -0.2])) * unit
+        part.targets = {name: shift * unit for name, shift in part.targets.items()}
+    head = read_glb(write_glb(tmp_path / "my.glb", parts))
+    same_place(head, original)
     for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
         assert off(head, original, SHAPES[name]) < 0.25, name
     for viseme in ("PP", "aa", "ou", "ih"):
@@ -96,16 +98,6 @@ def test_reads_oculus_visemes(original: Head, tmp_path: Path, short: bool) -> No
     assert off(head, original, neutral_faps(close_t_l_eyelid=700, close_t_r_eyelid=700)) < 0.4
 
 
-def test_unit_position_and_direction_do_not_matter(original: Head, tmp_path: Path) -> None:
-    parts = meshes(original, SHAPES)
-    for part in parts:
-        part.vertices = part.vertices * [-250, 250, -250] + [3, 1600, 40]
-        part.targets = {name: shift * [-250, 250, -250] for name, shift in part.targets.items()}
-    head = read_glb(write_glb(tmp_path / "my.glb", parts))
-    assert off(head, original, SHAPES["jawOpen"]) < 0.25
-    same_place(head, original)
-
-
 def same_place(head: Head, original: Head) -> None:
     """Compare the vertices of the parts in the GLB, except for their size and pivot."""
     rows = [original.vertices[original.part(part.name).vertices] for part in head.parts]
@@ -113,17 +105,6 @@ def same_place(head: Head, original: Head) -> None:
     shift = second - first * np.ptp(second[:, 1]) / np.ptp(first[:, 1])
     assert np.ptp(shift, axis=0).max() < 1e-4
     assert np.abs(shift).max() < 0.01
-
-
-def test_shapes_move_the_gaze_without_eyeballs(original: Head, tmp_path: Path) -> None:
-    parts = [part for part in meshes(original, SHAPES) if not part.name.startswith("eye_")]
-    looks = np.flatnonzero(original.vertices[original.part("skin").vertices][:, 1] > 0.03)
-    shift = np.zeros_like(parts[0].vertices)
-    shift[looks[:50], 0] = 0.004
-    for name in ("eyeLookOutLeft", "eyeLookInLeft"):
-        parts[0].targets[name] = shift * (1 if "Out" in name else -1)
-    head = read_glb(write_glb(tmp_path / "my.glb", parts))
-    assert skin(head, neutral_faps(yaw_l_eyeball=25_000))[looks[:50], 0].min() > 0.01
 
 
 def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_path: Path) -> None:
@@ -144,9 +125,8 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_pat
     for node in document["nodes"][:count]:
         attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
         rows = document["accessors"][attributes["POSITION"]]["count"]
-        joints = np.zeros((rows, 4), "u1")
-        joints[:, 0] = 0 if node["name"] == "garment" else 1
-        weights = np.tile(np.array([1, 0, 0, 0], "<f4"), (rows, 1))
+        joints, weights = np.zeros((rows, 4), "u1"), np.zeros((rows, 4), "<f4")
+        joints[:, 0], weights[:, 0] = node["name"] != "garment", 1
         attributes["JOINTS_0"] = add(document, binary, joints, "VEC4", 5121)
         attributes["WEIGHTS_0"] = add(document, binary, weights, "VEC4", 5126)
         node["skin"] = 0
@@ -186,24 +166,16 @@ def change(key: str, index: int, **values: Any) -> Callable[[dict[str, Any]], No
 
 
 def sparse(document: dict[str, Any]) -> None:
-    document["accessors"][0]["sparse"] = {
-        "count": 1,
-        "indices": {"bufferView": 0, "componentType": 5125, "byteOffset": 12},
-        "values": {"bufferView": 0},
-    }
+    part = {"bufferView": 0, "componentType": 5125, "byteOffset": 12}
+    document["accessors"][0]["sparse"] = {"count": 1, "indices": part, "values": part}
 
 
-def many_targets(document: dict[str, Any]) -> None:
-    document["accessors"][0]["count"] = 200_000
-    document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}] * 101
+def primitives(count: int, **values: Any) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        (first,) = document["meshes"][0]["primitives"]
+        document["meshes"][0]["primitives"] = [first | values] * count
 
-
-def many_primitives(document: dict[str, Any]) -> None:
-    document["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}}] * 3000
-
-
-def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda document: document["meshes"][0]["primitives"][0].update(values)
+    return change
 
 
 @pytest.mark.parametrize(
@@ -211,35 +183,22 @@ def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
     [
         (change("accessors", 0, count=10**9), "more than 300000 vertices"),
         (change("accessors", 1, count=10**9), "an accessor has 1000000000 elements"),
-        (many_primitives, "more than 2000 meshes"),
-        (many_targets, "more than 20000000 displacements"),
+        (change("accessors", 0, count=-1), "an accessor has -1"),
+        (primitives(2001), "more than 2000 meshes"),
         (change("nodes", 0, translation=[1e300, 0, 0]), "not finite or very large"),
         (change("nodes", 0, translation=[float("nan"), 0, 0]), "glTF description is damaged"),
         (change("nodes", 0, scale=[0, 0, 0]), "cannot speak: it has no shape jawOpen"),
         (change("accessors", 0, count=5), "larger than its buffer view"),
-        (change("accessors", 0, count=-1), "an accessor has -1"),
         (change("accessors", 0, byteOffset=-4), "larger than its buffer view"),
-        (change("accessors", 0, componentType=1), "is damaged or is not a GLB"),
-        (change("accessors", 0, type="VEC4"), "larger than its buffer view"),
         (change("accessors", 0, bufferView=999), "bufferViews has no item 999"),
         (change("bufferViews", 0, byteLength=10**9), "outside the file"),
-        (change("bufferViews", 0, byteOffset=-1), "outside the file"),
-        (change("bufferViews", 0, byteStride=4), "larger than its buffer view"),
         (change("nodes", 0, children=[0]), "are not a tree"),
-        (change("nodes", 0, children=[7]), "nodes has no item 7"),
-        (change("nodes", 0, mesh=7), "meshes has no item 7"),
         (change("nodes", 0, matrix=[1, 2]), "is damaged or is not a GLB"),
         (sparse, "writes outside itself"),
-        (primitive(indices=0), "refers to a missing vertex"),
-        (primitive(mode=0), "no triangles"),
-        (primitive(attributes={}), "is damaged or is not a GLB"),
+        (primitives(1, indices=0), "refers to a missing vertex"),
+        (primitives(1, mode=0), "no triangles"),
         (lambda d: d["meshes"][0].pop("extras"), "cannot speak: it has no shape jawOpen"),
-        (
-            lambda d: d.update(extensionsRequired=["KHR_texture_basisu"]),
-            "KHR_texture_basisu, which",
-        ),
-        (lambda d: d.update(scene=5), "is damaged or is not a GLB"),
-        (lambda d: d.update(nodes=[]), "nodes has no item 0"),
+        (lambda d: d.update(extensionsRequired=["KHR_texture_basisu"]), "KHR_texture_basisu"),
     ],
 )
 def test_rejects_bad_descriptions(
@@ -256,11 +215,9 @@ def test_rejects_bad_descriptions(
     ("data", "said"),
     [
         (b"", "not a binary glTF"),
-        (b"\0" * 100, "not a binary glTF"),
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
         (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "description is damaged"),
         (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "description is damaged"),
     ],
 )
@@ -284,15 +241,15 @@ def test_any_flipped_byte_is_handled(small: Path) -> None:
         assert np.isfinite(head.vertices).all()
 
 
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
 @pytest.mark.parametrize(
     ("texture", "said"),
     [
         (b"#EXTM3U\n/etc/hostname\n", "not PNG, JPEG or WebP"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(50), "damaged"),
-        (
-            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">IIB", 30_000, 30_000, 8),
-            "million pixels",
-        ),
+        (PNG + bytes(50), "damaged"),
+        (PNG + b"\0\0\0\rIHDR" + struct.pack(">IIB", 30_000, 30_000, 8), "million pixels"),
     ],
 )
 def test_rejects_bad_textures(tmp_path: Path, original: Head, texture: bytes, said: str) -> None:

@@ -9,14 +9,10 @@ import pytest
 
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAPS
-from kouxing.shared.face.high_level import VISEMES, expression_faps, viseme_faps
+from kouxing.shared.face.high_level import expression_faps, viseme_faps
 from tests import heads
 from tests.heads import neutral_faps
 
-pytestmark = pytest.mark.unit
-
-LIP_POINTS = [f"2.{n}" for n in range(2, 10)] + [f"8.{n}" for n in range(1, 9)]
 LEVELS = [("woman", "coarse"), *((name, "fine") for name in heads.NAMES)]
 
 
@@ -38,41 +34,6 @@ def test_feature_points_move_as_defined(head: Head) -> None:
                 came = shift[head.feature_points[point], axis]
                 assert came == pytest.approx(wanted, rel=0.05), (fap.name, point)
     assert len(shown) > 40
-
-
-def test_pupils_dilate_as_defined(head: Head) -> None:
-    for number, eye in ((29, "eye_left"), (30, "eye_right")):
-        where = head.part(eye).vertices
-        moved = head.deform(heads.only(number, 200.0))
-        shift = np.linalg.norm((moved - head.vertices)[where], axis=1).max()
-        assert 2 * shift == pytest.approx(200 * head.fapu["IRISD"] / 1024, rel=0.05)  # diameter
-
-
-def test_every_fap_moves_something(head: Head) -> None:
-    for fap in FAPS[2:]:
-        assert np.abs(head.deform(heads.only(fap.number, 1000.0)) - head.vertices).max() > 1e-4, fap
-
-
-def test_lip_faps_are_independent(head: Head) -> None:
-    vertical = [
-        fap for fap in heads.DISPLACING if heads.AXES[fap.direction][0] == 1 and fap.number != 18
-    ]
-    for fap in vertical:
-        travel = 300 * head.fapu[fap.fapu] / 1024
-        shift = head.deform(heads.only(fap.number, 300.0)) - head.vertices
-        for point in LIP_POINTS:
-            if point not in fap.feature_points:
-                assert abs(shift[head.feature_points[point], 1]) < 0.05 * travel, (fap.name, point)
-
-
-def test_fine_and_coarse_heads_move_equally() -> None:
-    fine, coarse = heads.load("woman"), heads.load("woman", "coarse")
-    assert len(coarse.vertices) < 0.6 * len(fine.vertices)
-    faps = neutral_faps(open_jaw=300, raise_b_midlip=-300, stretch_l_cornerlip=-100)
-    for point, vertex in fine.feature_points.items():
-        np.testing.assert_allclose(
-            fine.deform(faps)[vertex], coarse.deform(faps)[coarse.feature_points[point]], atol=1e-6
-        )
 
 
 @pytest.mark.parametrize(
@@ -98,12 +59,6 @@ def test_rotations(head: Head, name: str, point: str, about: int, axis: int, sig
     assert turned == pytest.approx(0.1, rel=0.01)
 
 
-def test_shoulders_do_not_rotate(head: Head) -> None:
-    shift = head.deform(neutral_faps(head_yaw=30_000.0)) - head.vertices
-    assert np.abs(shift[head.part("garment").vertices]).max() == 0
-    assert np.abs(shift[head.part("hair").vertices]).max() > 0.01
-
-
 def test_normals_are_unit_vectors_and_follow(head: Head) -> None:
     faps = neutral_faps(open_jaw=300, raise_b_midlip=-400, head_yaw=20_000)
     vertices, normals = head.pose(faps)
@@ -113,10 +68,8 @@ def test_normals_are_unit_vectors_and_follow(head: Head) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage",
-    ["cut", "text", "format", "missing", "index", "part_names", "part_vertices", "eye_centres",
-     "texture_skin", "huge"],
-)  # fmt: skip
+    "damage", ["cut", "text", "format", "uv", "index", "part_names", "texture_skin", "huge"]
+)
 def test_rejects_a_damaged_file(
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,13 +84,11 @@ def test_rejects_a_damaged_file(
             arrays = {key: asset[key] for key in asset.files}
         if damage == "format":
             arrays["format"] = np.array("kouxing head 99")
-        elif damage == "missing":
-            del arrays["uv"]
-        elif damage == "texture_skin":
+        elif damage in ("uv", "texture_skin"):
             del arrays[damage]
         elif damage == "huge":
             monkeypatch.setattr("kouxing.services.driver.head.head.MAX_BYTES", 100_000)
-        elif damage in arrays:
+        elif damage == "part_names":
             arrays[damage] = arrays[damage][:1]
         else:
             arrays["field_vertices"] = arrays["field_vertices"] + np.uint16(40_000)
@@ -147,14 +98,6 @@ def test_rejects_a_damaged_file(
 
 
 # --- FAP 1 and FAP 2 ---
-
-
-def test_blend() -> None:
-    np.testing.assert_array_equal(viseme_faps(1, 10, 63), VISEMES[1])
-    np.testing.assert_array_equal(viseme_faps(1, 10, 0), VISEMES[10])
-    np.testing.assert_allclose(
-        viseme_faps(1, 10, 21), VISEMES[1] / 3 + VISEMES[10] * 2 / 3, rtol=1e-5
-    )
 
 
 def test_visemes_and_expressions_move_the_face() -> None:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import csv
-import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
 import av
 import numpy as np
 import pytest
-from matplotlib.font_manager import findfont
 
 from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
 from kouxing.services.cli.offline import lips
 from kouxing.services.cli.options import Timing
 from kouxing.services.driver import picture
-from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
-
-pytestmark = pytest.mark.unit
 
 SOUND = Path(__file__).parents[2] / "shared" / "demo" / "fast-female.wav"
 NUM_FRAMES = 124  # of 4.925 s
@@ -55,26 +50,6 @@ def test_picture_and_svg_show_every_key_frame(tmp_path: Path) -> None:
     assert texts.count("iii") + texts.count("ii") == 16
     pixels = picture.decode((tmp_path / "mouth.png").read_bytes(), "mouth.png")
     assert pixels.shape[:2] == (int(root.attrib["height"]), int(root.attrib["width"]))
-
-
-def test_pixels_show_characters_if_a_font_has_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drawn = []
-    for folder in ("none", "one"):
-        fonts = tmp_path / folder / "fonts"
-        fonts.mkdir(parents=True)
-        if folder == "one":  # any font will do: it is found by its name
-            shutil.copy(findfont("DejaVu Serif"), fonts / "wqy-zenhei.ttc")
-        monkeypatch.setenv("XDG_DATA_HOME", str(fonts.parent))
-        monkeypatch.setenv("XDG_DATA_DIRS", str(tmp_path / "nowhere"))
-        drawing._chinese_font.cache_clear()
-        draw_mouth(SOUND, TEXT, tmp_path / "mouth.png")
-        drawn.append(picture.decode((tmp_path / "mouth.png").read_bytes(), "mouth.png"))
-        told = capsys.readouterr().err
-        assert ("no font with Chinese characters" in told) == (folder == "none")
-    drawing._chinese_font.cache_clear()
-    assert (drawn[0] != drawn[1]).any()
 
 
 def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ from kouxing.services.driver.poses import Poses
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import FADE_S, IdleMotion
 
-pytestmark = pytest.mark.unit
-
 
 def faps(value: float) -> np.ndarray:
     return np.full(NUM_FAPS, value, np.float32)
@@ -34,15 +32,6 @@ def test_shows_the_newest_session_until_it_closes() -> None:
     assert shown == ["c", "b", "b", ""]
 
 
-def test_waits_for_a_named_session() -> None:
-    poses = poses_of("a", configured="b")
-    assert (poses.shown, poses.caption(0.0)) == ("", "waiting for b")
-    assert poses.faps(0.0)[0] == 0
-    poses.add("b", 0.0)
-    poses.add("c", 0.0)
-    assert poses.shown == "b"
-
-
 def test_switching_wraps_around_and_holds_until_the_session_closes() -> None:
     poses = poses_of("a", "b", "c")
     shown = []
@@ -54,14 +43,6 @@ def test_switching_wraps_around_and_holds_until_the_session_closes() -> None:
     assert poses.shown == "b"
     poses.remove("b")
     assert poses.shown == "d"
-
-
-def test_returning_to_the_newest_follows_new_sessions_again() -> None:
-    poses = poses_of("a", "b")
-    poses.switch(1)
-    poses.switch(1)
-    poses.add("c", 0.0)
-    assert poses.shown == "c"
 
 
 def test_a_stalled_face_fades_to_rest_and_returns() -> None:
@@ -99,9 +80,3 @@ def test_resting_face_moves_and_does_not_jump() -> None:
     assert (np.ptp(head[: 60 * 12], axis=0) > 100.0).all()
     step_deg = np.rad2deg(np.abs(np.diff(head, axis=0)).max() * 1e-5)
     assert step_deg < 0.15  # 9 degrees per second
-
-
-def test_caption_counts_the_sessions() -> None:
-    poses = poses_of("a", "b", "c")
-    poses.switch(-1)
-    assert poses.caption(0.0) == "b, 2 of 3 (Tab: next)"

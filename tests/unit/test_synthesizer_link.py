@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import cast
 
-import pytest
-
 from kouxing.services.recognizer.synthesizer_link import KEPT, SynthesizerLink
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
@@ -13,7 +11,6 @@ from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
-pytestmark = pytest.mark.unit
 FAPS = bytes(range(4)) * NUM_FAPS
 
 
@@ -68,14 +65,6 @@ def test_only_one_frame_to_resume_after_is_sent() -> None:
     link.acknowledge_up_to(0, epoch=2)
     sent = link.connect_to(3)
     assert [isinstance(m, Progress) and m.newest_frame is not None for m in sent] == [True, False]
-
-
-def test_ignores_acknowledgements_of_an_earlier_epoch() -> None:
-    link = Link()
-    link.send_all(progress(1.0))
-    link.connect_to(2)
-    assert link.acknowledge_up_to(1, epoch=1) == []
-    assert link.backlog == 1
 
 
 def test_forgets_messages_before_an_interruption() -> None:

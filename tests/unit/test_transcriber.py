@@ -1,52 +1,102 @@
-"""Speech to text with sherpa-onnx and tiny models in its formats."""
+"""Speech to text with sherpa-onnx."""
 
 from __future__ import annotations
 
+import inspect
 import sys
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import onnx
 import pytest
+import sherpa_onnx
+from onnx import TensorProto, helper, numpy_helper
 
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
 from kouxing.shared.errors import UserError
-from tests.sherpa_models import paraformer, sense_voice, transducer
-
-pytestmark = pytest.mark.unit
 
 SOUND = 0.1 * np.random.default_rng(0).standard_normal(16_000).astype(np.float32)
+TOKENS = ("<blk>", "</s>", "<unk>", "你", "好")
+
+
+@pytest.fixture
+def paraformer(tmp_path: Path) -> Path:
+    """Write a Paraformer that returns 你好 for any audio."""
+    constants = {
+        "all": 10.0 * np.eye(len(TOKENS), dtype=np.float32)[[3, 4, 1]][None],
+        "number": np.array([3], np.int32),
+    }
+    info = helper.make_tensor_value_info
+    graph = helper.make_graph(
+        [
+            helper.make_node("Identity", ["all"], ["logits"]),
+            helper.make_node("Identity", ["number"], ["token_num"]),
+        ],
+        "paraformer",
+        [
+            info("speech", TensorProto.FLOAT, ["N", "T", 560]),
+            info("speech_lengths", TensorProto.INT32, ["N"]),
+        ],
+        [
+            info("logits", TensorProto.FLOAT, constants["all"].shape),
+            info("token_num", TensorProto.INT32, [1]),
+        ],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    properties = {"model_type": "paraformer", "lfr_window_size": "7", "lfr_window_shift": "6"}
+    properties |= {"vocab_size": str(len(TOKENS)), "neg_mean": ",".join(["0"] * 560)}
+    helper.set_model_props(model, properties | {"inv_stddev": ",".join(["1"] * 560)})
+    folder = tmp_path / "sherpa-onnx-paraformer-zh"
+    folder.mkdir()
+    onnx.save(model, folder / "model.int8.onnx")
+    lines = [f"{token} {number}\n" for number, token in enumerate(TOKENS)]
+    (folder / "tokens.txt").write_text("".join(lines), encoding="utf-8")
+    return folder
+
+
+def test_transcribes_with_the_smallest_file(paraformer: Path) -> None:
+    (paraformer / "model.onnx").write_bytes(bytes(100_000))  # cannot be loaded
+    transcriber = SherpaTranscriber(paraformer)
+    assert [transcriber.transcribe(sound) for sound in (SOUND, SOUND[:8000])] == ["你好", "你好"]
 
 
 @pytest.mark.parametrize(
-    ("name", "write"),
+    ("kind", "name", "models"),
     [
-        ("zipformer", transducer),
-        ("sherpa-onnx-paraformer-zh", paraformer),
-        ("sherpa-onnx-sense-voice-zh", sense_voice),
+        ("from_transducer", "zipformer", ("encoder", "decoder", "joiner")),
+        ("from_paraformer", "a-paraformer", ("model",)),
+        ("from_sense_voice", "sherpa-onnx-sense-voice-zh", ("model",)),
     ],
 )
-def test_runs_every_kind_of_model(tmp_path: Path, name: str, write: Callable[[Path], Path]) -> None:
-    transcriber = SherpaTranscriber(write(tmp_path / name))
-    assert transcriber.transcribe(SOUND) == "你好"
-    assert transcriber.transcribe(SOUND[:8000]) == "你好"
+def test_loads_every_kind_of_model(
+    tmp_path: Path, kind: str, name: str, models: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / name
+    folder.mkdir()
+    files = {str(folder / f"{model}.onnx") for model in models}
+    for path in (folder / "tokens.txt", *map(Path, files)):
+        path.touch()
+    load = inspect.signature(getattr(sherpa_onnx.OfflineRecognizer, kind))
+    given: dict[str, Any] = {}
+
+    def bind(**names: Any) -> None:
+        given.update(load.bind(**names).arguments)
+
+    monkeypatch.setattr(sherpa_onnx.OfflineRecognizer, kind, bind)
+    SherpaTranscriber(folder)
+    assert files <= {str(value) for value in given.values()}
 
 
-def test_uses_the_smallest_file(tmp_path: Path) -> None:
-    folder = paraformer(tmp_path / "paraformer")
-    (folder / "model.onnx").rename(folder / "model.int8.onnx")
-    (folder / "model.onnx").write_bytes(bytes(100_000))  # cannot be loaded
-    assert SherpaTranscriber(folder).transcribe(SOUND) == "你好"
-
-
-def test_rejects_a_folder_without_a_model(tmp_path: Path) -> None:
+def test_rejects_a_folder_without_a_model(tmp_path: Path, paraformer: Path) -> None:
     with pytest.raises(UserError, match=r"contains no tokens\.txt"):
         SherpaTranscriber(tmp_path)
     with pytest.raises(UserError, match="no model of a known kind"):
-        SherpaTranscriber(paraformer(tmp_path / "other"))
-    damaged = paraformer(tmp_path / "paraformer")
+        SherpaTranscriber(paraformer.rename(tmp_path / "other"))
+    damaged = (tmp_path / "other").rename(paraformer)
     (damaged / "tokens.txt").write_text("你 0\n", encoding="utf-8")
-    with pytest.raises(UserError, match=r"paraformer: sherpa-onnx cannot load the model"):
+    with pytest.raises(UserError, match=r"paraformer-zh: sherpa-onnx cannot load the model"):
         SherpaTranscriber(damaged)
 
 

@@ -16,7 +16,7 @@ from kouxing.shared.phones.events import LipPositions, Phone
 from tests.live_streams import recognize_live, recognize_together
 from tests.unit.test_block_model import FRAMES, HELLO, blocks
 
-pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.usefixtures("one_thread")]
 
 
 @cache
@@ -26,11 +26,7 @@ def two_networks() -> TwoNetworks:
 
 def test_the_newest_frames_have_causal_scores() -> None:
     model = two_networks()
-    together, early, late = (
-        model.create_stream(),
-        model.early.create_stream(),
-        model.late.create_stream(),
-    )
+    together, early, late = (part.create_stream() for part in (model, model.early, model.late))
     num_settled = 0
     newest = np.empty((0, model.topology.num_states), np.float32)
     for start in range(0, len(FRAMES), 3):

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 
 from kouxing.services.recognizer.front_end.vad import (
     BLOCK_SAMPLES,
@@ -8,8 +7,6 @@ from kouxing.services.recognizer.front_end.vad import (
 )
 from kouxing.shared.audio_file import read_audio
 from tests.system import DEMO
-
-pytestmark = pytest.mark.unit
 
 HELLO = read_audio(DEMO / "hello-female.wav")[0].reshape(-1)
 QUIET, SPEAKING, STOPPING = VoiceState
@@ -30,19 +27,6 @@ def test_silence_and_noise_are_not_speech() -> None:
     hum = (0.1 * np.sin(2 * np.pi * 50 * np.arange(48_000) / 16_000)).astype(np.float32)
     for sound in (np.zeros(48_000, np.float32), noise, noise * 10, hum, clicks):
         assert set(states(sound)) == {QUIET}
-
-
-def test_three_states() -> None:
-    detector = VoiceActivityDetector()
-    assert detector.state is QUIET
-    assert detector.update(0.1) is QUIET
-    assert detector.update(0.9) is SPEAKING
-    assert detector.update(0.4) is SPEAKING  # weaker, but not improbable
-    assert detector.update(0.1) is STOPPING
-    assert detector.update(0.9) is SPEAKING  # a stop's closure
-    ending = [detector.update(0.1) for _ in range(16)]
-    assert ending == [STOPPING] * 15 + [QUIET]
-    assert [state.is_speech for state in VoiceState] == [False, True, True]
 
 
 def test_detects_speech_early() -> None:

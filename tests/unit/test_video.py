@@ -14,67 +14,32 @@ from PIL import Image, ImageSequence
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.recording import Recording
-from kouxing.services.driver.video.writer import VideoWriter, open_writer, write_picture
+from kouxing.services.driver.video.writer import VideoWriter, open_writer
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-
-pytestmark = pytest.mark.unit
-
-
-def read(path: Path) -> tuple[int, float, float]:
-    """Return the number of pictures, and the durations of pictures and sound, seconds."""
-    with av.open(str(path)) as container:
-        video, sound = container.streams.video[0], container.streams.audio[0]
-        assert video.codec_context.name == "h264"
-        assert video.codec_context.pix_fmt == "yuv420p"
-        assert sound.codec_context.name == "aac"
-        durations = [
-            float((stream.duration or 0) * (stream.time_base or 0)) for stream in (video, sound)
-        ]
-        images = sum(1 for _ in container.decode(video=0))
-    return images, durations[0], durations[1]
 
 
 def test_pictures_and_sound_are_in_sync(tmp_path: Path) -> None:
     path = tmp_path / "out.mp4"
-    with VideoWriter(path, 64, 48, 25.0, 16000) as writer:
-        for number in range(30):
-            writer.write_image(np.full((48, 64, 3), number * 8, np.uint8))
-            writer.write_sound(np.zeros(640, np.float32))
-        assert not path.exists()  # not visible before it is complete
-    images, picture_s, sound_s = read(path)
-    assert images == 30
-    assert picture_s == pytest.approx(1.2, abs=0.001)
-    assert sound_s == pytest.approx(1.2, abs=0.065)  # whole AAC blocks
-    assert [file.name for file in tmp_path.iterdir()] == ["out.mp4"]
-
-
-def test_sound_starts_with_the_picture(tmp_path: Path) -> None:
-    path = tmp_path / "click.mp4"
-    sound = np.zeros(16000, np.float32)
+    sound = np.zeros(16_000, np.float32)
     sound[8000:8400] = 0.9 * np.sin(np.arange(400) * 0.6)
-    with VideoWriter(path, 64, 48, 25.0, 16000) as writer:
+    with VideoWriter(path, 64, 48, 25.0, 16_000) as writer:
         for number in range(25):
             writer.write_image(np.full((48, 64, 3), 255 * (number >= 12), np.uint8))
-        writer.write_sound(sound)
+            writer.write_sound(sound[640 * number : 640 * (number + 1)])
+        assert not path.exists()  # not visible before it is complete
+    assert [file.name for file in tmp_path.iterdir()] == ["out.mp4"]
     with av.open(str(path)) as container:
-        heard = []
-        for frame in container.decode(audio=0):
-            start = float((frame.pts or 0) * (frame.time_base or 0))
-            loud = np.flatnonzero(np.abs(frame.to_ndarray().ravel()) > 0.3)
-            heard += [start + float(index) / 16000 for index in loud]
+        codecs = [stream.codec_context.name for stream in container.streams]
+        assert codecs == ["h264", "aac"]
+        assert sum(1 for _ in container.decode(video=0)) == 25
+        container.seek(0)
+        heard = [
+            float((frame.pts or 0) * (frame.time_base or 0)) + float(index) / 16_000
+            for frame in container.decode(audio=0)
+            for index in np.flatnonzero(np.abs(frame.to_ndarray().ravel()) > 0.3)
+        ]
     assert min(heard) == pytest.approx(0.5, abs=0.01)
-
-
-def test_an_exception_leaves_no_file(tmp_path: Path) -> None:
-    def fail() -> None:
-        with VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer:
-            writer.write_image(np.zeros((48, 64, 3), np.uint8))
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert not list(tmp_path.iterdir())
 
 
 # --- formats ---
@@ -143,17 +108,22 @@ def test_opaque_videos_declare_their_colors(tmp_path: Path, name: str, codec: st
         )
 
 
-@pytest.mark.parametrize("name", ["frames", "face%03d.png"])
-def test_writes_a_picture_sequence(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "names"),
+    [
+        ("frames", ["frames/00000.png", "frames/00001.png"]),
+        ("face%03d.png", ["face000.png", "face001.png"]),
+    ],
+)
+def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) -> None:
     writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000, transparent=True)
-    for _ in range(3):
+    for _ in range(2):
         writer.write_image(PICTURE)
         writer.write_sound(np.zeros(640, np.float32))
     writer.close()
     files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png"))
-    names = ["frames/00000.png", "frames/00001.png", "frames/00002.png"]
-    assert files == (names if name == "frames" else ["face000.png", "face001.png", "face002.png"])
-    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / files[2])), PICTURE)
+    assert files == names
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / files[1])), PICTURE)
 
 
 @pytest.mark.parametrize(
@@ -171,19 +141,10 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str) -> None:
 def test_rejects_invalid_settings(
     tmp_path: Path, name: str, settings: dict[str, Any], said: str
 ) -> None:
-    used: dict[str, Any] = {
-        "size": (64, 48),
-        "frame_rate_hz": 25.0,
-        "sample_rate_hz": 16000,
-    } | settings
+    used: dict[str, Any] = {"size": (64, 48), "frame_rate_hz": 25.0, "sample_rate_hz": 16_000}
     with pytest.raises(UserError, match=said):
-        open_writer(tmp_path / name, **used)
+        open_writer(tmp_path / name, **(used | settings))
     assert not list(tmp_path.iterdir())
-
-
-def test_error_of_an_unwritable_picture(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cannot write"):
-        write_picture(tmp_path / "no" / "out.png", PICTURE)
 
 
 # --- recordings of sessions ---

@@ -5,20 +5,6 @@ import pytest
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel, mel_bands
 
-pytestmark = pytest.mark.unit
-
-
-def tone(hz: float, num_samples: int = 4000) -> np.ndarray:
-    return np.sin(2 * np.pi * hz * np.arange(num_samples) / 16_000).astype(np.float32)
-
-
-def test_frames_are_ready_with_their_last_sample() -> None:
-    mel = WhisperMel()
-    assert mel.accept_waveform(np.zeros(399, np.float32)).shape == (0, NUM_MELS)
-    assert len(mel.accept_waveform(np.zeros(1, np.float32))) == 1
-    assert len(mel.accept_waveform(np.zeros(159, np.float32))) == 0
-    assert len(mel.accept_waveform(np.zeros(1 + 160 * 8, np.float32))) == 9
-
 
 def test_frames_match_the_definition() -> None:
     sound = np.random.default_rng(0).normal(0, 0.1, 3000)
@@ -31,12 +17,6 @@ def test_frames_match_the_definition() -> None:
     np.testing.assert_allclose(bands, expected, atol=1e-5)
 
 
-def test_silence_is_at_the_floor() -> None:
-    silence = WhisperMel().accept_waveform(np.zeros(4000, np.float32))
-    np.testing.assert_array_equal(silence, np.float32(-0.75))
-    assert 0.9 < WhisperMel().accept_waveform(tone(1000.0)).max() < 1.6
-
-
 def test_bands_match_slaney() -> None:
     """Check Slaney's mels: 66.7 Hz below 1 kHz, 6.9 % above it; every triangle has the area 1."""
     bands = mel_bands()
@@ -46,10 +26,3 @@ def test_bands_match_slaney() -> None:
     assert (np.diff(center_hz) >= 0).all()
     wide = bands[:, -20:].sum(axis=0) * 40  # lines are 40 Hz apart
     np.testing.assert_allclose(wide, 1, atol=0.03)
-
-
-@pytest.mark.parametrize("hz", [300.0, 1000.0, 3000.0, 7000.0])
-def test_a_tone_is_loudest_in_its_band(hz: float) -> None:
-    loudest = WhisperMel().accept_waveform(tone(hz))[5].argmax()
-    low, high = mel_bands()[:, loudest].nonzero()[0][[0, -1]] * 40
-    assert low - 40 <= hz <= high + 40
