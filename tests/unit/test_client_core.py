@@ -10,7 +10,6 @@ from kouxing_client.audio import ANSWER_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.messages import Joined
 from kouxing_client.session_core import (
-    LAST_S,
     MOVE_LIMIT_S,
     REJOIN_S,
     SILENT_S,
@@ -203,19 +202,6 @@ def test_an_unknown_session_ends_unless_it_moves() -> None:
     scene.pass_time(MOVE_LIMIT_S + 0.1)
     assert scene.session.is_over
     assert "unknown-session" in str(scene.session.failure)
-
-
-def test_a_session_that_control_closes_ends_after_its_last_results() -> None:
-    scene = Scene()
-    inbox = scene.subscribe()
-    (events,) = scene.sockets.at("events")
-    events.answer("event", name="session-closed", detail="no audio")
-    scene.pass_time(LAST_S / 2)
-    assert not inbox.is_over
-    scene.pass_time(LAST_S)
-    assert "control has closed the session: no audio" in str(inbox.failure)
-    assert [one for one in scene.sockets.connections if one.is_open] == [scene.commands, events]
-    assert events.topics == set()
 
 
 @pytest.mark.parametrize("is_there", [True, False])

@@ -81,15 +81,6 @@ def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
     assert not honest.is_cut
 
 
-def test_waits_for_a_queue_that_is_full(scene: Scene) -> None:
-    waiting = scene.deliver(1)
-    scene.look(0.0)
-    scene.traffic[1] = Traffic(read=(AUDIO.queue_length + 1) * AUDIO.part_bytes)
-    for look in range(1, 1000):
-        scene.look(float(look))
-    assert not waiting.is_cut
-
-
 def test_sheds_the_owner_with_the_most_undelivered_bytes(scene: Scene) -> None:
     scene.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
     many = [scene.deliver(number, "many") for number in (1, 2, 3)]

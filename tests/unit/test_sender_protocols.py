@@ -75,15 +75,6 @@ def test_vmc_rotates_the_head_if_requested(fap: str, quaternion: tuple[float, ..
     assert not any(address == "/VMC/Ext/Bone/Pos" for address, _ in osc_messages("vmc://", frame))
 
 
-def test_mouth_only_leaves_out_the_rest_of_the_face() -> None:
-    frame = frame_of("vrm", aa=0.6)
-    messages = osc_messages("vmc://?only=mouth", frame)
-    names = {params[0] for address, params in messages if address == "/VMC/Ext/Blend/Val"}
-    assert names == {*"AIUEO", "aa", "ih", "ou", "ee", "oh"}
-    parameters = tracking_parameters(frame, is_mouth_only=True)
-    assert not any(name.startswith(("Eye", "Face", "Brow")) for name in parameters)
-
-
 def test_live_link_datagram() -> None:
     frame = frame_of(jawOpen=0.6, eyeBlinkRight=0.4, head_yaw=0.2e5, pitch_l_eyeball=0.1e5)
     datagram = LiveLinkConnection(parse_target("livelink://?name=Ada")).encode_at(frame, 3600.51)
