@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,13 +31,6 @@ class BenchGroup(TyperGroup):
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure models and services.")
 plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
 bench_app = typer.Typer(cls=BenchGroup, add_completion=False, help="Measure the running system.")
-
-
-class Part(StrEnum):
-    """Purpose of clips."""
-
-    CHOICE = "choice"  # choosing settings
-    HELD = "held"  # scoring
 
 
 SENTENCE = Path(__file__).parents[1] / "shared" / "demo" / "hello-female.wav"
@@ -220,7 +212,6 @@ def schemes(
 @app.command()
 def ferguson(
     clips: Clips,
-    part: Annotated[Part, typer.Option(help="Part of the clips to use.")] = Part.HELD,
     picture: Annotated[
         Path | None, typer.Option(help="Plot accuracy against speaking rate (.png).")
     ] = None,
@@ -231,7 +222,7 @@ def ferguson(
     from kouxing.evaluation.lips.speaking_rates import print_rates, rates_figure, score_rates
 
     check_output(picture, json_file)
-    scores = score_rates(clips, part)
+    scores = score_rates(clips)
     print_rates(scores, Console())
     if picture is not None:
         save_figure(rates_figure(scores), picture)

@@ -12,7 +12,6 @@ import typer
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.terminal import check_output, print_message
-from kouxing.training import SYNTHETIC_WEIGHT
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
@@ -22,9 +21,6 @@ Corpora = Annotated[
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")]
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same model.")]
-SyntheticWeight = Annotated[
-    float, typer.Option(help="Weight of synthetic relative to natural speech.")
-]
 Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
 PhoneLm = Annotated[
     Path | None,
@@ -111,7 +107,6 @@ def gmm(
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
     mixtures: Annotated[int, typer.Option(help="Gaussians per state, a power of two.")] = 32,
-    synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
     any_license: AnyLicense = False,
 ) -> None:
     """Train the Gaussian mixture recognizer, and write its model card."""
@@ -125,7 +120,6 @@ def gmm(
         phone_lm=phone_lm,
         seed=seed,
         num_mixtures=mixtures,
-        synthetic_weight=synthetic_weight,
         shipping=not any_license,
     )
 

@@ -3,7 +3,7 @@
 Corpora are unbalanced. One speaker reads words for three hours, thirty others read one sentence
 each, and a synthesizer makes any amount. The weight of a recording is
 
-    w = clip(sqrt(30 min / minutes of its speaker), 0.3, 3) * (synthetic_weight if synthetic)
+    w = clip(sqrt(30 min / minutes of its speaker), 0.3, 3) * (0.3 if synthetic)
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from kouxing.corpora.speech_corpus import (
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training import SYNTHETIC_WEIGHT
 
 MAX_WORD_PHONES = 8  # a recording with more phones is connected speech
 FRAMES_PER_MINUTE = 6000
+_SYNTHETIC_WEIGHT = 0.3  # relative to natural speech; chosen on development data
 _NEUTRAL_MINUTES = 30.0  # a speaker with this much speech has weight 1
 _MIN_WEIGHT, _MAX_WEIGHT = 0.3, 3.0
 _MIN_FRAMES_PER_PHONE = 3
@@ -76,7 +76,6 @@ def load_examples(
     *,
     split: str = "train",
     shipping: bool = True,
-    synthetic_weight: float = SYNTHETIC_WEIGHT,
     with_samples: bool = False,
 ) -> list[Example]:
     """Read the recordings of one split, with their log-mel features and weights.
@@ -99,7 +98,7 @@ def load_examples(
         utterances += rows
         log_mels += log_mel_of(rows, errors)
         sounds += samples_of(rows) if with_samples else [_NO_SAMPLES] * len(rows)
-    weights = _weights(utterances, synthetic_weight)
+    weights = _weights(utterances)
     examples = []
     for utterance, weight, log_mel, sound in zip(
         utterances, weights, log_mels, sounds, strict=True
@@ -127,7 +126,7 @@ def load_examples(
     return examples
 
 
-def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[float]:
+def _weights(utterances: Sequence[Utterance]) -> list[float]:
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60
@@ -135,7 +134,7 @@ def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[f
     for utterance in utterances:
         weight = np.sqrt(_NEUTRAL_MINUTES / minutes[utterance.speaker])
         weight = float(np.clip(weight, _MIN_WEIGHT, _MAX_WEIGHT))
-        weights.append(weight * (synthetic_weight if is_synthetic(utterance.license) else 1.0))
+        weights.append(weight * (_SYNTHETIC_WEIGHT if is_synthetic(utterance.license) else 1.0))
     return weights
 
 

@@ -90,14 +90,14 @@ def accuracy_of(made: Array, real: Array) -> float:
     return 1.0 - float(np.nansum(difference) / np.sum(size[np.isfinite(difference)]))
 
 
-def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list[RateScore]:
-    """Score all methods on the Mandarin clips of a part ("choice" or "held") that are in sync."""
-    clips = [clip for clip in read_clips(folder) if clip.part == part and clip.is_in_sync]
+def score_rates(folder: Path) -> list[RateScore]:
+    """Score all methods on the held-out Mandarin clips that are in sync."""
+    clips = [clip for clip in read_clips(folder) if clip.part == "held" and clip.is_in_sync]
     if not clips:
-        raise UserError(f"{folder} has no {part} clips with sound in sync; use another folder")
+        raise UserError(f"{folder} has no held-out clips with sound in sync; use another folder")
     real = scale_openings([clip.speaker for clip in clips], [clip.faps for clip in clips])
     model = load_live_model()
-    return [_score_rate(model, clips, real, rate) for rate in rates]
+    return [_score_rate(model, clips, real, rate) for rate in RATES]
 
 
 def _score_rate(

@@ -46,7 +46,6 @@ from kouxing.services.recognizer.search.forced_path import (
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.durations import PhoneDurations
-from kouxing.training.gmm.augmentation import Augmentation
 from kouxing.training.training_set import Example
 
 _LOUD_LEVEL = 0.4  # threshold of speech between quiet (0) and loud (1)
@@ -58,7 +57,7 @@ class Copy:
 
     example: Example
     weight: float  # weight of its frames in the estimates
-    augmentation: Augmentation | None = None
+    log_mel: NDArray[np.float16]  # (frames, 41)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -107,10 +106,7 @@ def features_of(
     copy: Copy, prior_mean: NDArray[np.float32], half_width: int
 ) -> NDArray[np.float32]:
     """Compute the normalized features of a copy as a new session does, (frames, 39)."""
-    log_mel = copy.example.log_mel.astype(np.float32)
-    if copy.augmentation is not None:
-        log_mel = copy.augmentation.apply(log_mel)
-    features = with_differences(cepstra_of_all(log_mel), half_width)
+    features = with_differences(cepstra_of_all(copy.log_mel.astype(np.float32)), half_width)
     return LiveMean(prior_mean).normalize(features)
 
 
@@ -383,8 +379,7 @@ def _component_covariances(
                 continue
             at = state * num_mixtures + component
             centered = (x[members] - mixtures.means[state, component]).astype(np.float64)
-            scatter[at] = (
-                (centered * frames.weights[numbers][members][:, None]).T @ centered / count
-            )
+            weighted = centered * frames.weights[numbers][members][:, None]
+            scatter[at] = weighted.T @ centered / count + 1e-4 * np.eye(num)  # never singular
             counts[at] = count
     return scatter, counts

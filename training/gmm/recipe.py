@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
-from kouxing.services.recognizer.front_end.features import NUM_FEATURES, cepstra_of_all
+from kouxing.services.recognizer.front_end.features import NUM_FEATURES, LogMel, cepstra_of_all
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training import SYNTHETIC_WEIGHT
-from kouxing.training.gmm.augmentation import Augmentation
 from kouxing.training.gmm.estimation import (
     Copy,
     FrameSet,
@@ -26,6 +25,7 @@ from kouxing.training.gmm.estimation import (
     topology_of,
 )
 from kouxing.training.model_card import write_card
+from kouxing.training.neural.augmentation import augment_samples, scale_level
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.training_set import Example, Report, load_examples
@@ -51,7 +51,6 @@ def train_gmm(
     seed: int = 0,
     phone_lm: Path | None = None,
     num_mixtures: int = 32,
-    synthetic_weight: float = SYNTHETIC_WEIGHT,
     shipping: bool = True,
     report: Report = print,
 ) -> None:
@@ -63,9 +62,7 @@ def train_gmm(
     if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
         raise UserError(f"--mixtures {num_mixtures} is not a power of two; give 1, 2, 4, 8, 16...")
     errors = RowErrors()
-    examples = load_examples(
-        corpora, errors, inventory, shipping=shipping, synthetic_weight=synthetic_weight
-    )
+    examples = load_examples(corpora, errors, inventory, shipping=shipping, with_samples=True)
     lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)
     rng = np.random.default_rng(seed)
     copies = [copy for example in examples for copy in _copies(example, rng)]
@@ -96,7 +93,7 @@ def train_gmm(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
         f"{len(inventory)} x {_STATES_PER_PHONE} states",
-        details=f"seed {seed}, synthetic weight {synthetic_weight:.2f}",
+        details=f"seed {seed}",
         recordings=examples,
         errors=errors,
         chosen=chosen,
@@ -141,8 +138,15 @@ def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
     copies = []
     for number in range(num_copies):
         is_augmented = number > 0 or rng.random() < 0.5
-        copies.append(Copy(example, weight, Augmentation.draw(rng) if is_augmented else None))
+        log_mel = _augmented(example.samples, rng) if is_augmented else example.log_mel
+        copies.append(Copy(example, weight, log_mel))
     return copies
+
+
+def _augmented(samples: NDArray[np.int16], rng: np.random.Generator) -> NDArray[np.float16]:
+    """Compute the features of augmented samples, (frames, 41)."""
+    sound, _ = augment_samples(as_floats(samples), rng)
+    return LogMel().accept_waveform(scale_level(sound, rng)).astype(np.float16)
 
 
 def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:

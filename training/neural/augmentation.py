@@ -1,4 +1,4 @@
-"""Augmentation of samples for neural training: speeds, rooms, noises and lines.
+"""Augmentation of samples: speeds, rooms, noises and lines.
 
 Sources: Ko et al. 2015, "Audio augmentation for speech recognition" (speed by resampling, which
 also moves pitch and formants); Ko et al. 2017, "A study on data augmentation of reverberant speech
