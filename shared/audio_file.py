@@ -1,32 +1,53 @@
-"""Audio files and pipes as blocks of samples."""
+"""Audio of files and pipes as blocks of samples."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import io
+import math
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
-import soundfile
 import soxr
-from numpy.typing import NDArray
 
+from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.wav_header import read_wav_header
-
-if TYPE_CHECKING:
-    from kouxing.shared.media_file import MediaSound
+from kouxing.shared.media_file import (
+    MIN_UNKNOWN_BYTES,
+    MediaSound,
+    RawFormat,
+    has_video,
+    pcm_of_wav,
+    to_float,
+)
+from kouxing.shared.sound_formats import (
+    NUM_BEGIN_BYTES,
+    is_sound,
+    needs_all,
+    needs_more,
+    other_kind,
+)
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # of a session; files above are resampled to it
+BLOCK_S = 0.02
 CLIPPED_LEVEL = 0.999
 CLIPPED_SHARE = 0.01  # of the samples; the user is warned about more
-Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
-MIN_MISSING_S = 0.05  # of a file that is reported as cut off
-_MISSING = re.compile(r"^data : (\d+) \(should be (\d+)\)", re.MULTILINE)
-_UNKNOWN_LENGTH = 2**31 - 2**16  # writers to pipes state this length or more
+_MIN_MISSING_S = 0.05  # of a file that is reported as cut off
+_MAX_SPOOLED_BYTES = 64 << 20  # of a pipe that must be read to its end first; more goes to a file
+_PIPE = Path("-")
+
+
+class Readable(Protocol):
+    """A stream of bytes."""
+
+    def read(self, size: int, /) -> bytes:
+        """Return up to ``size`` bytes; empty at the end."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,102 +61,166 @@ class AudioSource:
     blocks: Iterator[Samples]
     remarks: list[str] = field(default_factory=list)  # problems; complete after the last block
     is_live: bool = False  # it arrives in real time
+    notices: list[str] = field(default_factory=list)  # to print before reading
 
 
-def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
-    """Open an audio file, or the audio of a video, for reading block by block.
+def open_audio(
+    path: Path,
+    block_s: float = BLOCK_S,
+    *,
+    track: int | None = None,
+    raw: RawFormat | None = None,
+    is_raw: bool = False,
+) -> AudioSource:
+    """Open an audio file, the audio of a video, or a pipe, for reading block by block.
 
-    libsndfile reads wav, flac and ogg. FFmpeg reads all others (mp3, m4a, mp4, webm, ...). Files
-    above 48 kHz are resampled to 48 kHz. Channels after the second are dropped or mixed in.
+    FFmpeg decodes it. Silence fills the gaps that the file's timestamps have. Rates above 48 kHz
+    are resampled to 48 kHz, and more than two channels are mixed to two. ``track`` counts from 1.
+    The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
+    is read as raw samples; ``raw`` is their format. ``is_raw``: the content is raw samples.
 
     Raises
     ------
     UserError
-        If the file is missing, empty, not audio, or below 8 kHz; while reading, if samples are not
-        finite.
+        If the file is missing, empty, not audio, or below 8 kHz, or ``raw`` is given and another
+        format fits; while reading, if samples are not finite.
     """
-    file = None
     try:
         if path.is_dir():
             raise UserError(f"{path}: this is a folder; give an audio file")
-        if path.stat().st_size == 0:
-            raise UserError(f"{path}: the file is empty")
-        if path.suffix.lower() != ".mp3":  # libsndfile prints messages for it
-            file = soundfile.SoundFile(path)
+        file: BinaryIO = sys.stdin.buffer if path == _PIPE else path.open("rb")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except OSError as error:
         raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
-    except soundfile.LibsndfileError:
-        pass
-    if file is None:
-        return _open_media(path, block_s)
-    if file.frames == 0:
-        raise UserError(f"{path}: the file contains no samples; record it again")
-    _check_rate(path, file.samplerate)
-    rate_hz = min(file.samplerate, MAX_RATE_HZ)
-    remarks: list[str] = []
-    return AudioSource(
-        name=path.name,
-        sample_rate_hz=rate_hz,
-        num_channels=min(2, file.channels),
-        duration_s=file.frames / file.samplerate,
-        blocks=_file_blocks(file, path, rate_hz, block_s, remarks),
-        remarks=remarks,
-    )
+    name = "standard input" if path == _PIPE else path.name
+
+    def open_source() -> AudioSource:
+        if is_raw:
+            return raw_audio(_Pipe(file), raw or RawFormat(), name)
+        if path == _PIPE or not path.is_file():
+            return _open_pipe(file, name, block_s, track, raw)
+        if raw is not None:
+            raise UserError(f"{path}: --rate and --channels apply to raw samples; add --raw")
+        return _open_file(file, str(path), name, block_s, track)
+
+    return _with_file(file, open_source)
 
 
-def _check_rate(path: Path, rate_hz: int) -> None:
-    if rate_hz < MIN_RATE_HZ:
-        raise UserError(f"{path}: {rate_hz} Hz is too low for speech; use {MIN_RATE_HZ} Hz or more")
+def _with_file(file: BinaryIO, open_source: Callable[[], AudioSource]) -> AudioSource:
+    """Open the source of a file that is closed after the last block, or on an error."""
+    try:
+        source = open_source()
+    except BaseException:
+        file.close()
+        raise
+    return replace(source, blocks=_close_after(source.blocks, file))
 
 
-def _open_media(path: Path, block_s: float) -> AudioSource:
-    """Open a file that libsndfile cannot read."""
-    from kouxing.shared.media_file import open_media  # noqa: PLC0415 - takes 0.1 s, and few files need it
-
-    sound = open_media(path, MAX_RATE_HZ, 2)
-    remarks: list[str] = []
-    _check_rate(path, sound.sample_rate_hz)
-    return AudioSource(
-        name=path.name,
-        sample_rate_hz=sound.sample_rate_hz,
-        num_channels=sound.num_channels,
-        duration_s=sound.duration_s,
-        blocks=_media_blocks(path, sound, round(block_s * sound.sample_rate_hz), remarks),
-        remarks=remarks,
-    )
+def _close_after(blocks: Iterator[Samples], file: BinaryIO) -> Iterator[Samples]:
+    with file:
+        yield from blocks
 
 
-def _media_blocks(
-    path: Path, sound: MediaSound, size: int, remarks: list[str]
-) -> Iterator[Samples]:
-    """Cut the audio into blocks of one size; the last block may be shorter."""
-    rest: list[Samples] = []
-    num_rest = num_read = 0
-    for piece in sound.blocks:
-        if not np.isfinite(piece).all():
-            raise UserError(f"{path}: NaN or infinite samples; export the file again")
-        rest.append(np.clip(piece, -1.0, 1.0))
-        num_rest += len(piece)
-        num_read += len(piece)
-        if num_rest >= size:
-            samples = np.concatenate(rest)
-            whole = num_rest - num_rest % size
-            yield from np.split(samples[:whole], whole // size)
-            rest, num_rest = [samples[whole:]], num_rest - whole
-    if num_rest:
-        yield np.concatenate(rest)
-    if num_read == 0:
-        raise UserError(f"{path}: the file contains no samples; record it again")
-    if sound.duration_s is not None:
-        remarks += _missing(path, num_read / sound.sample_rate_hz, sound.duration_s)
+def _open_file(
+    file: BinaryIO, path: str, name: str, block_s: float, track: int | None
+) -> AudioSource:
+    begin = file.read(NUM_BEGIN_BYTES)
+    num_bytes = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    if num_bytes == 0:
+        raise UserError(f"{path}: the file is empty")
+    sound = MediaSound(file, path, begin, track, is_pipe=False)
+    return _source(sound, path, name, block_s, begin, lambda: num_bytes)
+
+
+def _open_pipe(
+    stream: BinaryIO, name: str, block_s: float, track: int | None, raw: RawFormat | None
+) -> AudioSource:
+    if stream.isatty():
+        raise UserError(f"{name}: this is a terminal; pipe sound into the command")
+    pipe = _Pipe(stream)
+    begin = pipe.peek()
+    if not begin:
+        raise UserError(f"{name}: no sound arrived; check the command that writes it")
+    if not is_sound(begin):
+        if kind := other_kind(begin):
+            raise UserError(f"{name}: this is {kind}")
+        raw = raw or RawFormat()
+        source = raw_audio(pipe, raw, name)
+        source.notices.append(
+            f"{name}: no sound format fits, so this is read as raw samples: 16-bit,"
+            f" {raw.sample_rate_hz} Hz, channels: {raw.num_channels}; the options --raw, --rate and"
+            " --channels set this"
+        )
+        return source
+    if raw is not None:
+        raise UserError(
+            f"{name}: the format of this sound states its rate and channels; leave out --rate and"
+            " --channels, or add --raw if these are raw samples"
+        )
+    if stream.seekable() or needs_all(begin):
+        file = stream if stream.seekable() else pipe.read_all()
+        file.seek(0)
+        return _with_file(file, lambda: _open_file(file, name, name, block_s, track))
+    if wav := pcm_of_wav(begin):  # without FFmpeg's delay of 64 KiB
+        pipe.read(wav.place)
+        return raw_audio(pipe, wav.format, name, wav.num_bytes)
+    sound = MediaSound(pipe, name, begin, track, is_pipe=True)  # type: ignore[arg-type]
+    return _source(sound, name, name, block_s, begin, lambda: pipe.num_bytes)
+
+
+class _Pipe:
+    """A pipe whose first bytes can be read twice."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream: Any = stream
+        self._begin = b""
+        self.num_bytes = 0  # read so far
+
+    def peek(self) -> bytes:
+        """Return the first bytes, as many as are needed to recognize the format."""
+        while len(self._begin) < NUM_BEGIN_BYTES and needs_more(self._begin):
+            piece = self._stream.read1(NUM_BEGIN_BYTES)
+            if not piece:
+                break
+            self._begin += piece
+        return self._begin
+
+    def read(self, size: int) -> bytes:
+        """Return up to ``size`` bytes as soon as some are there; empty at the end."""
+        if self._begin:
+            piece, self._begin = self._begin[:size], self._begin[size:]
+        else:
+            piece = self._stream.read1(size)
+        self.num_bytes += len(piece)
+        return piece
+
+    def read_all(self) -> BinaryIO:
+        """Return everything as a file."""
+        file = tempfile.SpooledTemporaryFile(_MAX_SPOOLED_BYTES)  # noqa: SIM115 - the reader closes it
+        while piece := self.read(NUM_BEGIN_BYTES):
+            file.write(piece)
+        return file  # type: ignore[return-value]
 
 
 def read_audio(path: Path) -> tuple[Samples, int]:
     """Return all samples, (n, channels), and their rate in Hz; raises as ``open_audio``."""
     source = open_audio(path, block_s=1.0)
     return np.concatenate(list(source.blocks)), source.sample_rate_hz
+
+
+def check_video(path: Path) -> None:
+    """Raise ``UserError`` if a file is not a video with audio."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(NUM_BEGIN_BYTES)
+            file.seek(0)
+            is_video = has_video(file, str(path), begin)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
+    if not is_video:
+        raise UserError(f"{path}: the video must have pictures and audio")
 
 
 def num_clipped(samples: Samples) -> int:
@@ -150,87 +235,129 @@ def clipping_remarks(name: str, share: float) -> list[str]:
     return [f"{name}: {share:.0%} of the samples are clipped; record at a lower level"]
 
 
-def raw_audio(stream: IO[bytes], sample_rate_hz: int, num_channels: int) -> AudioSource:
-    """Read little-endian int16 samples from a pipe, or the format that a WAV header states.
+def raw_audio(
+    stream: Readable, raw: RawFormat, name: str, num_bytes: int | None = None
+) -> AudioSource:
+    """Read raw samples until the end of a stream, or only ``num_bytes`` of it."""
+    rate_hz, num_channels = min(raw.sample_rate_hz, MAX_RATE_HZ), raw.num_channels
+    _check_rate(name, raw.sample_rate_hz)
+    remarks: list[str] = []
+    frame_bytes = raw.dtype.itemsize * num_channels
+    block_bytes = frame_bytes * raw.sample_rate_hz // 50
 
-    Raises
-    ------
-    UserError
-        If the header states an encoding, a rate or a number of channels that is not supported.
-    """
-    rest = stream.read(2 * num_channels * sample_rate_hz // 50)
-    header = read_wav_header(rest)
-    kind, scale = "<i2", 1 / 32768
-    if header is not None:
-        sample_rate_hz, num_channels = header.sample_rate_hz, header.num_channels
-        if not MIN_RATE_HZ <= sample_rate_hz <= MAX_RATE_HZ or num_channels not in (1, 2):
-            raise UserError(
-                f"the WAV header states {sample_rate_hz} Hz and {num_channels} channels; use "
-                f"{MIN_RATE_HZ} to {MAX_RATE_HZ} Hz and 1 or 2 channels"
-            )
-        if header.encoding == "f32le":
-            kind, scale = "<f4", 1.0
-        rest = rest[header.num_bytes :]
+    def pieces() -> Iterator[tuple[int, Samples]]:
+        guard = CancellationGuard(name, num_channels, remarks)
+        rest, num_left = b"", math.inf if num_bytes is None else num_bytes
+        while num_left and (more := stream.read(int(min(block_bytes, num_left)))):
+            num_left -= len(more)
+            data = rest + more
+            whole = len(data) - len(data) % frame_bytes
+            rest = data[whole:]
+            channels = to_float(np.frombuffer(data[:whole], raw.dtype)).reshape(-1, num_channels)
+            yield raw.sample_rate_hz, guard.mix(channels, channels)
+
+    blocks = _blocks(pieces(), name, rate_hz, num_channels, BLOCK_S)
+    return AudioSource(name, rate_hz, num_channels, None, blocks, remarks)
+
+
+def _source(
+    sound: MediaSound,
+    path: str,
+    name: str,
+    block_s: float,
+    begin: bytes,
+    num_bytes: Callable[[], int],
+) -> AudioSource:
+    _check_rate(path, sound.sample_rate_hz)
+    rate_hz = min(sound.sample_rate_hz, MAX_RATE_HZ)
 
     def blocks() -> Iterator[Samples]:
-        frame_bytes = np.dtype(kind).itemsize * num_channels
-        data = rest
-        while data:
-            whole = len(data) - len(data) % frame_bytes
-            pcm = np.frombuffer(data[:whole], kind).reshape(-1, num_channels)
-            if whole:
-                yield np.clip(pcm * np.float32(scale), -1.0, 1.0)
-            more = stream.read(frame_bytes * sample_rate_hz // 50)
-            data = data[whole:] + more if more else b""
-
-    return AudioSource("standard input", sample_rate_hz, num_channels, None, blocks())
-
-
-def _file_blocks(
-    file: soundfile.SoundFile, path: Path, rate_hz: int, block_s: float, remarks: list[str]
-) -> Iterator[Samples]:
-    num_channels = min(2, file.channels)
-    resampler = (
-        soxr.ResampleStream(file.samplerate, rate_hz, num_channels, dtype="float32")
-        if rate_hz != file.samplerate
-        else None
-    )
-    num_read = 0
-    with file:
-        while True:
-            try:
-                block = file.read(round(block_s * file.samplerate), "float32", always_2d=True)
-            except soundfile.LibsndfileError as error:
-                raise UserError(
-                    f"{path}: damaged at {num_read / file.samplerate:.2f} s: {error}"
-                ) from None
-            is_number = np.isfinite(block).all(axis=1)
-            if not is_number.all():
-                place_s = (num_read + int(is_number.argmin())) / file.samplerate
-                raise UserError(
-                    f"{path}: NaN or infinite samples near {place_s:.2f} s; "
-                    "export the file again, for example as 16-bit PCM"
-                )
+        num_read = 0
+        for block in _blocks(sound.blocks, path, rate_hz, sound.num_channels, block_s):
             num_read += len(block)
-            samples = np.clip(block[:, :num_channels], -1.0, 1.0)
+            yield block
+        if not sound.remarks:
+            sound.remarks.extend(_missing(path, num_read / rate_hz, begin, num_bytes()))
+
+    return AudioSource(
+        name=name,
+        sample_rate_hz=rate_hz,
+        num_channels=sound.num_channels,
+        duration_s=sound.duration_s,
+        blocks=blocks(),
+        remarks=sound.remarks,
+        notices=sound.notices,
+    )
+
+
+def _check_rate(path: str, rate_hz: int) -> None:
+    if rate_hz < MIN_RATE_HZ:
+        raise UserError(f"{path}: {rate_hz} Hz is too low for speech; use {MIN_RATE_HZ} Hz or more")
+
+
+def _blocks(
+    pieces: Iterator[tuple[int, Samples]],
+    path: str,
+    rate_hz: int,
+    num_channels: int,
+    block_s: float,
+) -> Iterator[Samples]:
+    """Cut the audio into blocks of one size; the last block may be shorter."""
+    size = round(block_s * rate_hz)
+    rest: list[Samples] = []
+    num_rest = 0
+    for piece in _resample(_check(pieces, path), rate_hz, num_channels):
+        rest.append(piece)
+        num_rest += len(piece)
+        if num_rest >= size:
+            samples = np.concatenate(rest)
+            whole = num_rest - num_rest % size
+            yield from np.split(samples[:whole], whole // size)
+            rest, num_rest = [samples[whole:]], num_rest - whole
+    if num_rest:
+        yield np.concatenate(rest)
+
+
+def _check(pieces: Iterator[tuple[int, Samples]], path: str) -> Iterator[tuple[int, Samples]]:
+    """Clip samples to [-1, 1]; raise ``UserError`` if some are not finite."""
+    read_s = 0.0
+    for rate_hz, samples in pieces:
+        is_number = np.isfinite(samples).all(axis=1)
+        if not is_number.all():
+            place_s = read_s + int(is_number.argmin()) / rate_hz
+            raise UserError(
+                f"{path}: NaN or infinite samples near {place_s:.2f} s; "
+                "export the file again, for example as 16-bit PCM"
+            )
+        read_s += len(samples) / rate_hz
+        yield rate_hz, np.clip(samples, -1.0, 1.0)
+
+
+def _resample(
+    pieces: Iterator[tuple[int, Samples]], rate_hz: int, num_channels: int
+) -> Iterator[Samples]:
+    """Resample pieces whose rate differs; it may change between pieces."""
+    resampler: Any = None
+    piece_rate_hz = rate_hz
+    end = np.zeros((0, num_channels), np.float32)
+    for new_rate_hz, samples in pieces:
+        if new_rate_hz != piece_rate_hz:
             if resampler is not None:
-                samples = resampler.resample_chunk(samples, last=len(block) == 0)
-            if len(samples):
-                yield np.ascontiguousarray(samples, np.float32)
-            if len(block) == 0:
-                remarks += _cut_off(file, path, num_read)
-                return
+                yield resampler.resample_chunk(end, last=True)
+            piece_rate_hz, resampler = new_rate_hz, None
+            if new_rate_hz != rate_hz:
+                resampler = soxr.ResampleStream(new_rate_hz, rate_hz, num_channels, dtype="float32")
+        yield samples if resampler is None else resampler.resample_chunk(samples)
+    if resampler is not None:
+        yield resampler.resample_chunk(end, last=True)
 
 
-def _cut_off(file: soundfile.SoundFile, path: Path, num_read: int) -> list[str]:
-    """Return a remark if the file is shorter than its header states."""
-    num_stated = file.frames
-    if (match := _MISSING.search(file.extra_info)) and int(match[1]) < _UNKNOWN_LENGTH:
-        num_stated = int(match[1]) * num_read // int(match[2])
-    return _missing(path, num_read / file.samplerate, num_stated / file.samplerate)
-
-
-def _missing(path: Path, read_s: float, stated_s: float) -> list[str]:
-    if stated_s < read_s + MIN_MISSING_S:
+def _missing(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
+    """Return a remark if a WAV or AIFF file is shorter than its header states."""
+    if begin[:4] not in (b"RIFF", b"FORM"):
         return []
-    return [f"{path}: the file is cut off after {read_s:.1f} s of {stated_s:.1f} s"]
+    stated = int.from_bytes(begin[4:8], "little" if begin[:4] == b"RIFF" else "big") + 8
+    missing_s = read_s * (stated / num_bytes - 1)
+    if stated > MIN_UNKNOWN_BYTES or missing_s < _MIN_MISSING_S:
+        return []
+    return [f"{path}: the file is cut off after {read_s:.1f} s of {read_s + missing_s:.1f} s"]

@@ -1,99 +1,327 @@
-"""The audio of media files in any format that FFmpeg reads: m4a, mp4, webm, mkv, mov."""
+"""Decodes the sound of files and pipes with FFmpeg, at the times that the container states."""
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from fractions import Fraction
-from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
+from kouxing.shared.sound_formats import why_unreadable
 
 _MAX_STREAMS = 64
-# Read only the file itself: no network, and no files that a playlist names.
-_OPTIONS = {"protocol_whitelist": "file"}
+_OPTIONS = {"protocol_whitelist": "none"}  # no network, and no files that a playlist names
+# A pipe's first frame is decoded as soon as its bytes are there.
+_PIPE_OPTIONS = _OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
+_JITTER_S = 0.05  # timestamps that differ less from the number of samples are inexact
+_MAX_OVERLAP_S = 1.0  # timestamps that go back further start again
+_MAX_GAP_S = 3600.0  # a larger one is an error in the timestamps
+_MAX_GAP_OF_BROADCAST_S = 10.0  # its timestamps may start again at any value
+_MAX_UNSTATED_S = 0.5  # of a file that is not reported as cut off; also the length of a video frame
+MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
+_WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
+_HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|avi|flv|caf|ape|tta|wv|au|w64")
 
 
-@dataclass(frozen=True, slots=True)
+class RawFormat(NamedTuple):
+    """The format of raw samples."""
+
+    sample_rate_hz: int = 16_000
+    num_channels: int = 1
+    dtype: np.dtype[Any] = np.dtype("<i2")
+
+
+class WavPcm(NamedTuple):
+    """The samples in a WAV file."""
+
+    format: RawFormat
+    place: int  # of the first sample, bytes
+    num_bytes: int | None  # None: until the end of the file
+
+
 class MediaSound:
-    """The first audio track of a media file."""
+    """One audio track of a media file, with one or two channels.
 
-    sample_rate_hz: int
-    num_channels: int
-    duration_s: float | None  # as the file states it
-    blocks: Iterator[NDArray[np.float32]]  # (n, channels), until the end
-
-
-def open_media(path: Path, max_rate_hz: int, max_channels: int) -> MediaSound:
-    """Open the audio of a media file, with a limited rate and 1 or 2 channels.
+    ``track`` counts from 1; None: the first track that can be decoded. ``name`` is the file's, for
+    messages. ``blocks`` yields the sample rate and samples, (n, channels); the rate may change.
+    ``remarks`` is complete after the last block.
 
     Raises
     ------
     UserError
-        If FFmpeg cannot read the file or it has no audio; while reading, if the file is damaged.
+        If FFmpeg cannot read the file, or it has no such track; while reading, if nothing can be
+        decoded.
     """
-    try:
-        container = av.open(path, options=_OPTIONS)
-    except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise UserError(
-            f"{path}: cannot read audio from this file ({_reason(error)}); use wav, flac, mp3, "
-            "m4a, mp4, webm or ogg"
-        ) from None
-    if not container.streams.audio or len(container.streams) > _MAX_STREAMS:
-        container.close()
-        raise UserError(f"{path}: the file has no audio")
-    stream = container.streams.audio[0]
-    rate_hz = min(stream.rate, max_rate_hz)
-    num_channels = min(max_channels, stream.channels)
-    duration_s = None
-    if stream.duration is not None and stream.time_base is not None:
-        duration_s = float(stream.duration * stream.time_base)
-    elif container.duration is not None:
-        duration_s = float(Fraction(container.duration, av.time_base))
-    resampler = av.AudioResampler(
-        format="flt", layout="stereo" if num_channels == 2 else "mono", rate=rate_hz
-    )
-    return MediaSound(
-        rate_hz, num_channels, duration_s, _blocks(path, container, resampler, num_channels)
-    )
 
+    def __init__(
+        self, file: BinaryIO, name: str, begin: bytes, track: int | None, *, is_pipe: bool
+    ) -> None:
+        self.remarks: list[str] = []
+        self.notices: list[str] = []
+        self._name = name
+        self._downmixers: dict[tuple[str, str, int], Any] = {}
+        try:
+            self._container: Any = av.open(
+                file,
+                mode="r",
+                options=_PIPE_OPTIONS if is_pipe else _OPTIONS,
+                buffer_size=4096 if is_pipe else 65536,
+                metadata_errors="replace",
+            )
+        except (av.error.FFmpegError, ValueError) as error:
+            raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
+        try:
+            self._stream = self._choose(track)
+            self._frames = self._decode()
+            first = next(self._frames, None)
+            if first is None:
+                raise UserError(f"{name}: {self._why_silent()}")
+        except BaseException:
+            self._container.close()
+            raise
+        self.sample_rate_hz: int = first.sample_rate
+        self.num_channels = min(2, first.layout.nb_channels)
+        self.duration_s = None if is_pipe else self._stated_s()
+        self.blocks = self._blocks(first)
 
-def check_video(path: Path) -> None:
-    """Raise ``UserError`` if a file is not a video with audio."""
-    try:
-        with av.open(path, options=_OPTIONS) as container:
-            has_both = bool(container.streams.video and container.streams.audio)
-    except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot read this as a video ({_reason(error)})") from None
-    if not has_both:
-        raise UserError(f"{path}: the video must have pictures and audio")
+    def _choose(self, track: int | None) -> Any:
+        tracks = self._container.streams.audio
+        if not tracks or len(self._container.streams) > _MAX_STREAMS:
+            kinds = {stream.type for stream in self._container.streams}
+            contents = f"; it has only {' and '.join(sorted(kinds))}" if kinds else ""
+            raise UserError(f"{self._name}: the file has no audio{contents}")
+        listing = "; ".join(f"{place} {_describe(one)}" for place, one in enumerate(tracks, 1))
+        if track is not None and not 1 <= track <= len(tracks):
+            raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")
+        decodable = [place for place, one in enumerate(tracks, 1) if one.codec_context is not None]
+        chosen = track or next(iter(decodable), 1)
+        stream = tracks[chosen - 1]
+        if stream.codec_context is None:
+            raise UserError(
+                f"{self._name}: the codec of audio track {chosen} is unknown; export the sound as"
+                " wav, flac, mp3 or m4a"
+            )
+        if len(tracks) > 1 and track is None:
+            self.notices.append(
+                f"{self._name}: {len(tracks)} audio tracks: {listing}. This reads track {chosen};"
+                " choose another with --track"
+            )
+        return stream
 
-
-def _blocks(
-    path: Path,
-    container: av.container.InputContainer,
-    resampler: av.AudioResampler,
-    num_channels: int,
-) -> Iterator[NDArray[np.float32]]:
-    num_read = 0
-    with container:
-        frames = container.decode(audio=0)
+    def _decode(self) -> Iterator[Any]:
+        """Yield the frames of the track. Damaged packets are left out, as FFmpeg does."""
+        self._read_end_s = self._track_end_s = 0.0  # of all tracks, and of this one
+        self._first_place: int | None = None  # of the first packet in the file, bytes
+        self._num_damaged = 0
+        self._damaged_s = 0.0  # time of the first damaged packet
+        self._is_encrypted = _tag(self._stream) == "drms"
+        packets = self._container.demux()
         while True:
             try:
-                frame = next(frames, None)
-                parts = resampler.resample(frame)
-            except (av.error.FFmpegError, ValueError) as error:
-                place_s = num_read / resampler.rate
-                raise UserError(f"{path}: damaged at {place_s:.2f} s: {_reason(error)}") from None
-            for part in parts:
-                num_read += part.samples
-                yield part.to_ndarray().astype(np.float32, copy=False).reshape(-1, num_channels)
-            if frame is None:
+                packet = next(packets, None)
+            except (av.error.FFmpegError, ValueError):
+                self._on_damage(self._read_end_s)
                 return
+            except OSError as error:
+                raise UserError(f"{self._name}: cannot read on: {error.strerror}") from None
+            if packet is None:
+                return
+            end_s = _end_s(packet)
+            self._read_end_s = max(self._read_end_s, end_s)
+            if packet.stream is not self._stream:
+                continue
+            if self._first_place is None:
+                self._first_place = packet.pos
+            self._is_encrypted |= packet.has_sidedata("encryption_info")
+            if self._is_encrypted:
+                return
+            try:
+                frames = packet.decode()
+            except (av.error.FFmpegError, ValueError):
+                self._on_damage(end_s)
+                continue
+            self._track_end_s = max(self._track_end_s, end_s)
+            yield from frames
+
+    def _on_damage(self, place_s: float) -> None:
+        if self._num_damaged == 0:
+            self._damaged_s = place_s
+        self._num_damaged += 1
+
+    def _why_silent(self) -> str:
+        if self._is_encrypted:
+            return "the sound is encrypted (DRM); use a copy without protection"
+        if self._num_damaged:
+            return "the sound is damaged or encrypted; nothing can be decoded; export it again"
+        return "the file contains no samples; record it again"
+
+    def _blocks(self, first: Any) -> Iterator[tuple[int, Samples]]:
+        """Yield the samples, with silence in gaps."""
+        start = self._container.start_time
+        origin_s = first.time or 0.0 if start is None else start / av.time_base
+        position_s = 0.0
+        guard = CancellationGuard(self._name, self.num_channels, self.remarks)
+        frame: Any = first
+        with self._container:
+            while frame is not None:
+                rate_hz = frame.sample_rate
+                samples = guard.mix(*self._mix(frame))
+                ahead_s = 0.0 if frame.time is None else frame.time - origin_s - position_s
+                if not self._is_continuous(ahead_s):
+                    origin_s += ahead_s
+                elif ahead_s > _JITTER_S:
+                    if self._container.format.name == "flac":  # its frames have no gaps
+                        self._on_damage(position_s)
+                    num_missing = round(ahead_s * rate_hz)
+                    position_s += num_missing / rate_hz
+                    for begin in range(0, num_missing, rate_hz):
+                        size = min(rate_hz, num_missing - begin)
+                        yield rate_hz, np.zeros((size, self.num_channels), np.float32)
+                elif ahead_s < -_JITTER_S:
+                    samples = samples[round(-ahead_s * rate_hz) :]
+                position_s += len(samples) / rate_hz
+                yield rate_hz, samples
+                frame = next(self._frames, None)
+            self._check_end(position_s)
+
+    def _mix(self, frame: Any) -> tuple[Samples, Samples]:
+        """Return all channels of a frame, and FFmpeg's mix of them if there are more than two."""
+        channels = _samples_of(frame)
+        if frame.layout.nb_channels <= 2:
+            return channels, channels
+        kind = (frame.layout.name, frame.format.name, frame.sample_rate)
+        if kind not in self._downmixers:
+            self._downmixers[kind] = av.AudioResampler(format="flt", layout="stereo")
+        (mixed,) = self._downmixers[kind].resample(frame)
+        return channels, _samples_of(mixed)
+
+    def _is_continuous(self, ahead_s: float) -> bool:
+        """Return whether a difference between timestamps and samples is a gap or an overlap."""
+        if self._container.format.flags & av.format.Flags.ts_discont.value:
+            return -_JITTER_S < ahead_s < _MAX_GAP_OF_BROADCAST_S
+        return -_MAX_OVERLAP_S < ahead_s < _MAX_GAP_S
+
+    def _stated_s(self) -> float | None:
+        """Return the duration that the file states, or that FFmpeg estimates."""
+        if self._container.duration is None:
+            return None
+        return float(self._container.duration / av.time_base)
+
+    def _check_end(self, read_s: float) -> None:
+        """Remark on damage, and on a file that ends before its header states."""
+        stream, stated_s, end_s = self._stream, self._stated_s(), self._read_end_s
+        if stream.duration is not None and stream.time_base is not None:
+            stated_s = float(((stream.start_time or 0) + stream.duration) * stream.time_base)
+            end_s = self._track_end_s
+        elif stated_s is not None:
+            stated_s += (self._container.start_time or 0) / av.time_base
+        missing_s = 0.0 if stated_s is None else stated_s - end_s
+        if missing_s > _MAX_UNSTATED_S and self._states_length():
+            self.remarks.append(
+                f"{self._name}: the file is cut off after {read_s:.1f} s of"
+                f" {read_s + missing_s:.1f} s"
+            )
+        elif self._num_damaged and self._damaged_s < end_s:
+            self.remarks.append(
+                f"{self._name}: damaged near {self._damaged_s:.1f} s; the damaged part is silent"
+            )
+
+    def _states_length(self) -> bool:
+        """Return whether the duration is from a header, not estimated from the file's size."""
+        container = self._container
+        if not _HEADERS_STATE_LENGTH.match(container.format.name):
+            return False
+        bit_rate = sum(
+            one.bit_rate or 0 for one in container.streams if one.type in ("audio", "video")
+        )
+        estimated_bytes = bit_rate * (self._stated_s() or 0) / 8
+        sizes = (container.size, container.size - (self._first_place or 0))
+        return all(abs(estimated_bytes - size) > 0.002 * size for size in sizes)
+
+
+def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
+    """Return whether a media file has moving pictures and sound.
+
+    Raises ``UserError`` if FFmpeg cannot read it.
+    """
+    try:
+        with av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace") as container:
+            cover = av.stream.Disposition.attached_pic
+            has_pictures = any(not one.disposition & cover for one in container.streams.video)
+            return bool(has_pictures and container.streams.audio)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
+
+
+def pcm_of_wav(begin: bytes) -> WavPcm | None:
+    """Return where the samples of a WAV stream are, if they are 16-bit integers or 32-bit floats.
+
+    None for other encodings, more than two channels, and rates that need resampling.
+    """
+    if begin[:4] != b"RIFF" or begin[8:12] != b"WAVE":
+        return None
+    try:
+        with av.open(io.BytesIO(begin), mode="r", format="wav") as container:
+            codec: Any = container.streams.audio[0].codec_context
+            place = next(container.demux()).pos
+    except (av.error.FFmpegError, ValueError, IndexError, StopIteration):
+        return None
+    dtype = _WAV_TYPES.get(codec.name)
+    if (
+        dtype is None
+        or codec.channels > 2
+        or place is None
+        or begin[place - 8 : place - 4] != b"data"
+    ):
+        return None
+    stated = int.from_bytes(begin[place - 4 : place], "little")
+    is_known = 0 < stated < MIN_UNKNOWN_BYTES
+    raw = RawFormat(codec.sample_rate, codec.channels, np.dtype(dtype))
+    return WavPcm(raw, place, stated if is_known else None)
+
+
+def _describe(stream: Any) -> str:
+    """Return what a user needs to recognize a track."""
+    title = stream.metadata.get("title") or stream.metadata.get("handler_name") or ""
+    parts = [f"'{title}'" if title not in ("", "SoundHandler", "Core Media Audio") else ""]
+    parts.append(language if (language := stream.metadata.get("language")) != "und" else "")
+    if (codec := stream.codec_context) is not None:
+        parts += [f"({codec.name}, {codec.sample_rate} Hz, {codec.channels} ch)"]
+    return " ".join(filter(None, parts))
+
+
+def _tag(stream: Any) -> str:
+    try:
+        return str(stream.codec_context.codec_tag)
+    except UnicodeDecodeError:  # it is a number
+        return ""
+
+
+def _end_s(packet: Any) -> float:
+    if packet.pts is None or packet.time_base is None:
+        return 0.0
+    return float((packet.pts + (packet.duration or 0)) * packet.time_base)
+
+
+def _samples_of(frame: Any) -> Samples:
+    """Return a frame's samples as (n, channels), with full scale at 1."""
+    samples = to_float(frame.to_ndarray())
+    return samples.T if frame.format.is_planar else samples.reshape(-1, frame.layout.nb_channels)
+
+
+def to_float(samples: NDArray[Any]) -> NDArray[np.float32]:
+    """Return samples of any type with full scale at 1."""
+    values = samples.astype(np.float32)
+    if samples.dtype.kind == "f":
+        return values
+    values *= np.float32(2.0 ** (1 - 8 * samples.dtype.itemsize))
+    return values - 1 if samples.dtype.kind == "u" else values
 
 
 def _reason(error: Exception) -> str:

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from kouxing.shared.audio_file import AudioSource, Samples, raw_audio
+from kouxing.shared.audio_file import AudioSource, raw_audio
+from kouxing.shared.channels import Samples
 from kouxing.shared.errors import UserError
+from kouxing.shared.media_file import RawFormat
 
 _RATE_HZ = 16_000
 _LATENCY_MS = 20  # of recordings of outputs and programs
@@ -102,7 +104,7 @@ def monitor(name: str = "") -> AudioSource:
         ):
             try:
                 has_audio = False
-                for block in raw_audio(parec.stdout, _RATE_HZ, 1).blocks:  # type: ignore[arg-type]
+                for block in raw_audio(parec.stdout, RawFormat(_RATE_HZ), "monitor").blocks:  # type: ignore[arg-type]
                     has_audio = True
                     yield block
                 if not has_audio:

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.audio_file import check_video
 from kouxing.shared.errors import UserError
-from kouxing.shared.media_file import check_video
 
 FILE_NAME = "study.json"
 SUFFIXES = {".mp4", ".webm", ".mov"}

@@ -69,6 +69,7 @@ def animate(
     text: str | None,
     mouth: Path | None,
     expressiveness: float | None,
+    track: int | None = None,
 ) -> Motion:
     """Animate a face from a sound file.
 
@@ -82,7 +83,7 @@ def animate(
     model = load_live_model()
     predictor = _load_lip_predictor(model, mouth)
     settings = [_synthesizer_settings(name, expressiveness) for name in lips]
-    samples = read_mono_16k(source)
+    samples = read_mono_16k(source, track)
     events: Sequence[SoundEvent]
     if live:
         chains = [_new_chain(model, predictor, config) for config in settings]

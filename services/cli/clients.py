@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kouxing.services.cli.options import CurveForm, MouthFile, Shown
+from kouxing.services.cli.options import AudioTrack, CurveForm, MouthFile, Shown
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
@@ -38,8 +37,8 @@ def speak(
         str,
         typer.Argument(
             metavar="FILE|-|mic|monitor",
-            help="'-': standard input, raw int16 or WAV. 'mic': a microphone. 'monitor': the sound"
-            " that this machine plays.",
+            help="Audio or video file. '-': standard input, in any format. 'mic': a microphone."
+            " 'monitor': the sound that this machine plays.",
         ),
     ],
     session: Annotated[str, typer.Option(help="Name of the session.")] = "",
@@ -56,28 +55,41 @@ def speak(
             help="Device for 'mic' or 'monitor', by part of its name in 'kouxing devices'."
         ),
     ] = "",
-    rate: Annotated[int, typer.Option(help="Sample rate of raw standard input, Hz.")] = 16000,
-    channels: Annotated[int, typer.Option(help="Number of channels of raw standard input.")] = 1,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Read raw samples: 16-bit integers, little-endian.")
+    ] = False,
+    rate: Annotated[
+        int | None, typer.Option(help="Sample rate of raw samples, Hz. Default: 16000.")
+    ] = None,
+    channels: Annotated[
+        int | None,
+        typer.Option(min=1, max=8, help="Number of channels of raw samples. Default: 1."),
+    ] = None,
+    track: AudioTrack = None,
     mouth: MouthFile = None,
     control: Control = "",
 ) -> None:
     """Stream a file, standard input, a microphone or this machine's sound to a running system."""
     from kouxing.services.cli.streaming import stream
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
-    from kouxing.shared.audio_file import open_audio, raw_audio
+    from kouxing.shared.audio_file import open_audio
+    from kouxing.shared.media_file import RawFormat
     from kouxing.shared.sound_devices import microphone, monitor
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
         raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
+    if source in ("mic", "monitor") and (raw or rate or channels or track):
+        raise UserError(f"--raw, --rate, --channels and --track do not apply to {source}")
     if source == "mic":
         audio = microphone(device)
     elif source == "monitor":
         audio = monitor(device)
-    elif source == "-":
-        audio = raw_audio(sys.stdin.buffer, rate, channels)
     else:
-        audio = open_audio(Path(source))
+        given = (
+            None if rate is None and channels is None else RawFormat(rate or 16_000, channels or 1)
+        )
+        audio = open_audio(Path(source), track=track, raw=given, is_raw=raw)
     summary = stream(
         audio,
         control_address(control),

@@ -12,13 +12,15 @@ from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
 from kouxing.shared.terminal import print_message
 
 
-def read_mono_16k(path: Path) -> NDArray[np.float32]:
+def read_mono_16k(path: Path, track: int | None = None) -> NDArray[np.float32]:
     """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
 
-    Prints a message if the file is truncated or clipped. Raises ``UserError`` as
-    ``kouxing.shared.audio_file.open_audio``.
+    Prints a message if the file is truncated or clipped, or has other tracks. Raises ``UserError``
+    as ``kouxing.shared.audio_file.open_audio``.
     """
-    source = open_audio(path, block_s=1.0)
+    source = open_audio(path, block_s=1.0, track=track)
+    for notice in source.notices:
+        print_message(notice)
     resampler = Resampler(source.sample_rate_hz, source.num_channels)
     parts = []
     num_samples = clipped = 0

@@ -79,6 +79,7 @@ def draw_mouth(
     smooth: bool = False,
     num_points: int = 21,
     speech_to_text: Path | None = None,
+    track: int | None = None,
 ) -> None:
     """Draw the mouth of a sound file, in the format of the output's suffix.
 
@@ -97,7 +98,7 @@ def draw_mouth(
     if text is None and speech_to_text is None and timing is not None:
         raise UserError("--timing needs a text; give the spoken text before the output file")
     check_output(output)
-    samples = read_mono_16k(source)
+    samples = read_mono_16k(source, track)
     inventory = load_inventory()
     if speech_to_text is not None:
         text = SherpaTranscriber(speech_to_text).transcribe(samples) or None

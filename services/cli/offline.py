@@ -10,6 +10,7 @@ import typer
 
 from kouxing.services.cli.options import (
     DEFAULT_HEAD,
+    AudioTrack,
     CurveForm,
     ExportOptions,
     HeadName,
@@ -21,7 +22,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.terminal import CONSOLE, print_message, write_output
 
-Audio = Annotated[Path, typer.Argument(help="Audio or video file.")]
+Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
 Acoustic = Annotated[
     str, typer.Option(help="Acoustic model: neural, blocks, gmm, or a model file.")
 ]
@@ -105,6 +106,7 @@ def render(
             min=1, max=240, help="Images per second. Default: 25, or the rate of the curves."
         ),
     ] = None,
+    track: AudioTrack = None,
     sound: Annotated[Path | None, typer.Option(help="Sound to add to curves.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, in seconds.")] = None,
     mouth: MouthFile = None,
@@ -124,7 +126,7 @@ def render(
     if has_motion(source):
         _check_no_sound_options(
             source, lips=lips, live=live or None, text=text, mouth=mouth,
-            expressiveness=expressiveness,
+            expressiveness=expressiveness, track=track,
         )  # fmt: skip
     elif sound is not None:
         raise UserError(f"--sound applies to curves; {source} has its own sound")
@@ -142,7 +144,7 @@ def render(
         else:
             motion = animate(
                 source, models, progress, live=live, text=text, mouth=mouth,
-                expressiveness=expressiveness,
+                expressiveness=expressiveness, track=track,
             )  # fmt: skip
         if not motion.frames:
             raise UserError(f"{source}: the file contains no frames; export it again")
@@ -164,7 +166,11 @@ def _plural(count: int, noun: str) -> str:
 
 
 def phones(
-    audio: Audio, acoustic: Acoustic = "blocks", form: Form = None, output: Output = None
+    audio: Audio,
+    acoustic: Acoustic = "blocks",
+    form: Form = None,
+    output: Output = None,
+    track: AudioTrack = None,
 ) -> None:
     """Recognize the phones of an audio file, with their times."""
     from kouxing.services.cli.inputs import read_mono_16k
@@ -174,7 +180,7 @@ def phones(
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
-    samples = read_mono_16k(audio)
+    samples = read_mono_16k(audio, track)
     duration_s = len(samples) / MEDIA_RATE_HZ
     with CONSOLE.status(f"recognizing {duration_s:.0f} s"):
         recognized = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
@@ -191,6 +197,7 @@ def align(
     acoustic: Acoustic = "blocks",
     form: Form = None,
     output: Output = None,
+    track: AudioTrack = None,
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import read_mono_16k
@@ -201,7 +208,7 @@ def align(
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
-    samples = read_mono_16k(audio)
+    samples = read_mono_16k(audio, track)
     model = load_model(model_path(acoustic))
     transcript = read_text(text, model.inventory)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
@@ -241,6 +248,7 @@ def lips(
         Path | None,
         typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text."),
     ] = None,
+    track: AudioTrack = None,
 ) -> None:
     """Draw the mouth in two dimensions, for cartoons, teaching and papers."""
     from kouxing.services.cli.mouth_drawing import draw_mouth
@@ -256,6 +264,7 @@ def lips(
         smooth=smooth,
         num_points=points,
         speech_to_text=speech_to_text,
+        track=track,
     )
 
 

@@ -21,6 +21,10 @@ HeadName = Annotated[
         help=f"{', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz).",
     ),
 ]
+AudioTrack = Annotated[
+    int | None,
+    typer.Option("--track", metavar="N", help="Audio track of the file. Default: the first."),
+]
 MouthFile = Annotated[
     Path | None, typer.Option("--mouth", help="Mouth profile of the speaker, from kouxing adapt.")
 ]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kouxing.services.cli.heads import ensure_page_heads
-from kouxing.services.cli.options import ConfigFile, HeadName, ServiceAssignments
+from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
 from kouxing.services.cli.running_system import announce, find_control
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
@@ -36,6 +36,7 @@ def run(
     play: Annotated[
         Path | None, typer.Option(help="Play this file first, and record it as out/demo.mp4.")
     ] = None,
+    track: AudioTrack = None,
     stop_after: Annotated[
         bool, typer.Option("--stop-after", help="Stop after playing the file.")
     ] = False,
@@ -66,7 +67,7 @@ def run(
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
     driver = settings.load(DriverConfig)
     out = Path(driver.out)
-    sample = None if play is None else _open_sample(play, out / f"{_SAMPLE_SESSION}.mp4")
+    sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     arguments = ["--config", str(config)] if config else []
     addresses = available_addresses(settings)
     control_config = settings.load(ControlConfig)
@@ -169,13 +170,13 @@ def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str
         yield f"your kouxing commands use this one; for other programs, KOUXING_CONTROL={control}"
 
 
-def _open_sample(path: Path, video: Path) -> AudioSource:
+def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:
     """Open the file to play, and remove the video of the last one."""
     from kouxing.shared.audio_file import open_audio
 
     if video.exists() and video.samefile(path):
         raise UserError(f"{path}: the video would overwrite this file; rename it first")
-    sample = open_audio(path)
+    sample = open_audio(path, track=track)
     video.unlink(missing_ok=True)
     return sample
 

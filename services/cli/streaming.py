@@ -77,6 +77,8 @@ class _Streaming:
     def run(self, *, record: bool, paced: bool, **options: Any) -> StreamSummary:
         """Stream the source and wait for the last frame and the video."""
         source = self._source
+        for notice in source.notices:
+            self._warn(notice)
         drawn_before_s = self._drawn_s() if record else 0.0
         self._session = self._client.open_session(
             encoding="f32le",

@@ -27,8 +27,8 @@ from kouxing.services.driver.video import film
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recording_chain import AnalyzedRecording
 from kouxing.services.synthesizer.face_animator import Frame
+from kouxing.shared.audio_file import check_video
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.media_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
 from tests.videos import write_video

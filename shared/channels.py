@@ -1,0 +1,56 @@
+"""One or two channels of sound from any number, without losing a voice."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
+
+_LOST_SHARE = 0.01  # of the loudest channel's energy; a mix with less has lost it
+_SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
+
+
+class CancellationGuard:
+    """Replaces the mix by the loudest channel while the channels cancel each other.
+
+    This happens if a microphone's cable inverts one channel of two, or if the mix of a film leaves
+    out a channel. The mix of other recordings is returned unchanged. ``name`` is the sound's, for
+    the remark that is added to ``remarks``.
+    """
+
+    def __init__(self, name: str, num_channels: int, remarks: list[str]) -> None:
+        self._name = name
+        self._num_channels = num_channels
+        self._remarks = remarks
+        self._energy: NDArray[np.float64] = np.zeros(1)  # of every channel so far
+        self._mixed_energy = 0.0
+        self._has_remarked = False
+
+    def mix(self, channels: Samples, mixed: Samples) -> Samples:
+        """Return ``mixed`` or the loudest of ``channels``, with ``num_channels`` columns."""
+        if mixed.shape[1] != self._num_channels:  # the sound changed
+            mixed = mixed.mean(axis=1, keepdims=True).repeat(self._num_channels, axis=1)
+        if channels.shape[1] == 1 or len(channels) == 0:
+            return mixed
+        energy = np.square(channels, dtype=np.float64).sum(axis=0)
+        mixed_energy = float(np.square(mixed.mean(axis=1), dtype=np.float64).sum())
+        if len(energy) != len(self._energy):
+            self._energy, self._mixed_energy = np.zeros(len(energy)), 0.0
+        self._energy += energy
+        self._mixed_energy += mixed_energy
+        loudest = int(energy.argmax())
+        is_lost = (
+            energy[loudest] > _SILENT_POWER * len(channels)
+            and mixed_energy < _LOST_SHARE * energy[loudest]
+            and self._mixed_energy < _LOST_SHARE * self._energy.max()
+        )
+        if not is_lost:
+            return mixed
+        if not self._has_remarked:
+            self._has_remarked = True
+            self._remarks.append(
+                f"{self._name}: the mix of the channels is silent, since they cancel each other;"
+                f" only channel {loudest + 1} is used"
+            )
+        return channels[:, [loudest] * self._num_channels]

@@ -1,0 +1,123 @@
+"""Recognizes the formats of sound, and of other files, by their first bytes."""
+
+from __future__ import annotations
+
+import codecs
+
+import av
+
+NUM_BEGIN_BYTES = 4096  # enough for all of this module
+_SOUND = (
+    (0, b"RIFF"), (0, b"RIFX"), (0, b"RF64"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"),
+    (0, b"OggS"), (0, b"fLaC"), (0, b"ID3"), (0, b"FORM"), (0, b"caff"), (0, b"#!AMR"),
+    (0, b".snd"), (0, b"\x1a\x45\xdf\xa3"), (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"),
+    (0, b"wvpk"), (0, b"TTA1"), (0, b"MAC "), (0, b"\0\0\1\xba"), (4, b"ftyp"), (4, b"moov"),
+    (4, b"mdat"), (4, b"wide"),
+)  # fmt: skip
+# Codecs whose frames need no container, with the bits of a frame's first two bytes.
+_FRAMED = (
+    ("mp3", 0xFFE6, 0xFFE2),
+    ("mp2", 0xFFE6, 0xFFE4),
+    ("aac", 0xFFF6, 0xFFF0),
+    ("ac3", 0xFFFF, 0x0B77),
+)
+_TS_PACKET, _TS_SYNC = 188, 0x47
+_OTHER = {
+    b"PK\3\4": "a zip archive; unpack it first",
+    b"\x1f\x8b": "a gzip archive; unpack it first",
+    b"7z\xbc\xaf": "a 7z archive; unpack it first",
+    b"Rar!": "a rar archive; unpack it first",
+    b"%PDF": "a PDF document, not sound",
+    b"\x89PNG": "a picture, not sound",
+    b"\xff\xd8\xff": "a picture, not sound",
+    b"GIF8": "a picture, not sound",
+    b"MThd": "a MIDI file: notes without sound; render it to wav with a synthesizer",
+}
+
+
+def is_sound(begin: bytes) -> bool:
+    """Return whether the first bytes are those of a sound or video format."""
+    return (
+        any(begin.startswith(mark, place) for place, mark in _SOUND)
+        or _is_transport_stream(begin)
+        or any(_consists_of_frames(begin, *kind) for kind in _FRAMED)
+    )
+
+
+def needs_more(begin: bytes) -> bool:
+    """Return whether more bytes are needed, up to ``NUM_BEGIN_BYTES``, to recognize a format."""
+    if len(begin) < 12 or begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
+        return True
+    return begin[:1] in (b"\xff", b"\x0b", bytes([_TS_SYNC])) and not is_sound(begin)
+
+
+def other_kind(begin: bytes) -> str:
+    """Return what a file is that is not sound, and what to do; empty if unknown."""
+    for mark, kind in _OTHER.items():
+        if begin.startswith(mark):
+            return kind
+    text = _text_of(begin)
+    return f"text, not sound: {text[:60]!r}" if text else ""
+
+
+def why_unreadable(begin: bytes, reason: str) -> str:
+    """Return why FFmpeg cannot read a file with these first bytes."""
+    if kind := other_kind(begin):
+        return f"cannot read audio: this is {kind}"
+    if not any(begin):
+        return "the file has only zeros, as it was not stored completely; copy or record it again"
+    if begin.startswith(b"ftyp", 4) or begin.startswith(b"mdat", 4):
+        return (
+            "cannot read audio: the file is cut off, so its index is missing; copy or record it"
+            " again"
+        )
+    return (
+        f"cannot read audio from this file ({reason}); use wav, flac, mp3, m4a, mp4, webm or ogg."
+        " Raw samples need: kouxing speak --raw"
+    )
+
+
+def needs_all(begin: bytes) -> bool:
+    """Return whether a file can be decoded only once its end is there."""
+    if begin.startswith(b"caff"):
+        return True
+    return begin[4:8] in (b"ftyp", b"mdat", b"wide") and not _has_index_first(begin)
+
+
+def _has_index_first(begin: bytes) -> bool:
+    place = 0
+    while place + 8 <= len(begin):
+        kind = begin[place + 4 : place + 8]
+        if kind == b"moov":
+            return True
+        size = int.from_bytes(begin[place : place + 4], "big")
+        if kind == b"mdat" or size < 8:
+            return False
+        place += size
+    return False
+
+
+def _is_transport_stream(begin: bytes) -> bool:
+    places = range(0, min(len(begin), 5 * _TS_PACKET), _TS_PACKET)
+    return len(places) == 5 and all(begin[place] == _TS_SYNC for place in places)
+
+
+def _consists_of_frames(begin: bytes, codec: str, mask: int, sync: int) -> bool:
+    """Return whether a codec's parser finds frame after frame from the first byte."""
+    if int.from_bytes(begin[:2], "big") & mask != sync:
+        return False
+    packets = [bytes(packet) for packet in av.CodecContext.create(codec, "r").parse(begin)]
+    return (
+        len(packets) >= 3
+        and begin.startswith(b"".join(packets))
+        and all(packet[:2] == begin[:2] for packet in packets)
+    )
+
+
+def _text_of(begin: bytes) -> str:
+    """Return the text, or an empty string if the bytes are not text."""
+    try:
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(begin)
+    except UnicodeDecodeError:
+        return ""
+    return text.strip() if all(c.isprintable() or c.isspace() for c in text) else ""

@@ -1,0 +1,69 @@
+"""Writes media files for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+Part = tuple[float, NDArray[np.float32]]  # start in seconds, and samples
+
+
+def write_media(
+    path: Path,
+    codec: str,
+    samples: NDArray[np.float32],
+    rate_hz: int,
+    *,
+    start_s: float = 0.0,
+    video_s: float = 0.0,
+    options: dict[str, str] | None = None,
+) -> None:
+    """Write mono samples, with a black video of ``video_s`` from 0 s if it is not 0."""
+    write_tracks(path, codec, [[(start_s, samples)]], rate_hz, video_s=video_s, options=options)
+
+
+def write_tracks(
+    path: Path,
+    codec: str,
+    tracks: Sequence[Sequence[Part]],
+    rate_hz: int,
+    *,
+    titles: Sequence[str] = (),
+    video_s: float = 0.0,
+    options: dict[str, str] | None = None,
+) -> None:
+    """Write tracks of parts, each at its start."""
+    with av.open(path, "w", options=options or {}) as container:
+        if video_s:
+            video = container.add_stream("mpeg4", rate=25)
+            assert isinstance(video, av.VideoStream)
+            video.width = video.height = 32
+            video.pix_fmt = "yuv420p"
+        streams = [container.add_stream(codec, rate=rate_hz, layout="mono") for _ in tracks]
+        for stream, title in zip(streams, titles, strict=False):
+            stream.metadata["title"] = title
+        if video_s:
+            for number in range(round(video_s * 25)):
+                picture = av.VideoFrame.from_ndarray(
+                    np.zeros((32, 32, 3), np.uint8), format="rgb24"
+                )
+                picture.pts, picture.time_base = number, Fraction(1, 25)
+                container.mux(video.encode(picture))
+            container.mux(video.encode(None))
+        for stream, parts in zip(streams, tracks, strict=True):
+            assert isinstance(stream, av.AudioStream)
+            for start_s, samples in parts:
+                resampler = av.AudioResampler(stream.format.name, "mono", rate_hz, frame_size=960)
+                frame = av.AudioFrame.from_ndarray(samples[None], format="fltp", layout="mono")
+                frame.sample_rate = rate_hz
+                position = round(start_s * rate_hz)
+                for piece in [*resampler.resample(frame), *resampler.resample(None)]:
+                    piece.pts, piece.time_base = position, Fraction(1, rate_hz)
+                    position += piece.samples
+                    container.mux(stream.encode(piece))
+            container.mux(stream.encode(None))

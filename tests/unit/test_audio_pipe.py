@@ -1,0 +1,152 @@
+"""Sound from pipes: formats by their first bytes, and raw samples."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from kouxing.shared.audio_file import AudioSource, open_audio, raw_audio, read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.media_file import RawFormat
+from kouxing.shared.sound_formats import is_sound
+from tests.system import DEMO
+from tests.unit.media import write_media
+
+SPEECH = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
+RATE_HZ = 16_000
+
+
+class Pipe(io.RawIOBase):
+    """A stream that cannot seek and that returns few bytes at a time."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = io.BytesIO(data)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        return self._data.readinto(buffer[:777])
+
+
+def _open(monkeypatch: pytest.MonkeyPatch, data: bytes, **options: object) -> AudioSource:
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(Pipe(data))))
+    return open_audio(Path("-"), **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a.mp3", "a.ogg", "a.flac", "a.wav", "a.aiff", "a.au", "a.caf", "a.w64", "rf64.rf64", "a.aac",
+     "a.m4a", "fast.m4a", "a.webm", "a.ts", "a.avi"],
+)  # fmt: skip
+def test_decodes_a_pipe_like_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    path = tmp_path / name
+    codecs = {".aac": "aac", ".m4a": "aac", ".webm": "libopus", ".ts": "aac", ".avi": "pcm_s16le"}
+    if codec := codecs.get(path.suffix):
+        options = {"movflags": "faststart"} if name == "fast.m4a" else {}
+        speech = SPEECH.repeat(3)  # 48 kHz
+        write_media(path, codec, speech, 48_000, options=options)
+    else:
+        soundfile.write(path, SPEECH, RATE_HZ)
+    expected, rate_hz = read_audio(path)
+    source = _open(monkeypatch, path.read_bytes())
+    samples = np.concatenate([*source.blocks])
+    assert (source.sample_rate_hz, source.duration_s) == (rate_hz, None) or path.suffix in (
+        ".caf",
+        ".m4a",
+    )
+    assert len(samples) >= len(expected)
+    np.testing.assert_array_equal(samples[: len(expected)], expected)
+    assert source.remarks == source.notices == []
+
+
+@pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "PCM_24", "PCM_U8", "ALAW", "ULAW"])
+def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, subtype: str) -> None:
+    file = io.BytesIO()
+    soundfile.write(file, np.full((3000, 2), 0.25), 24000, subtype=subtype, format="WAV")
+    data = file.getvalue() + b"LIST\4\0\0\0abcd"  # which is not sound
+    source = _open(monkeypatch, data)
+    assert (source.sample_rate_hz, source.num_channels) == (24000, 2)
+    samples = np.concatenate([*source.blocks])
+    assert len(samples) == 3000
+    np.testing.assert_allclose(samples, 0.25, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
+def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if path.suffix == ".webm":
+        write_media(path, "libopus", SPEECH.repeat(3), 48_000)
+    else:
+        soundfile.write(path, SPEECH, RATE_HZ)
+    os.mkfifo(tmp_path / "fifo")
+    is_read = threading.Event()
+
+    def write() -> None:
+        data = path.read_bytes()
+        with (tmp_path / "fifo").open("wb") as fifo:
+            fifo.write(data[: len(data) // 3])
+            fifo.flush()
+            is_read.wait()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        source = open_audio(tmp_path / "fifo")
+        assert len(next(source.blocks)) == source.sample_rate_hz // 50
+    finally:
+        is_read.set()
+        writer.join()
+    [*source.blocks]  # noqa: B018 - it ends in the middle of a packet
+
+
+def test_reads_raw_samples_if_no_format_fits_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.arange(-1000, 1000, dtype="<i2")
+    source = _open(monkeypatch, values.tobytes() + b"\x01")
+    np.testing.assert_allclose(np.concatenate([*source.blocks]).ravel() * 32768, values)
+    (notice,) = source.notices
+    assert "raw samples: 16-bit, 16000 Hz, channels: 1" in notice
+    source = _open(monkeypatch, values.tobytes(), raw=RawFormat(24_000, 2), is_raw=True)
+    assert (source.sample_rate_hz, source.num_channels, source.notices) == (24_000, 2, [])
+    source = _open(monkeypatch, b"RIFF" + values.tobytes(), is_raw=True)
+    assert len(np.concatenate([*source.blocks])) == 2002
+
+
+def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
+    rng = np.random.default_rng(0)
+    pieces = [rng.integers(-low, low + 1, 2048) for low in (1, 2, 9, 300, 3000) for _ in range(99)]
+    assert not any(is_sound(b"\xff\xfb" + piece.astype("<i2").tobytes()) for piece in pieces)
+    assert not any(is_sound(b"\xff\xff" + piece.astype("<i2").tobytes()) for piece in pieces)
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        (b"", {}, "no sound arrived"),
+        (b'{"error": "invalid key"}', {}, 'this is text, not sound: \'{"error": "invalid key'),
+        (b"\x1f\x8b\x08" + bytes(99), {}, "gzip archive; unpack"),
+        (b"OggS" + bytes(99), {"raw": RawFormat(24_000)}, "leave out --rate"),
+        (b"\0" * 99, {"raw": RawFormat(4_000)}, "4000 Hz is too low"),
+    ],
+)
+def test_rejects_a_pipe_that_is_not_sound(
+    monkeypatch: pytest.MonkeyPatch, data: bytes, options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(UserError, match=f"standard input: .*{message}"):
+        _open(monkeypatch, data, **options)
+
+
+def test_reads_raw_audio_in_odd_pieces() -> None:
+    values = np.arange(-1000, 1000, dtype="<i2")
+    source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), RawFormat(16000, 2), "x")
+    read = np.concatenate(list(source.blocks))
+    np.testing.assert_allclose(read.ravel() * 32768, values)

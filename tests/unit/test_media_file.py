@@ -1,0 +1,156 @@
+"""The times, tracks and damage of media files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from kouxing.shared.audio_file import AudioSource, check_video, open_audio, read_audio
+from kouxing.shared.errors import UserError
+from tests.unit.media import write_media, write_tracks
+
+RATE_HZ = 48_000
+TONE = (0.5 * np.sin(np.arange(RATE_HZ) * 0.1)).astype(np.float32)  # 1 s
+
+
+def _read(source: AudioSource) -> np.ndarray:
+    return np.concatenate(list(source.blocks))[:, 0]
+
+
+def _spans(samples: np.ndarray) -> list[tuple[float, float]]:
+    """Return the seconds between which there is sound."""
+    is_loud = np.abs(samples).reshape(-1, 480).max(axis=1) > 0.1
+    edges = np.flatnonzero(np.diff([False, *is_loud, False])) / 100
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [("a.webm", "libopus"), ("a.mkv", "pcm_s16le"), ("a.mkv", "aac"), ("a.mp4", "aac"),
+     ("a.ts", "aac"), ("a.ogg", "libopus"), ("a.mka", "libmp3lame")],
+)  # fmt: skip
+def test_honors_gaps_in_timestamps(tmp_path: Path, name: str, codec: str) -> None:
+    write_tracks(tmp_path / name, codec, [[(0.0, TONE), (5.0, TONE)]], RATE_HZ)
+    source = open_audio(tmp_path / name)
+    samples = _read(source)
+    (first, second) = _spans(samples[: len(samples) // 480 * 480])
+    assert first == pytest.approx((0.0, 1.0), abs=0.06)
+    assert second == pytest.approx((5.0, 6.0), abs=0.06)
+    assert source.remarks == []
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("a.mkv", "aac"),
+        ("a.mp4", "aac"),
+        ("a.ts", "aac"),
+        ("a.mov", "pcm_s16le"),
+    ],
+)
+def test_honors_the_start_of_a_late_track(tmp_path: Path, name: str, codec: str) -> None:
+    write_media(tmp_path / name, codec, TONE, RATE_HZ, start_s=2.0, video_s=5.0)
+    source = open_audio(tmp_path / name)
+    samples = _read(source)
+    assert _spans(samples[: len(samples) // 480 * 480]) == [pytest.approx((2.0, 3.0), abs=0.06)]
+    assert source.remarks == []
+
+
+def test_times_count_from_the_start_of_the_file(tmp_path: Path) -> None:
+    write_media(tmp_path / "a.mkv", "pcm_s16le", TONE, RATE_HZ, start_s=100.0)
+    np.testing.assert_allclose(read_audio(tmp_path / "a.mkv")[0][:, 0], TONE, atol=1e-4)
+
+
+def test_reads_a_chained_ogg_file_to_its_end(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "a.ogg", TONE, RATE_HZ)
+    (tmp_path / "a.ogg").write_bytes((tmp_path / "a.ogg").read_bytes() * 2)
+    source = open_audio(tmp_path / "a.ogg")
+    assert len(_read(source)) == pytest.approx(2 * RATE_HZ, abs=1200)
+    assert source.remarks == []
+
+
+def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
+    path = tmp_path / "obs.mkv"
+    tracks = [[(0.0, np.zeros_like(TONE))], [(0.0, TONE)]]
+    write_tracks(path, "pcm_s16le", tracks, RATE_HZ, titles=["Desktop", "Mic"])
+    source = open_audio(path)
+    assert _spans(_read(source)) == []
+    (notice,) = source.notices
+    assert "1 'Desktop' (pcm_s16le, 48000 Hz, 1 ch); 2 'Mic' (" in notice
+    assert "--track" in notice
+    source = open_audio(path, track=2)
+    np.testing.assert_allclose(_read(source), TONE, atol=1e-4)
+    assert source.notices == []
+    with pytest.raises(
+        UserError, match=r"there is no track 3; the tracks are: 1 'Desktop' .* 2 'Mic'"
+    ):
+        open_audio(path, track=3)
+
+
+@pytest.mark.parametrize("name", ["a.wav", "a.aiff", "a.flac", "a.mp3", "a.mkv", "a.mp4"])
+def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
+    path, samples = tmp_path / name, np.tile(TONE, 3)
+    if path.suffix in (".mkv", ".mp4"):
+        codec = {".mkv": "pcm_s16le", ".mp4": "aac"}[path.suffix]
+        write_media(path, codec, samples, RATE_HZ, options={"movflags": "faststart"})
+    else:
+        soundfile.write(path, samples, RATE_HZ)
+    source = open_audio(path)
+    assert len(_read(source)) >= 3 * RATE_HZ
+    assert source.remarks == []
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 + 1])
+    source = open_audio(path)
+    assert _spans(_read(source)[:RATE_HZ]) == [pytest.approx((0.0, 1.0), abs=0.06)]
+    (remark,) = source.remarks
+    assert "cut off" in remark
+    assert "of 3.0 s" in remark
+
+
+def test_a_track_that_ends_before_the_video_is_not_cut_off(tmp_path: Path) -> None:
+    write_media(tmp_path / "a.mkv", "aac", TONE, RATE_HZ, video_s=4.0)
+    source = open_audio(tmp_path / "a.mkv")
+    assert len(_read(source)) == pytest.approx(RATE_HZ, abs=4000)
+    assert source.remarks == []
+
+
+def test_leaves_out_damage_and_reports_it(tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).uniform(-0.5, 0.5, 4 * RATE_HZ)
+    soundfile.write(tmp_path / "a.flac", noise, RATE_HZ)
+    data = bytearray((tmp_path / "a.flac").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 20_000] = bytes(20_000)
+    (tmp_path / "a.flac").write_bytes(data)
+    source = open_audio(tmp_path / "a.flac")
+    samples = _read(source)
+    np.testing.assert_allclose(samples[-RATE_HZ:], noise[-RATE_HZ:], atol=1e-4)
+    assert len(samples) == 4 * RATE_HZ
+    (remark,) = source.remarks
+    assert "damaged near 2." in remark
+
+
+def test_rejects_encrypted_sound(tmp_path: Path) -> None:
+    key = {
+        "encryption_scheme": "cenc-aes-ctr",
+        "encryption_key": "01" * 16,
+        "encryption_kid": "02" * 16,
+    }
+    write_media(tmp_path / "a.mp4", "aac", TONE, RATE_HZ, options=key)
+    with pytest.raises(UserError, match="encrypted"):
+        open_audio(tmp_path / "a.mp4")
+
+
+def test_a_cover_picture_is_not_a_video(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "a.mp3", TONE, RATE_HZ)
+    picture = b"\0image/png\0\3\0\x89PNG" + bytes(70_000)
+    frame = b"APIC" + len(picture).to_bytes(4, "big") + b"\0\0" + picture
+    size = bytes((len(frame) >> shift) & 127 for shift in (21, 14, 7, 0))
+    data = b"ID3\3\0\0" + size + frame + (tmp_path / "a.mp3").read_bytes()
+    (tmp_path / "a.mp3").write_bytes(data)
+    source = open_audio(tmp_path / "a.mp3")
+    assert len(_read(source)) == RATE_HZ
+    assert source.remarks == []
+    with pytest.raises(UserError, match="must have pictures"):
+        check_video(tmp_path / "a.mp3")
