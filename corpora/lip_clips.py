@@ -102,7 +102,9 @@ class LipClip:
 
     def filmed_speech(self) -> FilmedSpeech:
         """Return the clip as input for learning a mouth profile."""
-        return FilmedSpeech(samples=self.samples, frame_s=self.time_s, lips=lip_tracks(self.faps))
+        return FilmedSpeech(
+            samples=self.samples, frame_s=self.time_s, lip_track=lip_tracks(self.faps)
+        )
 
 
 def part_of(name: str, *, may_train: bool) -> str:

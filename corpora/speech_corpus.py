@@ -74,14 +74,14 @@ class RowErrors:
         """Add a bad row."""
         self.messages.append(f"{place}: {what}; row skipped")
 
-    def print_to(self, report: Callable[[str], None]) -> None:
+    def report_to(self, report: Callable[[str], None]) -> None:
         """Report each skipped row, then their number."""
         for message in self.messages:
             report(message)
         if self.messages:
             report(f"{len(self.messages)} rows skipped")
 
-    def nothing_left(self, where: str) -> UserError:
+    def no_recording_error(self, where: str) -> UserError:
         """Make the error that no recording can be used, with the reason for the last one."""
         last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
         return UserError(f"no usable recordings {where}{last}; give other recordings")

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from kouxing.shared.config import COMMON, Bound, Settings, bound_keys, variable
+from kouxing.shared.config import COMMON, BindAddress, Settings, bound_keys, variable
 from kouxing.shared.endpoints import WILDCARDS
 from kouxing.shared.errors import UserError
 from kouxing.shared.service_kind import ServiceKind
@@ -31,7 +31,7 @@ def read_settings(
     return Settings(types, file=file, assignments=assignments)
 
 
-def free_addresses(
+def free_port_environment(
     names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
 ) -> dict[str, str]:
     """Return an environment in which services bind free ports, on 127.0.0.1 or the given hosts."""
@@ -40,34 +40,34 @@ def free_addresses(
         for name in names:
             host = (hosts or {}).get(name, "127.0.0.1")
             for key, bound in bound_keys(KINDS[name].config_type).items():
-                if bound is Bound.HOST:
+                if bound is BindAddress.HOST:
                     continue
                 probe = probes.enter_context(socket.socket())
                 probe.bind((host, 0))
                 port = str(probe.getsockname()[1])
-                address = f"tcp://{host}:{port}" if bound is Bound.ENDPOINT else port
+                address = f"tcp://{host}:{port}" if bound is BindAddress.ENDPOINT else port
                 environment[variable(name, key)] = address
     if "control" in names:
         environment[variable(COMMON, "control")] = environment[variable("control", "control")]
     return environment
 
 
-def available_addresses(settings: Settings) -> dict[str, str]:
+def available_port_environment(settings: Settings) -> dict[str, str]:
     """Return an environment in which services bind free ports instead of default ports in use.
 
     Raises ``UserError`` if a port in use was set by the user.
     """
-    free = free_addresses()
+    free = free_port_environment()
     environment = {}
     for kind in KINDS.values():
         values = {setting.key: setting for setting in settings.describe(kind.config_type)}
         bound = bound_keys(kind.config_type)
-        host = next((str(values[key].value) for key in bound if bound[key] is Bound.HOST), "")
-        for key in (key for key in bound if bound[key] is not Bound.HOST):
+        host = next((str(values[key].value) for key in bound if bound[key] is BindAddress.HOST), "")
+        for key in (key for key in bound if bound[key] is not BindAddress.HOST):
             setting = values[key]
             endpoint_host, _, port = str(setting.value).removeprefix("tcp://").rpartition(":")
             if port not in ("0", "*"):
-                if not _is_taken(endpoint_host or host, int(port)):
+                if not _is_port_in_use(endpoint_host or host, int(port)):
                     continue
                 if not setting.is_default:
                     raise UserError(
@@ -78,7 +78,7 @@ def available_addresses(settings: Settings) -> dict[str, str]:
     return environment
 
 
-def more_workers(settings: Settings, number: int) -> dict[str, dict[str, str]]:
+def extra_worker_environments(settings: Settings, number: int) -> dict[str, dict[str, str]]:
     """Return the environments of additional workers, so that each kind has ``number`` of them.
 
     Their names are ``recognizer-2`` and so on. They bind free ports on the first worker's host.
@@ -88,10 +88,10 @@ def more_workers(settings: Settings, number: int) -> dict[str, dict[str, str]]:
         config = settings.load(KINDS[name].config_type)
         environment = {variable(name, "instance"): ""}
         for key, bound in bound_keys(type(config)).items():
-            if bound is Bound.ENDPOINT:
+            if bound is BindAddress.ENDPOINT:
                 host = str(getattr(config, key)).rpartition(":")[0]
                 environment[variable(name, key)] = f"{host}:*"
-            elif bound is Bound.PORT:
+            elif bound is BindAddress.PORT:
                 environment[variable(name, key)] = "0"
         environments |= {f"{name}-{count}": environment for count in range(2, number + 1)}
     return environments
@@ -102,7 +102,7 @@ def kind_of(name: str) -> str:
     return name.partition("-")[0]
 
 
-def _is_taken(host: str, port: int) -> bool:
+def _is_port_in_use(host: str, port: int) -> bool:
     host = "" if host in WILDCARDS else host.strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:

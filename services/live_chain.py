@@ -25,18 +25,18 @@ from kouxing.shared.phones.events import SoundEvent, Waveform
 def sound_events(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lips_from_sound: LipFrameModel | None = None,
+    lip_predictor: LipFrameModel | None = None,
     face_delay_s: float = 0.0,
     config: RecognizerConfig | None = None,
 ) -> list[SoundEvent]:
     """Return the events of a whole sound, 16 kHz mono, shape (n,).
 
-    With ``lips_from_sound``, they include lip frames for a face with the delay ``face_delay_s``.
+    With ``lip_predictor``, they include lip frames for a face with the delay ``face_delay_s``.
     Without ``config``, the default settings are used.
     """
     config = config or RecognizerConfig()
     recognizer = Recognizer(model, config.output_rule)
-    stream = recognizer.create_stream(lips=lips_from_sound, face_delay_s=face_delay_s)
+    stream = recognizer.create_stream(lip_predictor=lip_predictor, face_delay_s=face_delay_s)
     stream.accept_waveform(samples)
     stream.input_finished()
     return _decode(recognizer, stream)
@@ -49,13 +49,13 @@ class LiveChain:
     ----------
     model
         The acoustic model.
-    lips
+    lip_model
         The lip model, for the acoustic model's language.
     sample_rate_hz, num_channels
         Format of the audio.
     recognizer, synthesizer
         Settings of the two services. ``synthesizer.lips`` is ignored.
-    lips_from_sound
+    lip_predictor
         The network that predicts learnt lips. If None, the recognizer's default.
 
     Attributes
@@ -72,13 +72,13 @@ class LiveChain:
     def __init__(
         self,
         model: AcousticModel,
-        lips: LipModel,
+        lip_model: LipModel,
         *,
         sample_rate_hz: int = MEDIA_RATE_HZ,
         num_channels: int = 1,
         recognizer: RecognizerConfig | None = None,
         synthesizer: SynthesizerConfig | None = None,
-        lips_from_sound: LipFrameModel | None = None,
+        lip_predictor: LipFrameModel | None = None,
     ) -> None:
         recognizer = recognizer or RecognizerConfig()
         synthesizer = synthesizer or SynthesizerConfig()
@@ -87,11 +87,11 @@ class LiveChain:
         self._stream = self._recognizer.create_stream(
             sample_rate_hz=sample_rate_hz,
             num_channels=num_channels,
-            lips=lips_from_sound or lip_predictor_for(model),
+            lip_predictor=lip_predictor or lip_predictor_for(model),
             face_delay_s=synthesizer.delay_ms / 1e3,
         )
         self._face = FaceAnimator(
-            lips,
+            lip_model,
             frame_rate_hz=synthesizer.frame_rate_hz,
             delay_s=synthesizer.delay_ms / 1e3,
             idle_motion_seed=synthesizer.idle_motion_seed,

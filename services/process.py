@@ -40,10 +40,10 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     from kouxing.shared.connections import raise_file_limit
     from kouxing.shared.errors import UserError, with_name
     from kouxing.shared.logs import LOG, configure
-    from kouxing.shared.metrics import keep_one_arena
+    from kouxing.shared.metrics import use_single_malloc_arena
 
     configure(name, log_level)
-    keep_one_arena()
+    use_single_malloc_arena()
     raise_file_limit()
     try:
         service = make_service()

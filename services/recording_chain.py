@@ -59,7 +59,7 @@ class AnalyzedRecording:
 def analyze_recording(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lips_from_sound: LipFrameModel | None = None,
+    lip_predictor: LipFrameModel | None = None,
     aligned: Sequence[Phone] | None = None,
 ) -> AnalyzedRecording:
     """Find the phones, lip frames, voice activity and levels of a recording.
@@ -70,17 +70,17 @@ def analyze_recording(
         The acoustic model.
     samples
         16 kHz mono, shape (n,).
-    lips_from_sound
+    lip_predictor
         The network that predicts learnt lips, if it fits the acoustic model.
     aligned
         The phones of the known text; None: phones are recognized.
     """
     silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)  # the delay of the face
     padded = np.concatenate([samples, silence])
-    lips = None
-    if lips_from_sound is not None:
-        lips = lips_from_sound.create_stream(lips_from_sound.delays_s[-1:])
-    events = score_recording(model, padded, MEDIA_RATE_HZ, lips)
+    lip_stream = None
+    if lip_predictor is not None:
+        lip_stream = lip_predictor.create_stream(lip_predictor.delays_s[-1:])
+    events = score_recording(model, padded, MEDIA_RATE_HZ, lip_stream)
     phones = decode_offline(model, events) if aligned is None else aligned
     return AnalyzedRecording(
         duration_s=len(samples) / MEDIA_RATE_HZ,
@@ -101,13 +101,15 @@ def analyze_recording(
 
 
 def animate_recording(
-    recording: AnalyzedRecording, lips: LipModel, config: SynthesizerConfig
+    recording: AnalyzedRecording, lip_model: LipModel, config: SynthesizerConfig
 ) -> list[Frame]:
     """Return all frames of a recording, until the face is at rest. ``delay_ms`` is ignored."""
-    if isinstance(lips, LearntLips):
-        lips = replace(lips, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED)
+    if isinstance(lip_model, LearntLips):
+        lip_model = replace(
+            lip_model, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED
+        )
     face = FaceAnimator(
-        lips,
+        lip_model,
         frame_rate_hz=config.frame_rate_hz,
         delay_s=MAX_DELAY_S,
         idle_motion_seed=config.idle_motion_seed,

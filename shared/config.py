@@ -27,14 +27,20 @@ from annotated_types import Ge, Le, MultipleOf
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from kouxing.shared.endpoints import WILDCARDS, is_loopback, own_address, split_endpoint, with_host
+from kouxing.shared.endpoints import (
+    WILDCARDS,
+    is_loopback,
+    local_address,
+    split_endpoint,
+    with_host,
+)
 from kouxing.shared.errors import UserError
 
 PREFIX = "KOUXING_"
 COMMON = "common"  # table of the keys that every service has
 
 
-class Bound(Enum):
+class BindAddress(Enum):
     """Marks a key as an address that the process binds."""
 
     ENDPOINT = auto()  # tcp://HOST:PORT
@@ -43,14 +49,14 @@ class Bound(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class ValueHint:
     """Describes the values of a key, if their type does not say enough."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
-class DefaultBy:
+class DependentDefault:
     """Default factory of a key whose default depends on the value of an earlier key."""
 
     key: str
@@ -91,13 +97,15 @@ def _split(value: object) -> object:
     return tuple(value.split()) if isinstance(value, str) else value
 
 
-_HOST = Form("a host name or address")
+_HOST = ValueHint("a host name or address")
 Switch = Annotated[bool, BeforeValidator(_check_boolean)]
-Endpoint = Annotated[str, AfterValidator(_check_endpoint), Form("an endpoint, tcp://HOST:PORT")]
-BoundEndpoint = Annotated[Endpoint, Bound.ENDPOINT]
+Endpoint = Annotated[
+    str, AfterValidator(_check_endpoint), ValueHint("an endpoint, tcp://HOST:PORT")
+]
+BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
 Host = Annotated[str, AfterValidator(_check_host), _HOST]
-BoundHost = Annotated[str, Bound.HOST, _HOST]
-BoundPort = Annotated[int, Field(ge=0, le=65535), Bound.PORT]
+BoundHost = Annotated[str, BindAddress.HOST, _HOST]
+BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
 LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_lower)]
 Texts = Annotated[tuple[str, ...], BeforeValidator(_split)]
 """A list in a TOML file; elsewhere a text with spaces between the items."""
@@ -132,7 +140,7 @@ class ServiceConfig(BaseModel):
     def own_host(self) -> str:
         """Host by which others reach a service that binds every address of this host."""
         host, _ = split_endpoint(self.control, "control")
-        return own_address() if is_loopback(host) else own_address(host)
+        return local_address() if is_loopback(host) else local_address(host)
 
     def reachable(self, endpoint: str) -> str:
         """Return the endpoint by which others reach a bound endpoint."""
@@ -151,14 +159,14 @@ Address = tuple[str, str]  # a table and a key
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
+class _RawValue:
     """A value as the user wrote it."""
 
     text: str
     origin: str
 
 
-Layer = dict[Address, _Given]  # the values of one source
+Layer = dict[Address, _RawValue]  # the values of one source
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,14 +239,14 @@ class Settings:
                 origin=given[key].origin if key in given else _default_origin(config, field),
                 default=_default(field),
                 allowed=allowed(field),
-                meaning=_meaning(field),
+                meaning=_field_help(field),
             )
             for key, field in config_type.model_fields.items()
         ]
 
     def _resolve(
         self, config_type: type[Config], overrides: Mapping[str, str]
-    ) -> tuple[Config, dict[str, _Given]]:
+    ) -> tuple[Config, dict[str, _RawValue]]:
         table = next(name for name, known in self._tables.items() if known is config_type)
         assigned = self._assigned({f"{table}.{key}": text for key, text in overrides.items()})
         given = {
@@ -280,7 +288,7 @@ class Settings:
                 raise self._not_allowed(address, layer[address])
         return layer
 
-    def _not_allowed(self, address: Address, given: _Given) -> UserError:
+    def _not_allowed(self, address: Address, given: _RawValue) -> UserError:
         table, key = address
         return UserError(
             f"{table}.{key}: {given.text!r} (from {given.origin}) is not "
@@ -297,8 +305,8 @@ def allowed(field: FieldInfo) -> str:
     """Describe the allowed values of a key, such as "a whole number from 1 to 20"."""
     kind = field.annotation
     marks: dict[type, Any] = {type(mark): mark for mark in field.metadata}
-    if Form in marks:
-        return str(marks[Form].text)
+    if ValueHint in marks:
+        return str(marks[ValueHint].text)
     if typing.get_origin(kind) is Literal:
         return f"one of {', '.join(typing.get_args(kind))}"
     if isinstance(kind, type) and issubclass(kind, StrEnum):
@@ -313,13 +321,13 @@ def allowed(field: FieldInfo) -> str:
     return f"{number} from {marks[Ge].ge} to {marks[Le].le}"
 
 
-def bound_keys(config_type: type[ServiceConfig]) -> dict[str, Bound]:
+def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
     """Return the keys that are addresses which a service binds."""
     return {
         key: mark
         for key, field in config_type.model_fields.items()
         for mark in field.metadata
-        if isinstance(mark, Bound)
+        if isinstance(mark, BindAddress)
     }
 
 
@@ -344,7 +352,7 @@ def _find(values: Mapping[str, str], known: Mapping[str, Address], origin: str =
         if name not in known:
             what = f"{origin}: unknown key {name}" if origin else f"${name}: unknown variable"
             raise UserError(f"{what}; {_hint(name, known)}")
-        layer[known[name]] = _Given(text, origin or f"${name}")
+        layer[known[name]] = _RawValue(text, origin or f"${name}")
     return layer
 
 
@@ -356,22 +364,22 @@ def _as_text(value: object) -> str:
 
 def _default(field: FieldInfo) -> object:
     factory = field.default_factory
-    return factory.otherwise if isinstance(factory, DefaultBy) else field.default
+    return factory.otherwise if isinstance(factory, DependentDefault) else field.default
 
 
 def _default_origin(config: ServiceConfig, field: FieldInfo) -> str:
     factory = field.default_factory
-    if isinstance(factory, DefaultBy):
+    if isinstance(factory, DependentDefault):
         chosen = getattr(config, factory.key)
         if factory.defaults.get(chosen, factory.otherwise) != factory.otherwise:
             return f"default with {factory.key} = {chosen}"
     return "default"
 
 
-def _meaning(field: FieldInfo) -> str:
+def _field_help(field: FieldInfo) -> str:
     meaning = " ".join((field.description or "").split())
     factory = field.default_factory
-    if isinstance(factory, DefaultBy):
+    if isinstance(factory, DependentDefault):
         names: dict[float, list[str]] = {}
         for name, value in factory.defaults.items():
             if value != factory.otherwise:
@@ -390,7 +398,12 @@ def _check_hosts(table: str, config: ServiceConfig) -> None:
     """Reject hosts that other machines can reach, unless connections to them are encrypted."""
     for key, kind in bound_keys(type(config)).items():
         host = getattr(config, key)
-        if kind is not Bound.HOST or is_loopback(host) or config.insecure or config.is_encrypted:
+        if (
+            kind is not BindAddress.HOST
+            or is_loopback(host)
+            or config.insecure
+            or config.is_encrypted
+        ):
             continue
         raise UserError(
             f"{table}.{key}: other machines can reach {host}, and nothing is encrypted; "

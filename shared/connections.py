@@ -24,10 +24,10 @@ import zmq
 from kouxing.shared import kernel_sockets
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
-from kouxing.shared.metrics import give_back_memory
+from kouxing.shared.metrics import trim_heap
 
 KIB, MIB = 1024, 1024 * 1024
-LOOK_S = 0.05  # between two looks at all connections
+CHECK_INTERVAL_S = 0.05  # between two looks at all connections
 RECEIVE_BUFFER = 256 * KIB  # of the kernel, which doubles it
 MAX_UNDELIVERED = 24 * MIB  # of all connections
 MAX_INCOMPLETE = MIB  # of all connections: 16 audio messages on slow links
@@ -135,7 +135,7 @@ class Connection:
             if self.budget.left < 0:
                 self.disconnect("it sends too many useless messages", PENALTY_S)
 
-    def look(self, traffic: Traffic, now_s: float) -> None:
+    def update(self, traffic: Traffic, now_s: float) -> None:
         """Update the figures; disconnect a peer whose message does not end."""
         if self.num_delivered != self._delivered_before:
             self._delivered_before, self._read_before = self.num_delivered, traffic.read
@@ -169,7 +169,7 @@ class Connection:
         self.is_cut = True
         if penalty_s:
             self.budget.block(penalty_s)
-            self.socket.limiter.keep_budget(self)
+            self.socket.limiter.save_budget(self)
         kernel_sockets.reset(self.descriptor, self.inode)
         if _WARNINGS.allows(reason):
             LOG.warning("disconnected a peer at %s: %s", self.address or "?", reason)
@@ -199,7 +199,7 @@ class LimitedSocket:
             return None
         if not connection.num_delivered:
             connection.key = key
-            self.limiter.inherit_budget(connection)
+            self.limiter.restore_budget(connection)
         connection.num_delivered += 1
         connection.spend(self.limits.cost)
         return connection
@@ -223,9 +223,9 @@ class LimitedSocket:
             if follows and connection.is_stalled(now_s):
                 connection.disconnect("it stopped reading live frames")
 
-    def has(self, inode: int) -> bool:
+    def is_open(self, inode: int) -> bool:
         """Return whether a connection has not ended."""
-        return self.limiter.has(inode)
+        return self.limiter.is_open(inode)
 
     def accepted(self) -> Iterator[int]:
         """Yield the descriptors of new connections."""
@@ -283,7 +283,7 @@ class ConnectionLimiter:
             return None
         return self._connections.setdefault(inode, Connection(descriptor, inode, socket))
 
-    def has(self, inode: int) -> bool:
+    def is_open(self, inode: int) -> bool:
         """Return whether a connection has not ended."""
         connection = self._connections.get(inode)
         return connection is not None and _exists(connection)
@@ -293,7 +293,7 @@ class ConnectionLimiter:
         connections = list(self._connections.values())
         return [c for c in connections if c.socket is socket and not c.is_cut]
 
-    def inherit_budget(self, connection: Connection) -> None:
+    def restore_budget(self, connection: Connection) -> None:
         """Start a connection with the budget that its owner's earlier ones left.
 
         Disconnect it if its key has too many connections.
@@ -305,7 +305,7 @@ class ConnectionLimiter:
         if connection.key and sum(not c.is_cut for c in same_key) > max_shared:
             connection.disconnect("its key has too many connections")
 
-    def keep_budget(self, connection: Connection) -> None:
+    def save_budget(self, connection: Connection) -> None:
         """Keep what is left of a connection's budget for its owner's next connections."""
         kept = self._budgets.get(connection.owner)
         if connection.budget.left < (BUDGET if kept is None else kept.left):
@@ -315,7 +315,7 @@ class ConnectionLimiter:
         """Keep the size of all subscriptions below its limit after ``num_bytes`` more."""
         self._topic_bytes += num_bytes
         if self._topic_bytes > MAX_ALL_TOPICS:
-            self._topic_bytes = _shed(
+            self._topic_bytes = _disconnect_heaviest(
                 list(self._connections.values()),
                 lambda connection: connection.topic_bytes,
                 MAX_ALL_TOPICS,
@@ -342,10 +342,10 @@ class ConnectionLimiter:
             socket.close()
 
     def _run(self) -> None:
-        while not self._stops.wait(LOOK_S):
-            self.look(time.monotonic())
+        while not self._stops.wait(CHECK_INTERVAL_S):
+            self.enforce_limits(time.monotonic())
 
-    def look(self, now_s: float) -> None:
+    def enforce_limits(self, now_s: float) -> None:
         """Enforce all limits."""
         for socket in self._sockets:
             for descriptor in socket.accepted():
@@ -354,14 +354,18 @@ class ConnectionLimiter:
         connections = [c for c in list(self._connections.values()) if not c.is_cut]
         self._limit_number(connections)
         for connection in connections:
-            connection.look(kernel_sockets.traffic_of(connection.descriptor), now_s)
-        _shed(connections, lambda c: c.undelivered, MAX_UNDELIVERED, "too much waits for delivery")
+            connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
+        _disconnect_heaviest(
+            connections, lambda c: c.undelivered, MAX_UNDELIVERED, "too much waits for delivery"
+        )
         max_incomplete = MAX_INCOMPLETE + SMALL_INCOMPLETE * len(connections)
-        _shed(connections, lambda c: c.incomplete, max_incomplete, "too many messages do not end")
-        _shed(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
+        _disconnect_heaviest(
+            connections, lambda c: c.incomplete, max_incomplete, "too many messages do not end"
+        )
+        _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
         if self._trims_s and now_s >= self._trims_s[0]:
             del self._trims_s[0]
-            give_back_memory()
+            trim_heap()
 
     def _limit_number(self, connections: list[Connection]) -> None:
         """Disconnect silent peers, oldest first, then the newest ones, if there are too many."""
@@ -384,7 +388,7 @@ class ConnectionLimiter:
             connection.socket.ended.append(connection.inode)
             if connection.is_cut or connection.unread:
                 self._trims_s = [now_s + delay_s for delay_s in TRIMS_S]
-            self.keep_budget(connection)
+            self.save_budget(connection)
         for owner in [owner for owner, kept in self._budgets.items() if kept.left >= BUDGET]:
             del self._budgets[owner]
 
@@ -393,7 +397,7 @@ def _exists(connection: Connection) -> bool:
     return kernel_sockets.inode_of(connection.descriptor) == connection.inode
 
 
-def _shed(
+def _disconnect_heaviest(
     connections: Iterable[Connection],
     measure: Callable[[Connection], int],
     limit: int,

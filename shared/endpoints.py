@@ -51,7 +51,7 @@ def with_host(endpoint: str, host: str) -> str:
     return f"tcp://{host}:{port}"
 
 
-def own_address(towards: str = "192.0.2.1") -> str:
+def local_address(towards: str = "192.0.2.1") -> str:
     """Return the local address for connections to a host, without sending anything.
 
     Without a host, or if it cannot be reached, this is the address of the default route, or

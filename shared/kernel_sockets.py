@@ -44,14 +44,14 @@ def inode_of(descriptor: int) -> int | None:
 
 def address_of(descriptor: int) -> str:
     """Return the peer's network (see ``network_of``), empty if the peer is gone."""
-    with contextlib.suppress(OSError), _borrow(descriptor) as connection:
+    with contextlib.suppress(OSError), _borrow_socket(descriptor) as connection:
         return network_of(str(connection.getpeername()[0]))
     return ""
 
 
 def port_of(descriptor: int) -> int:
     """Return the local port, 0 if there is none."""
-    with contextlib.suppress(OSError), _borrow(descriptor) as connection:
+    with contextlib.suppress(OSError), _borrow_socket(descriptor) as connection:
         name = connection.getsockname()
         return int(name[1]) if isinstance(name, tuple) else 0
     return 0
@@ -80,7 +80,7 @@ def traffic_of(descriptor: int) -> Traffic:
     if not _IS_LINUX:
         return Traffic()
     try:
-        with _borrow(descriptor) as connection:
+        with _borrow_socket(descriptor) as connection:
             info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _COUNTERS.size)
         acknowledged, received = _COUNTERS.unpack(info)
         unread = _request(descriptor, termios.FIONREAD)
@@ -95,7 +95,7 @@ def reset(descriptor: int, inode: int) -> None:
         copy = os.dup(descriptor)  # libzmq cannot close the copy
         try:
             if inode_of(copy) == inode:
-                with _borrow(copy) as connection:
+                with _borrow_socket(copy) as connection:
                     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
                     connection.shutdown(socket.SHUT_RDWR)
                     while connection.recv_into(_SINK, 0, _DISCARD):  # or libzmq would read it
@@ -109,7 +109,7 @@ def _request(descriptor: int, request: int) -> int:
 
 
 @contextlib.contextmanager
-def _borrow(descriptor: int) -> Iterator[socket.socket]:
+def _borrow_socket(descriptor: int) -> Iterator[socket.socket]:
     """Yield a Python socket for a descriptor that libzmq owns."""
     connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fileno=descriptor)
     try:

@@ -90,23 +90,23 @@ def memory_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def keep_one_arena() -> None:
+def use_single_malloc_arena() -> None:
     """Let all threads share one glibc arena. Call this before starting threads.
 
-    ``give_back_memory`` cannot release memory at the end of further arenas, such as those of
+    ``trim_heap`` cannot release memory at the end of further arenas, such as those of
     ZeroMQ's threads.
     """
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
-def give_back_memory() -> None:
+def trim_heap() -> None:
     """Return freed memory to the system. Only glibc keeps a relevant amount."""
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-class BusyShare:
+class LoadMeter:
     """Measures how much of at least the last ``period_s`` a loop worked, rather than waited."""
 
     def __init__(self, period_s: float, now_s: float) -> None:
@@ -116,11 +116,11 @@ class BusyShare:
         self._works = False
         self._marks = deque([(now_s, 0.0)])  # times, and the total of working time until then
 
-    def works(self, now_s: float) -> None:
+    def start_working(self, now_s: float) -> None:
         """Note that the loop starts to work."""
         self._changed_s, self._works = now_s, True
 
-    def waits(self, now_s: float) -> None:
+    def start_waiting(self, now_s: float) -> None:
         """Note that the loop starts to wait."""
         self._busy_s = self._busy_at(now_s)
         self._changed_s, self._works = now_s, False

@@ -70,14 +70,14 @@ class MetricsCollector:
                 label = name.removeprefix(prefix).replace("_", "-")
                 labeled[prefix].add_metric([self._service, label], value)
             else:
-                base, scale = _in_seconds(name)
+                base, scale = _unit_and_divisor(name)
                 counter = CounterMetricFamily(f"kouxing_{base}", "", labels=["service"])
                 counter.add_metric([self._service], value / scale)
                 yield counter
         yield from labeled.values()
 
     def _histogram(self, name: str, distribution: Distribution) -> Metric:
-        base, scale = _in_seconds(name)
+        base, scale = _unit_and_divisor(name)
         limits = [*(str(limit_ms / scale) for limit_ms in BUCKETS_MS), "+Inf"]
         buckets = list(zip(limits, accumulate(distribution.bucket_counts), strict=True))
         histogram = HistogramMetricFamily(f"kouxing_{base}", "", labels=["service"])
@@ -85,7 +85,7 @@ class MetricsCollector:
         return histogram
 
 
-def _in_seconds(name: str) -> tuple[str, float]:
+def _unit_and_divisor(name: str) -> tuple[str, float]:
     """Return a metric's name with Prometheus' unit, and the divisor of its values."""
     return (f"{name.removesuffix('_ms')}_seconds", 1e3) if name.endswith("_ms") else (name, 1.0)
 

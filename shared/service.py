@@ -25,7 +25,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Grant, Peer, load_key, rejection_hint, save_grants
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler, MessageLoop
-from kouxing.shared.metrics import BusyShare, give_back_memory, memory_mb
+from kouxing.shared.metrics import LoadMeter, memory_mb, trim_heap
 from kouxing.shared.prometheus import MetricsServer
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
@@ -90,7 +90,7 @@ class Service(MessageLoop):
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
         self._reply_s = time.monotonic()
         self._control_instance = ""
-        self._busy = BusyShare(LOAD_PERIOD_S, time.monotonic())
+        self._busy = LoadMeter(LOAD_PERIOD_S, time.monotonic())
         self._metrics_server: MetricsServer | None = None
         self.control = self._connect_to_control() if has_control else None
 
@@ -174,7 +174,7 @@ class Service(MessageLoop):
         self._install_signal_handlers()
         gc.collect()
         gc.freeze()  # a full collection would stop the loop for 100 ms
-        give_back_memory()
+        trim_heap()
         self.startup()
         self.main_loop()
         self.shutdown()
@@ -224,11 +224,11 @@ class Service(MessageLoop):
     def step(self, timeout_s: float) -> None:
         """Wait up to the timeout for messages, handle them, then tick."""
         start_s = time.monotonic()
-        self._busy.waits(start_s)
+        self._busy.start_waiting(start_s)
         self.stall.restart(start_s)
         sockets = self.wait(timeout_s)
         now_s = time.monotonic()
-        self._busy.works(now_s)
+        self._busy.start_working(now_s)
         self.stall.check(now_s, expected_s=timeout_s)
         self.resync_with_control()
         for socket in sockets:

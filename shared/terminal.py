@@ -59,7 +59,7 @@ def check_output(*paths: Path | None) -> None:
             if is_new:
                 path.unlink()
         except OSError as error:
-            raise cannot_write(path, error) from None
+            raise write_error(path, error) from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -70,10 +70,10 @@ def write_text(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise cannot_write(path, error) from None
+        raise write_error(path, error) from None
 
 
-def cannot_write(path: Path, error: OSError) -> UserError:
+def write_error(path: Path, error: OSError) -> UserError:
     """Return the error for a file that cannot be written."""
     if isinstance(error, FileNotFoundError):
         return UserError(

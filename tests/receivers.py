@@ -16,7 +16,7 @@ from kouxing.services.senders.osc import OscConnection
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.target import Target
 from kouxing.services.senders.vmc import VmcConnection
-from kouxing.services.senders.vtube_studio import Dialogue, tracking_parameters
+from kouxing.services.senders.vtube_studio import VTubeStudioProtocol, tracking_parameters
 
 # addresses of all protocols and shape sets
 SENT = (
@@ -61,7 +61,7 @@ def _read_live_link(frame: FaceFrame, target: Target) -> list[float]:
 
 
 def _read_vtube_studio(frame: FaceFrame, _target: Target) -> list[float]:
-    dialogue = Dialogue("token", lambda _: None)
+    dialogue = VTubeStudioProtocol("token", lambda _: None)
     known = [{"name": name} for name in tracking_parameters(frame, is_mouth_only=True)]
     listed = {"defaultParameters": known, "customParameters": []}
     dialogue.reply(json.dumps({"messageType": "InputParameterListResponse", "data": listed}))

@@ -16,7 +16,7 @@ from typing import Self
 
 from kouxing_client import Client, KouxingError, Status
 
-from kouxing.services.kinds import KINDS, free_addresses
+from kouxing.services.kinds import KINDS, free_port_environment
 from kouxing.shared.config import variable
 from kouxing.shared.keys import control_endpoint
 
@@ -40,7 +40,7 @@ def own_addresses(
     names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
 ) -> dict[str, str]:
     """Return an environment in which services bind ports that no other program is given."""
-    addresses = free_addresses(names, hosts)
+    addresses = free_port_environment(names, hosts)
     for address in set(addresses.values()):
         host, _, port = address.removeprefix("tcp://").rpartition(":")
         _keep(host or "127.0.0.1", int(port))

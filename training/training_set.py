@@ -122,7 +122,7 @@ def load_examples(
             )
         )
     if not examples:
-        raise errors.nothing_left(f"of split {split!r} in {', '.join(map(str, corpora))}")
+        raise errors.no_recording_error(f"of split {split!r} in {', '.join(map(str, corpora))}")
     return examples
 
 
@@ -163,7 +163,7 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
                 piece = slice(span.start + start, span.stop)
                 pieces.append(sound[_samples_of(piece, min(_MAX_PIECE_FRAMES, num_frames - start))])
     if not pieces:
-        raise errors.nothing_left(f"in {', '.join(map(str, folders))}")
+        raise errors.no_recording_error(f"in {', '.join(map(str, folders))}")
     return pieces
 
 

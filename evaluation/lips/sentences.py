@@ -51,7 +51,7 @@ def corpus_sentences(
     errors = RowErrors()
     utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
     if not utterances:
-        raise errors.nothing_left(f"in the split {split!r} of {corpus}")
+        raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
     sentences = []
     for utterance in choose(utterances):
         clip = _clip(model, utterance.path, utterance.utterance_id, utterance.speaker)

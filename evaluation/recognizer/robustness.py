@@ -64,7 +64,7 @@ def evaluate_robustness(
         for utterance in read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
     ]
     if not recordings:
-        raise errors.nothing_left(f"in the split {split!r} of {corpus}")
+        raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
     voices = babble([samples for _, samples in recordings])
     conditions: dict[str, Callable[[Samples], Samples]] = {
         **SPEECH_CONDITIONS,

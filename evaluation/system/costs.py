@@ -67,7 +67,7 @@ def _cpu_s(
     num_sessions: int,
 ) -> float:
     """Run every session once through the recording, each from another starting point."""
-    streams = [recognizer.create_stream(lips=lips) for _ in range(num_sessions)]
+    streams = [recognizer.create_stream(lip_predictor=lips) for _ in range(num_sessions)]
     starts = np.arange(num_sessions) * len(samples) // num_sessions
     sounds = [np.roll(samples, -start) for start in starts]
     start_s = time.process_time()
@@ -109,9 +109,9 @@ def measure_images() -> Rendering:
         for faps in frames:
             renderer.draw(faps)
         rates[name] = NUM_IMAGES / (time.perf_counter() - start_s)
-        times_s = [renderer.stages_s(faps) for faps in frames]
+        times_s = [renderer.measure_stages_s(faps) for faps in frames]
         stages[name] = {
-            stage: 1e3 * float(np.median([stages_s[stage] for stages_s in times_s]))
+            stage: 1e3 * float(np.median([measure_stages_s[stage] for measure_stages_s in times_s]))
             for stage in times_s[0]
         }
         if encoded:

@@ -16,7 +16,12 @@ from rich.console import Console
 
 from kouxing.evaluation.system.network import Network
 from kouxing.services.cli.supervisor import Supervisor
-from kouxing.services.kinds import KINDS, free_addresses, more_workers, read_settings
+from kouxing.services.kinds import (
+    KINDS,
+    extra_worker_environments,
+    free_port_environment,
+    read_settings,
+)
 from kouxing.shared.config import variable
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
@@ -85,7 +90,7 @@ class LocalSystem(System):
         spare: str = "",
     ) -> None:
         environment = {
-            **free_addresses(services),
+            **free_port_environment(services),
             "KOUXING_DRIVER_VIEW": "none",
             "KOUXING_INSECURE": "false",
             "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
@@ -97,7 +102,7 @@ class LocalSystem(System):
         self._spare_name = f"{spare}-2"
         more = {
             name: {**addresses, variable(spare, "instance"): SPARE}
-            for name, addresses in more_workers(read_settings(), 2).items()
+            for name, addresses in extra_worker_environments(read_settings(), 2).items()
             if name == self._spare_name
         }
         self.supervisor = Supervisor([], folder, console, environment, services=services, more=more)

@@ -12,7 +12,7 @@ from rich.progress import Progress
 
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.inputs import read_mono_16k
-from kouxing.services.cli.spoken_text import does_not_fit, read_text
+from kouxing.services.cli.spoken_text import mismatch_message, read_text
 from kouxing.services.driver.video import film
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -62,7 +62,7 @@ def read_motion(source: Path, sound: Path | None) -> Motion:
 
 def animate(
     source: Path,
-    lips: Sequence[str],
+    lip_models: Sequence[str],
     progress: Progress,
     *,
     live: bool,
@@ -73,8 +73,8 @@ def animate(
 ) -> Motion:
     """Animate a face from a sound file.
 
-    Each lip model of ``lips`` moves a face; the frames hold all faces side by side. With ``live``,
-    the frames are those of the live services with their default settings. Otherwise the whole
+    Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
+    are those of the live services with their default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
     it, if given.
 
@@ -82,7 +82,7 @@ def animate(
     """
     model = load_live_model()
     predictor = _load_lip_predictor(model, mouth)
-    settings = [_synthesizer_settings(name, expressiveness) for name in lips]
+    settings = [_synthesizer_settings(name, expressiveness) for name in lip_models]
     samples = read_mono_16k(source, track)
     events: Sequence[SoundEvent]
     if live:
@@ -107,17 +107,17 @@ def animate(
     )
 
 
-def _synthesizer_settings(lips: str, expressiveness: float | None) -> SynthesizerConfig:
+def _synthesizer_settings(lip_model: str, expressiveness: float | None) -> SynthesizerConfig:
     if expressiveness is None:
-        return SynthesizerConfig(lips=lips)
-    return SynthesizerConfig(lips=lips, expressiveness=expressiveness)
+        return SynthesizerConfig(lips=lip_model)
+    return SynthesizerConfig(lips=lip_model, expressiveness=expressiveness)
 
 
 def _new_chain(
     model: AcousticModel, predictor: LipPredictor | None, settings: SynthesizerConfig
 ) -> LiveChain:
-    lips = load_lip_model(name=settings.lips)
-    return LiveChain(model, lips, synthesizer=settings, lips_from_sound=predictor)
+    lip_model = load_lip_model(name=settings.lips)
+    return LiveChain(model, lip_model, synthesizer=settings, lip_predictor=predictor)
 
 
 def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) -> list[film.Frame]:
@@ -135,7 +135,7 @@ def _align(
     transcript = read_text(text, model.inventory)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
     if not alignment.fits:
-        print_message(does_not_fit(source, alignment))
+        print_message(mismatch_message(source, alignment))
     return alignment.phones
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kouxing.services.cli.options import AudioTrack, CurveForm, MouthFile, Shown
+from kouxing.services.cli.options import AudioTrack, CurveForm, ListenOutput, MouthFile
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
@@ -124,9 +124,9 @@ def listen(
         typer.Argument(help="Name of the session. It may open later. Default: the newest."),
     ] = "",
     show: Annotated[
-        Shown,
+        ListenOutput,
         typer.Option(help="What to print. Syllables and phones are printed once they are final."),
-    ] = Shown.FAPS,
+    ] = ListenOutput.FAPS,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="File for the frames: .fap, .csv, .jsonl or .glb."),
@@ -187,13 +187,13 @@ def express(
     """Show expressions on the face of a session. Without expressions, end those it shows."""
     from kouxing.shared.control_client import connect
 
-    strengths = dict(map(_strength, expressions or ()))
+    strengths = dict(map(_parse_strength, expressions or ()))
     check_expressions(strengths, hold)
     with connect(control_address(control)) as client:
         client.set_face(_session_name(session), expressions=strengths, hold_s=hold)
 
 
-def _strength(text: str) -> tuple[str, float]:
+def _parse_strength(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     try:
         return name, float(value)
@@ -213,7 +213,7 @@ def status(control: Control = "", json_file: JsonFile = None) -> None:
         metrics = ", ".join(
             f"{name} {value:.4g}"
             for name, value in sorted(service.metrics.items())
-            if name.endswith(("_p50", "_p95")) or name in SHOWN_METRICS or _is_drop(name)
+            if name.endswith(("_p50", "_p95")) or name in SHOWN_METRICS or _is_drop_counter(name)
         )
         services.add_row(
             escape(service.instance), service.state, f"{service.age_s:.1f} s ago", escape(metrics)
@@ -244,7 +244,7 @@ def _session_name(name: str) -> str:
     return name
 
 
-def _is_drop(name: str) -> bool:
+def _is_drop_counter(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
 
 

@@ -27,7 +27,7 @@ from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.terminal import cannot_write
+from kouxing.shared.terminal import write_error
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import Motion
@@ -66,7 +66,7 @@ class CurveExporter(ABC):
         if len(options.lips) > 1:
             raise UserError("a curve file holds one face; give --lips only once")
         if not output.parent.is_dir():
-            raise cannot_write(output, FileNotFoundError())
+            raise write_error(output, FileNotFoundError())
         self._output = output
         self._form = options.form
         self._head = options.head
@@ -210,7 +210,7 @@ def _write_lines(output: Path, lines: Iterable[str]) -> int:
                 file.write(line + "\n")
                 file.flush()
     except OSError as error:
-        raise cannot_write(output, error) from None
+        raise write_error(output, error) from None
     return count
 
 

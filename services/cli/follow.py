@@ -18,7 +18,7 @@ from kouxing.services.cli.curves import (
     Row,
     json_line,
 )
-from kouxing.services.cli.options import CurveForm, ExportOptions, Shown
+from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
@@ -35,28 +35,30 @@ LEGEND = "columns: time, then FAPs " + ", ".join(f"{n} {FAPS[n - 1].name}" for n
 T = TypeVar("T", FapFrame, Phone)
 
 
-def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, control: str) -> None:
+def follow(
+    session: str, output: Path | None, shown: ListenOutput, form: CurveForm, control: str
+) -> None:
     """Follow a session until it ends; without a name, the newest one, or else the next one.
 
     The frames go to ``output``. Without it, what ``shown`` selects is printed. Raises ``UserError``
     if control does not answer, or the file cannot be written.
     """
-    if shown is not Shown.FAPS and (output is not None or form is not CurveForm.FAPS):
+    if shown is not ListenOutput.FAPS and (output is not None or form is not CurveForm.FAPS):
         raise UserError(f"--show {shown} cannot be combined with --output or --as")
     if form is CurveForm.LIVELINK and output is None:
         raise UserError("--as livelink is a table; add --output face.csv")
     exporter = None if output is None else _open_exporter(output, form)
     with connect(control) as client:
         followed = _wait_for_session(session, client)
-        if shown is not Shown.FAPS:
+        if shown is not ListenOutput.FAPS:
             language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
-            phones = _until_interrupted(followed.results(Phone, keep_all=True), followed.name)
+            phones = _iter_until_interrupt(followed.results(Phone, keep_all=True), followed.name)
             count = _print(_phone_lines(phones, shown, load_inventory(language)))
         else:
-            frames = _until_interrupted(followed.results(FapFrame, keep_all=True), followed.name)
+            frames = _iter_until_interrupt(followed.results(FapFrame, keep_all=True), followed.name)
             rows = map(_row, frames)
             count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
-    unit = "frames" if shown is Shown.FAPS else shown.value
+    unit = "frames" if shown is ListenOutput.FAPS else shown.value
     print_message(f"session {followed.name} ended: {count} {unit}")
     if output is not None:
         print_message(f"wrote {output}")
@@ -91,7 +93,7 @@ def _wait_for_session(name: str, client: Client) -> Session:
         time.sleep(OPEN_POLL_S)
 
 
-def _until_interrupted(results: Results[T], session: str) -> Iterator[T]:
+def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
     """Yield results until the session ends or the user interrupts."""
     print_message(f"following session {session}")
     with contextlib.suppress(KeyboardInterrupt):
@@ -99,7 +101,7 @@ def _until_interrupted(results: Results[T], session: str) -> Iterator[T]:
 
 
 def _phone_lines(
-    messages: Iterable[Phone], shown: Shown, inventory: PhoneInventory
+    messages: Iterable[Phone], shown: ListenOutput, inventory: PhoneInventory
 ) -> Iterator[str]:
     """Yield a line for each phone or syllable when it is final. Pauses have no line."""
     track = SyllableTrack(inventory)
@@ -112,7 +114,7 @@ def _phone_lines(
             confidence=message.confidence,
             final=message.final,
         )
-        changed = track.update(phone) if shown is Shown.SYLLABLES else [phone]
+        changed = track.update(phone) if shown is ListenOutput.SYLLABLES else [phone]
         for item in changed:
             text = item.symbol if isinstance(item, events.Phone) else item.text
             if item.final and item.duration_s > 0 and text != inventory.silence:

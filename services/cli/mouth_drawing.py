@@ -17,7 +17,7 @@ from rich.progress import Progress
 
 from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import Timing
-from kouxing.services.cli.spoken_text import does_not_fit, read_text
+from kouxing.services.cli.spoken_text import mismatch_message, read_text
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables
@@ -39,7 +39,7 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.terminal import CONSOLE, cannot_write, check_output, print_message, write_text
+from kouxing.shared.terminal import CONSOLE, check_output, print_message, write_error, write_text
 
 Span = tuple[float, float, str]  # start and end in seconds, and the label
 
@@ -131,7 +131,7 @@ def _time_phones(
         return recognize(model, samples, MEDIA_RATE_HZ)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
     if not alignment.fits:
-        print_message(does_not_fit(source, alignment))
+        print_message(mismatch_message(source, alignment))
     return alignment.phones
 
 
@@ -245,7 +245,7 @@ def _write_csv(output: Path, mouth: _Mouth) -> str:
                         for number, (x, y) in enumerate(line)
                     )
     except OSError as error:
-        raise cannot_write(output, error) from None
+        raise write_error(output, error) from None
     return f"{len(times_s)} frames"
 
 

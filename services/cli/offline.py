@@ -201,7 +201,7 @@ def align(
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import read_mono_16k
-    from kouxing.services.cli.spoken_text import does_not_fit, read_text
+    from kouxing.services.cli.spoken_text import mismatch_message, read_text
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -216,7 +216,7 @@ def align(
     syllables = timed_syllables(alignment.phones, transcript, model.inventory)
     write_output(format_phones(alignment.phones, style, duration_s, syllables), output)
     if not alignment.fits:
-        print_message(does_not_fit(audio, alignment))
+        print_message(mismatch_message(audio, alignment))
         raise typer.Exit(1)
 
 

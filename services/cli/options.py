@@ -53,7 +53,7 @@ class CurveForm(StrEnum):
     LIVELINK = "livelink"  # ARKit and head angles, as the app Live Link Face records them
 
 
-class Shown(StrEnum):
+class ListenOutput(StrEnum):
     """Output of ``kouxing listen``."""
 
     FAPS = "faps"

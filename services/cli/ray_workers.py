@@ -22,7 +22,7 @@ import ray
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
 from kouxing.services.cli.supervisor import ONE_THREAD
 from kouxing.services.kinds import KINDS
-from kouxing.shared.config import Bound, Settings, bound_keys, variable
+from kouxing.shared.config import BindAddress, Settings, bound_keys, variable
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import key_text, load_key
 from kouxing.shared.service import DRAIN_TIMEOUT_S
@@ -51,7 +51,7 @@ class Worker:
             environment={**os.environ, **ONE_THREAD, **environment, **folders},
             stdin=subprocess.DEVNULL,
         )
-        threading.Thread(target=self._end_with_process, daemon=True).start()
+        threading.Thread(target=self._watch_process, daemon=True).start()
 
     def host(self) -> str:
         """Return the address of the host that Ray chose."""
@@ -64,7 +64,7 @@ class Worker:
         self._process.wait()
         ray.actor.exit_actor()
 
-    def _end_with_process(self) -> None:
+    def _watch_process(self) -> None:
         while (status := self._process.poll()) is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(POLL_S)
@@ -137,7 +137,7 @@ def _environment(kind: ServiceKind, settings: Settings) -> dict[str, str]:
     for setting in settings.describe(kind.config_type):
         if not setting.is_default:
             environment[variable(kind.name, setting.key)] = setting.text
-        elif bound.get(setting.key) is Bound.ENDPOINT:
+        elif bound.get(setting.key) is BindAddress.ENDPOINT:
             environment[variable(kind.name, setting.key)] = "tcp://0.0.0.0:*"
     return environment
 

@@ -17,7 +17,12 @@ from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, Servi
 from kouxing.services.cli.running_system import announce, find_control
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
-from kouxing.services.kinds import KINDS, available_addresses, more_workers, read_settings
+from kouxing.services.kinds import (
+    KINDS,
+    available_port_environment,
+    extra_worker_environments,
+    read_settings,
+)
 from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.errors import UserError
@@ -69,7 +74,7 @@ def run(
     out = Path(driver.out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     arguments = ["--config", str(config)] if config else []
-    addresses = available_addresses(settings)
+    addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
     bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
     control = _control_address(bound_control)
@@ -81,13 +86,13 @@ def run(
         BOUND_CONTROL: bound_control,
     }
     client_control = control_endpoint(control, insecure=control_config.insecure)
-    more = more_workers(settings, workers)
+    more = extra_worker_environments(settings, workers)
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment, more=more)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(
         signal.SIGINT, signal.default_int_handler
     )  # a shell's background processes ignore it
-    for remark in _remarks_on_ports(settings, addresses, control):
+    for remark in _port_remarks(settings, addresses, control):
         print_message(remark)
     try:
         with CONSOLE.status(f"starting {', '.join(KINDS)}"):
@@ -153,7 +158,7 @@ def _control_address(bound: str) -> str:
     return with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
 
 
-def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str) -> Iterator[str]:
+def _port_remarks(settings: Settings, moved: Mapping[str, str], control: str) -> Iterator[str]:
     """Yield messages about default ports that are in use."""
     taken = [
         setting.text

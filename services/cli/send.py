@@ -76,7 +76,7 @@ def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
     frames: Results[FapFrame] | None = None
     while True:
         newest = search.newest
-        if newest is not None and (state is None or _is_another(newest, state)):
+        if newest is not None and (state is None or _is_new_session(newest, state)):
             if session is not None:
                 session.close()
             state = None
@@ -96,7 +96,7 @@ def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
             time.sleep(STEP_S)
 
 
-def _is_another(session: SessionState, before: SessionState) -> bool:
+def _is_new_session(session: SessionState, before: SessionState) -> bool:
     return session.session != before.session or session.age_s < before.age_s
 
 

@@ -45,7 +45,7 @@ def read_text(text: str, inventory: PhoneInventory) -> Transcript:
     return transcript
 
 
-def does_not_fit(audio: Path, alignment: Alignment) -> str:
+def mismatch_message(audio: Path, alignment: Alignment) -> str:
     """Return the message that a text does not fit a recording."""
     return (
         f"{audio}: the text does not fit the sound (fit {alignment.fit:.2f}, normally at least"

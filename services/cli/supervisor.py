@@ -36,7 +36,8 @@ class Supervisor:
 
     Warnings also go to the console. ``arguments`` are the command-line arguments of every service,
     and ``environment`` is added to this process's. ``more`` names additional workers, such as
-    ``recognizer-2``, with their additions to the environment (see ``services.kinds.more_workers``).
+    ``recognizer-2``, with their additions to the environment
+    (`services.kinds.extra_worker_environments`).
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from kouxing.shared.endpoints import (
     WILDCARDS,
     is_address,
     is_loopback,
-    own_address,
+    local_address,
     split_endpoint,
     with_host,
 )
@@ -45,4 +45,4 @@ class ControlConfig(ServiceConfig):
     def own_host(self) -> str:
         """Host by which others find control, and so its events."""
         host, _ = split_endpoint(self.control, "control")
-        return own_address() if is_loopback(host) or host in WILDCARDS else host
+        return local_address() if is_loopback(host) or host in WILDCARDS else host

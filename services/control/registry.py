@@ -160,11 +160,11 @@ class Registry:
             or record.heartbeat.needs != heartbeat.needs
         )
 
-    def pop_lost(self, instance: str, peer: Peer) -> bool:
+    def reclaim_lost(self, instance: str, peer: Peer) -> bool:
         """Return whether a new registration comes from a process that was declared lost."""
         return self._lost.pop(instance, NO_PEER) == peer
 
-    def displaced_by(self, heartbeat: Heartbeat, peer: Peer) -> str | None:
+    def replaced_by(self, heartbeat: Heartbeat, peer: Peer) -> str | None:
         """Return the worker at the same endpoints as a new worker: it must have crashed."""
         if heartbeat.role != "worker":
             return None
@@ -239,7 +239,7 @@ class Registry:
         """Return the age of a service's newest heartbeat, without control's own pauses."""
         return now_s - self._paused_s - self._services[instance].heartbeat_s
 
-    def silent(self, now_s: float) -> list[str]:
+    def overdue(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
         oldest = takewhile(
             lambda item: self.age_s(item[0], now_s) > self._lost_after_s, self._services.items()

@@ -27,7 +27,7 @@ from kouxing.shared.wire.session import (
 
 MAX_ANSWERS = 1000  # kept for repeated requests
 MAX_DEFERRED = 1000
-PREMATURE = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)  # errors that may be temporary
+TEMPORARY_ERRORS = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)  # errors that may be temporary
 Request: TypeAlias = OpenSession | CloseSession | FlushSession | SetFace | StatusRequest
 
 
@@ -127,7 +127,9 @@ class Requests:
             handle(message, sender)
 
     def _can_defer(self, refusal: Refusal) -> bool:
-        return self.defers and refusal.code in PREMATURE and len(self._deferred) < MAX_DEFERRED
+        return (
+            self.defers and refusal.code in TEMPORARY_ERRORS and len(self._deferred) < MAX_DEFERRED
+        )
 
     def _grant(self, sender: Peer) -> Grant | None:
         return None if self._bus.zap is None else self._bus.zap.grants.get(sender.key)

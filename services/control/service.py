@@ -122,11 +122,11 @@ class ControlService(Service):
         for connection in self._commands.ended():
             if instance := self._registry.instance_on(connection):
                 self._on_service_lost(instance, "its connection closed")
-        for instance in self._registry.silent(now_s):
+        for instance in self._registry.overdue(now_s):
             self._on_service_lost(instance, "no heartbeat")
         while self._moves_to_repeat and self._moves_to_repeat[0][0] <= now_s:
             self._repeat_move(heapq.heappop(self._moves_to_repeat)[2])
-        for record in self._sessions.unsettled():
+        for record in self._sessions.pending():
             self._check_timeout(record, now_s)
 
     def on_drain(self) -> bool:
@@ -138,7 +138,7 @@ class ControlService(Service):
     # --- requests of clients -------------------------------------------------------------------
 
     def _open_session(self, message: OpenSession, sender: Peer) -> Message | None:
-        known = self._sessions.opened_by(message, sender)
+        known = self._sessions.find_by_request(message, sender)
         if known is not None and known.restored:
             return known.opened_message(self.endpoints["events"])
         if known is not None and not self._commands.is_open(known.client.connection):
@@ -210,12 +210,12 @@ class ControlService(Service):
         if is_new and heartbeat.state == "draining":
             self._check_sessions(heartbeat, sender)  # those that have moved
             return
-        displaced = self._registry.displaced_by(heartbeat, sender) if is_new else None
+        replaced = self._registry.replaced_by(heartbeat, sender) if is_new else None
         self._registry.add(heartbeat, sender, time.monotonic())
         self._takeover.record_observer(heartbeat)
         if is_new:
-            was_lost = self._registry.pop_lost(instance, sender) and not is_other
-            self._on_new_service(heartbeat, sender, displaced, was_lost=was_lost)
+            was_lost = self._registry.reclaim_lost(instance, sender) and not is_other
+            self._on_new_service(heartbeat, sender, replaced, was_lost=was_lost)
         self._check_sessions(heartbeat, sender)
         # The reply is last: a service that stalled learns by then which sessions have moved.
         reply = HeartbeatReply(
@@ -230,20 +230,20 @@ class ControlService(Service):
             self._on_service_lost(instance, STOPPED)
 
     def _on_new_service(
-        self, heartbeat: Heartbeat, sender: Peer, displaced: str | None, *, was_lost: bool
+        self, heartbeat: Heartbeat, sender: Peer, replaced: str | None, *, was_lost: bool
     ) -> None:
         """Give a new service the sessions that lack a worker, or all sessions to an observer.
 
         A worker that was declared lost by mistake keeps the sessions that have not moved.
         """
         self._publish(EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}")
-        if displaced is not None:
-            self._on_service_lost(displaced, f"{heartbeat.instance} took its place")
+        if replaced is not None:
+            self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
         uninformed = []
         if was_lost:
             uninformed = self._sessions.reinstate_worker(heartbeat.instance)
         self._restore_sessions()
-        for record in self._sessions.unsettled():
+        for record in self._sessions.pending():
             if record.lost:
                 self._move_session(record)
         if heartbeat.role == "observer":
@@ -259,7 +259,7 @@ class ControlService(Service):
                 continue
             if record is not None and heartbeat.instance in record.lost:
                 continue  # the session has not moved yet
-            if record is None or not self._sessions.takes_part(record, heartbeat.instance):
+            if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
             elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:
                 self._end_session(record, f"no audio for {self._idle_limit_s:g} s")
@@ -299,7 +299,7 @@ class ControlService(Service):
         level = logging.INFO if reason == STOPPED else logging.WARNING
         LOG.log(level, "lost %s: %s", instance, reason)
         self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
-        for record in self._sessions.lose_worker(instance, time.monotonic()):
+        for record in self._sessions.mark_worker_lost(instance, time.monotonic()):
             self._move_session(record)
 
     # --- sessions ------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ class Sessions:
         self._max_sessions = max_sessions
         self._records: dict[str, SessionRecord] = {}
         self._numbers = count()
-        self._unsettled: dict[str, SessionRecord] = {}
+        self._pending: dict[str, SessionRecord] = {}
         self._of_worker: dict[str, dict[str, SessionRecord]] = {}
         self._num_per_key: Counter[str] = Counter()
         self._of_request: dict[tuple[Peer, str], SessionRecord] = {}
@@ -67,7 +67,7 @@ class Sessions:
             raise Refusal(ErrorCode.BAD_TOKEN, f"the token does not belong to session {name!r}")
         return record
 
-    def opened_by(self, opening: OpenSession, client: Peer) -> SessionRecord | None:
+    def find_by_request(self, opening: OpenSession, client: Peer) -> SessionRecord | None:
         """Return the session that a client opened with this request, or None."""
         record = self._of_request.get((client, opening.request))
         if record is None:
@@ -75,23 +75,23 @@ class Sessions:
         same = replace(record.opening, session=opening.session, face=opening.face) == opening
         return record if same else None
 
-    def since(self, number: int) -> list[SessionRecord]:
+    def numbered_from(self, number: int) -> list[SessionRecord]:
         """Return the sessions from a number on; newer sessions have greater numbers."""
         records = list(self._records.values())
         return records[bisect_left(records, number, key=attrgetter("number")) :]
 
-    def unsettled(self) -> list[SessionRecord]:
+    def pending(self) -> list[SessionRecord]:
         """Return the sessions that wait for a service, or whose client must be informed."""
-        for record in list(self._unsettled.values()):
+        for record in list(self._pending.values()):
             if record.is_settled:
-                del self._unsettled[record.name]
-        return list(self._unsettled.values())
+                del self._pending[record.name]
+        return list(self._pending.values())
 
     def participants(self, record: SessionRecord) -> set[str]:
         """Return the running services that take part: the session's workers and all observers."""
         return ({*record.workers.values()} - record.lost) | self._registry.observers()
 
-    def takes_part(self, record: SessionRecord, instance: str) -> bool:
+    def is_participant(self, record: SessionRecord, instance: str) -> bool:
         """Return whether a service takes part in a session."""
         return self._registry.is_observer(instance) or (
             instance in record.workers.values() and instance not in record.lost
@@ -129,7 +129,9 @@ class Sessions:
             workers=workers,
             endpoints=self._registry.endpoints(workers),
             facts=facts,
-            face=CurrentFace(FaceSettings(lip_model=facts.lip_model).updated(opening.face), now_s),
+            face=CurrentFace(
+                FaceSettings(lip_model=facts.lip_model).merged_with(opening.face), now_s
+            ),
             waiting_for={*workers.values()} | self._registry.observers(),
         )
         self._add(record, now_s)
@@ -178,7 +180,7 @@ class Sessions:
     def remove(self, record: SessionRecord, now_s: float) -> None:
         """Forget a session."""
         del self._records[record.name]
-        self._unsettled.pop(record.name, None)
+        self._pending.pop(record.name, None)
         self._num_per_key[record.client.key] -= 1
         self._of_request.pop((record.client, record.opening.request), None)
         self._set_workers(record, {}, now_s)
@@ -203,15 +205,15 @@ class Sessions:
         deferred, record.deferred = record.deferred, set()
         return deferred
 
-    def lose_worker(self, instance: str, now_s: float) -> list[SessionRecord]:
+    def mark_worker_lost(self, instance: str, now_s: float) -> list[SessionRecord]:
         """Record that a service is lost; return the sessions that lack a worker now."""
-        for record in self._unsettled.values():
+        for record in self._pending.values():
             record.waiting_for.discard(instance)
         records = list(self._of_worker.get(instance, {}).values())
         for record in records:
             record.lost.add(instance)
             record.started_s = now_s
-            self._unsettled[record.name] = record
+            self._pending[record.name] = record
         return records
 
     def reinstate_worker(self, instance: str) -> list[SessionRecord]:
@@ -259,7 +261,7 @@ class Sessions:
     def _add(self, record: SessionRecord, now_s: float) -> None:
         workers, record.workers = record.workers, {}
         self._records[record.name] = record
-        self._unsettled[record.name] = record
+        self._pending[record.name] = record
         self._num_per_key[record.client.key] += 1
         self._of_request[record.client, record.opening.request] = record
         self._set_workers(record, workers, now_s)

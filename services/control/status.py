@@ -60,7 +60,7 @@ class Status:
         first = message.after
         if first < FIRST_SESSION:
             yield from enumerate(self._registry.sorted()[first:], first)
-        for session in self._sessions.since(first - FIRST_SESSION):
+        for session in self._sessions.numbered_from(first - FIRST_SESSION):
             yield FIRST_SESSION + session.number, session
 
     def _service_state(

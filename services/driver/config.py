@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from kouxing.shared.config import Form, Switch
+from kouxing.shared.config import Switch, ValueHint
 from kouxing.shared.face.config import FaceConfig
 
 HEAD_NAMES = tuple(
@@ -32,7 +32,7 @@ class DriverConfig(FaceConfig):
     session: Annotated[
         str,
         Field(pattern="^[A-Za-z0-9_-]{1,64}$"),
-        Form("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
+        ValueHint("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
     ] = "newest"
     """Session to show. "newest" shows the session that was opened last."""
     out: str = "out"

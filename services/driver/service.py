@@ -38,7 +38,7 @@ LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
 
 
 @dataclass(slots=True)
-class _Session:
+class _FollowedSession:
     """One session that the driver follows."""
 
     start: StartSession
@@ -54,7 +54,7 @@ class DriverService(Service):
     def __init__(self, config: DriverConfig) -> None:
         super().__init__(config)
         self._config = config
-        self._sessions: dict[str, _Session] = {}
+        self._sessions: dict[str, _FollowedSession] = {}
         self._was_stalled = False
         self.poses = Poses(config.session, config.idle_motion_seed)
         self.view = View(config, self.poses.switch)
@@ -123,7 +123,7 @@ class DriverService(Service):
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def _make_session(self, start: StartSession) -> _Session:
+    def _make_session(self, start: StartSession) -> _FollowedSession:
         handlers: dict[type[Message], Callable[[Any], None]] = {
             FapFrame: self._on_frame,
             EndOfFaps: self._on_end,
@@ -134,7 +134,7 @@ class DriverService(Service):
             self, start.session, handlers, live=start.paced,
             on_complete=lambda: self.session_started(session.start),
         )  # fmt: skip
-        session = _Session(start, follower)
+        session = _FollowedSession(start, follower)
         return session
 
     def _on_frame(self, frame: FapFrame) -> None:
@@ -153,7 +153,7 @@ class DriverService(Service):
         if session.leave_by_s is not None:
             self._leave(session)
 
-    def _leave(self, session: _Session) -> None:
+    def _leave(self, session: _FollowedSession) -> None:
         """Close a session's subscriptions and finish its video with the frames received so far."""
         name = session.start.session
         del self._sessions[name]

@@ -15,7 +15,7 @@ from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
 
 MAX_QUEUED_BYTES = 12 * 1024 * 1024  # 32 s of 48 kHz stereo float; then the client must wait
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
-PIECE_S = 0.04  # duration of the pieces in which queued audio is passed on
+CHUNK_S = 0.04  # duration of the pieces in which queued audio is passed on
 KEEP_ALIVE_S = 20.0  # without audio, until a piece of silence keeps the session open
 _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR}
 
@@ -108,7 +108,7 @@ class RealTimeQueue:
     def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, keep_alive: bool) -> None:
         self._session = session
         self._format = pcm_format
-        self._piece_bytes = round(PIECE_S * pcm_format.sample_rate_hz) * pcm_format.frame_bytes
+        self._chunk_bytes = round(CHUNK_S * pcm_format.sample_rate_hz) * pcm_format.frame_bytes
         self._keep_alive_s = KEEP_ALIVE_S if keep_alive else None
         self._queued = bytearray()
         self._not_empty = asyncio.Event()
@@ -123,7 +123,7 @@ class RealTimeQueue:
         self._queued += pcm
         self._not_empty.set()
         while len(self._queued) > MAX_QUEUED_BYTES:
-            await asyncio.sleep(PIECE_S)
+            await asyncio.sleep(CHUNK_S)
 
     def clear(self) -> None:
         """Drop queued audio."""
@@ -132,7 +132,7 @@ class RealTimeQueue:
     async def wait_until_empty(self) -> None:
         """Return once all audio is passed on."""
         while self._queued:
-            await asyncio.sleep(PIECE_S)
+            await asyncio.sleep(CHUNK_S)
 
     async def run(self) -> None:
         """Pass on queued audio until cancelled."""
@@ -142,8 +142,8 @@ class RealTimeQueue:
             if not self._queued:
                 await self._wait_for_audio()
                 due_s = loop.time()
-            piece = bytes(self._queued[: self._piece_bytes])
-            del self._queued[: self._piece_bytes]
+            piece = bytes(self._queued[: self._chunk_bytes])
+            del self._queued[: self._chunk_bytes]
             try:
                 self._session.send(piece, len(piece) // self._format.frame_bytes)
             except KouxingError:  # the session is over; its errors are reported elsewhere
@@ -157,4 +157,4 @@ class RealTimeQueue:
         try:
             await asyncio.wait_for(self._not_empty.wait(), self._keep_alive_s)
         except TimeoutError:
-            self._queued += bytes(self._piece_bytes)
+            self._queued += bytes(self._chunk_bytes)

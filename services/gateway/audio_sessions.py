@@ -50,9 +50,9 @@ class AudioSession:
         """Interrupt: drop audio whose face is not shown yet."""
         await self._session.flush()
 
-    async def set_lips(self, lips: str) -> None:
+    async def set_lip_model(self, lip_model: str) -> None:
         """Let another lip model move the mouth."""
-        await self._session.set_face(lip_model=lips)
+        await self._session.set_face(lip_model=lip_model)
 
     def errors(self) -> list[Refused]:
         """Return the recognizer's errors since the last call.

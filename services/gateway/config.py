@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator
 
 from kouxing.services.gateway.limits import ADDRESS_SHARE
-from kouxing.shared.config import BoundHost, BoundPort, Form, Switch, Texts
+from kouxing.shared.config import BoundHost, BoundPort, Switch, Texts, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
@@ -36,14 +36,16 @@ def _check_targets(values: tuple[str, ...]) -> tuple[str, ...]:
 
 
 Origins = Annotated[
-    Texts, AfterValidator(_check_origins), Form("a list of origins such as https://example.org")
+    Texts,
+    AfterValidator(_check_origins),
+    ValueHint("a list of origins such as https://example.org"),
 ]
 Targets = Annotated[
     Texts,
     AfterValidator(_check_targets),
-    Form("a list of addresses such as vmc://127.0.0.1:39540"),
+    ValueHint("a list of addresses such as vmc://127.0.0.1:39540"),
 ]
-Names = Annotated[Texts, Form("a list of host names")]
+Names = Annotated[Texts, ValueHint("a list of host names")]
 
 
 class GatewayConfig(FaceConfig):

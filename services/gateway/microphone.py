@@ -94,8 +94,8 @@ class Microphones:
                 session.skip(command.num_skipped)
                 if command.flush:
                     await audio_input.flush()
-                if command.lips:
-                    await session.set_lips(command.lips)
+                if command.lip_model:
+                    await session.set_lip_model(command.lip_model)
                 if command.eof:
                     await audio_input.end()
             for error in session.errors():

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.certificate import local_host_names, tls_context
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, own_address
+from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, local_address
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
 
     Raises ``UserError`` if the certificate can neither be read nor created.
     """
-    host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
+    host = config.advertise or (local_address() if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
     names = {host, *local_host_names(), *config.names}
     tls = None

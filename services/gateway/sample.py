@@ -17,12 +17,12 @@ SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由�
 class Sample:
     """One playback of the sample sentence.
 
-    ``lips`` is the lip model, empty for the system's default. It can be changed during playback.
+    ``lip_model`` is empty for the system's default. It can be changed during playback.
     """
 
-    def __init__(self, audio_sessions: AudioSessions, lips: str) -> None:
+    def __init__(self, audio_sessions: AudioSessions, lip_model: str) -> None:
         self.session = f"sample-{secrets.token_hex(4)}"
-        self.lips = lips
+        self.lip_model = lip_model
         self._audio_sessions = audio_sessions
 
     async def speak(self) -> None:
@@ -37,14 +37,14 @@ class Sample:
             sample_rate_hz=source.sample_rate_hz,
             num_channels=source.num_channels,
         ) as session:
-            lips = ""
+            lip_model = ""
             due_s = loop.time()
             for block in source.blocks:
                 if session.is_closed:
                     break
-                if lips != self.lips:
-                    lips = self.lips
-                    await session.set_lips(lips)
+                if lip_model != self.lip_model:
+                    lip_model = self.lip_model
+                    await session.set_lip_model(lip_model)
                 session.send((block * 32767).astype("<i2").tobytes(), len(block))
                 due_s += len(block) / source.sample_rate_hz
                 await asyncio.sleep(due_s - loop.time())

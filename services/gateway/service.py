@@ -58,7 +58,7 @@ CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes
 
 
 @dataclass(slots=True)
-class _Session:
+class _FollowedSession:
     """A session that the gateway subscribes to."""
 
     start: StartSession
@@ -83,7 +83,7 @@ class GatewayService(Service):
         host, port = listening.getsockname()[:2]
         endpoint = make_page_endpoint(config, port)
         self.endpoints = {"page": endpoint.url}
-        self._sessions: dict[str, _Session] = {}
+        self._sessions: dict[str, _FollowedSession] = {}
         self._web_sockets = http.WebSockets()
         share = config.address_share
         self._viewers = Viewers(
@@ -91,7 +91,7 @@ class GatewayService(Service):
             share,
             self.metrics,
             self._play_sample,
-            self._choose_sample_lips,
+            self._choose_sample_lip_model,
             self._set_face,
         )
         self._audio_sessions = AudioSessions(self.control_endpoint, self.key, self.warn)
@@ -227,8 +227,10 @@ class GatewayService(Service):
         """Notify a session's viewers that its lip model has changed."""
         session = self._sessions.get(message.session)
         if session is not None and message.face.lip_model is not None:
-            session.start = replace(session.start, face=session.start.face.updated(message.face))
-            self._viewers.set_lips(message.session, message.face.lip_model)
+            session.start = replace(
+                session.start, face=session.start.face.merged_with(message.face)
+            )
+            self._viewers.set_lip_model(message.session, message.face.lip_model)
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Name the subscribed sessions, so that control can report which have ended."""
@@ -262,7 +264,7 @@ class GatewayService(Service):
 
     # --- from the publishers ---------------------------------------------------------------------
 
-    def _make_session(self, start: StartSession) -> _Session:
+    def _make_session(self, start: StartSession) -> _FollowedSession:
         follower = ServiceFollower(
             self,
             start.session,
@@ -280,7 +282,7 @@ class GatewayService(Service):
         is_sample = self._sample is not None and self._sample[0].session == start.session
         characters = self._sample_characters if is_sample else ()
         track = SyllableTrack(self._inventory(start), characters)
-        session = _Session(start, follower, track)
+        session = _FollowedSession(start, follower, track)
         return session
 
     def _inventory(self, start: StartSession) -> PhoneInventory:
@@ -290,7 +292,7 @@ class GatewayService(Service):
             self.warn("language", str(error), start.session)
             return load_inventory()
 
-    def _restart(self, session: _Session) -> None:
+    def _restart(self, session: _FollowedSession) -> None:
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
         start = session.start
@@ -338,16 +340,16 @@ class GatewayService(Service):
 
     # --- the sample sentence ---------------------------------------------------------------------
 
-    def _play_sample(self, lips: str) -> str:
+    def _play_sample(self, lip_model: str) -> str:
         """Start the sample sentence, unless it is playing; return its session."""
         if self._sample is None:
-            sample = Sample(self._audio_sessions, lips)
+            sample = Sample(self._audio_sessions, lip_model)
             self._sample = sample, self._create_task(self._speak(sample))
         return self._sample[0].session
 
-    def _choose_sample_lips(self, lips: str) -> None:
+    def _choose_sample_lip_model(self, lip_model: str) -> None:
         if self._sample is not None:
-            self._sample[0].lips = lips
+            self._sample[0].lip_model = lip_model
 
     async def _speak(self, sample: Sample) -> None:
         error = ""

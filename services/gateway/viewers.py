@@ -28,7 +28,7 @@ _SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 @dataclass(slots=True)
 class _ShownSession:
     epoch: int
-    lips: str  # name of the lip model; empty: unknown
+    lip_model: str  # its name; empty: unknown
 
 
 @dataclass(slots=True, eq=False)
@@ -62,7 +62,7 @@ class Viewers:
         self._quota = ConnectionQuota(MAX_VIEWERS, "viewers", address_share)
         self._metrics = metrics
         self._play_sample = play_sample
-        self._choose_sample_lips = choose_sample_lips
+        self._choose_sample_lip_model = choose_sample_lips
         self._set_face = set_face
         self._viewers: set[Viewer] = set()
         self._sessions: dict[str, _ShownSession] = {}  # in the order in which they were opened
@@ -71,16 +71,16 @@ class Viewers:
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def add_session(self, session: str, epoch: int, lips: str) -> None:
+    def add_session(self, session: str, epoch: int, lip_model: str) -> None:
         """Announce a session to its viewers; again when it continues in a new epoch."""
-        self._sessions[session] = _ShownSession(epoch, lips)
+        self._sessions[session] = _ShownSession(epoch, lip_model)
         self._notify_viewers()
 
-    def set_lips(self, session: str, lips: str) -> None:
+    def set_lip_model(self, session: str, lip_model: str) -> None:
         """Announce that the lip model of a session has changed."""
         if session in self._sessions:
-            self._sessions[session].lips = lips
-            self.forward(session, MessageKind.TEXT, wire.text("lips", lips=lips))
+            self._sessions[session].lip_model = lip_model
+            self.forward(session, MessageKind.TEXT, wire.text("lips", lips=lip_model))
 
     def remove_session(self, session: str) -> None:
         """Announce to a session's viewers that it has ended."""
@@ -186,13 +186,13 @@ class Viewers:
             command = wire.parse_object(message)
             session = command.get("follow")
             settings = wire.parse_face_settings(command)
-            lips = settings.lip_model if settings is not None else None
+            lip_model = settings.lip_model if settings is not None else None
             if command.get("play") == "sample":
-                self._sample = viewer.chosen = self._play_sample(lips or "")
-            elif lips:
+                self._sample = viewer.chosen = self._play_sample(lip_model or "")
+            elif lip_model:
                 if not self._sample or viewer.chosen != self._sample:
                     raise UserError("a viewer can choose lips only for the sample sentence")
-                self._choose_sample_lips(lips)
+                self._choose_sample_lip_model(lip_model)
             elif settings is not None:
                 if viewer.shown is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
@@ -224,7 +224,7 @@ class Viewers:
                 session=name if session else None,
                 chosen=viewer.chosen,
                 epoch=session.epoch if session else 0,
-                lips=session.lips if session else "",
+                lips=session.lip_model if session else "",
                 sample=session is not None and name == viewer.chosen == self._sample,
             )
             self._put(viewer, MessageKind.TEXT, message)

@@ -107,7 +107,7 @@ class WebServer:
 
         application.middlewares.insert(0, set_deadline)
         log = LOG.getChild("http")
-        log.addFilter(self._is_worth_logging)
+        log.addFilter(self._filter_client_errors)
         self._runner = web.AppRunner(
             application,
             access_log=None,
@@ -176,7 +176,7 @@ class WebServer:
             del self._deadlines_s[handler]
             handler.force_close()
 
-    def _is_worth_logging(self, record: logging.LogRecord) -> bool:
+    def _filter_client_errors(self, record: logging.LogRecord) -> bool:
         """Filter errors that clients can cause at will: data that is not HTTP, partial bodies."""
         error = record.exc_info[1] if record.exc_info else None
         if isinstance(error, HttpProcessingError):

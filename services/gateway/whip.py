@@ -209,8 +209,8 @@ class WhipClients:
                 command = wire.parse_command(message)
                 if command.flush:
                     await session.flush()
-                if command.lips:
-                    await session.set_lips(command.lips)
+                if command.lip_model:
+                    await session.set_lip_model(command.lip_model)
             except (UserError, KouxingError) as error:
                 if channel.readyState == "open":
                     channel.send(error_text(error))

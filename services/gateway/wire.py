@@ -94,7 +94,7 @@ class MicrophoneCommand:
     flush: bool  # interrupt: drop audio whose face is not shown yet
     eof: bool  # no more audio follows
     num_skipped: int  # samples of each channel that the client left out
-    lips: str  # lip model to change to; empty: no change
+    lip_model: str  # to change to; empty: no change
 
 
 def parse_command(message: str) -> MicrophoneCommand:
@@ -111,15 +111,15 @@ def parse_command(message: str) -> MicrophoneCommand:
         flush=bool(fields.get("flush")),
         eof=bool(fields.get("eof")),
         num_skipped=num_skipped,
-        lips=_parse_lips(fields),
+        lip_model=_parse_lip_model(fields),
     )
 
 
-def _parse_lips(fields: Mapping[str, object]) -> str:
-    lips = fields.get("lips", "")
-    if not isinstance(lips, str) or (lips and not LIP_MODEL_NAME.fullmatch(lips)):
+def _parse_lip_model(fields: Mapping[str, object]) -> str:
+    lip_model = fields.get("lips", "")
+    if not isinstance(lip_model, str) or (lip_model and not LIP_MODEL_NAME.fullmatch(lip_model)):
         raise UserError("lips must be the name of a lip model")
-    return lips
+    return lip_model
 
 
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
@@ -129,8 +129,8 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     """
     expressions, hold_s = fields.get("express"), fields.get("hold_s", DEFAULT_HOLD_S)
     settings: dict[str, Any] = {}
-    if lips := _parse_lips(fields):
-        settings["lip_model"] = lips
+    if lip_model := _parse_lip_model(fields):
+        settings["lip_model"] = lip_model
     if expressions is not None:
         if not isinstance(expressions, dict):
             raise UserError("express must be an object that maps names to strengths")

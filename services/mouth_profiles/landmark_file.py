@@ -42,7 +42,7 @@ def parse_landmark_file(content: bytes) -> FilmedSpeech:
         raise UserError(str(error)) from error
     levels = np.array(level_track(samples))
     faps = mouth_faps(landmarks, np.interp(time_s, levels[:, 0], levels[:, 1]))
-    return FilmedSpeech(samples=samples, frame_s=time_s, lips=lip_tracks(faps))
+    return FilmedSpeech(samples=samples, frame_s=time_s, lip_track=lip_tracks(faps))
 
 
 def landmark_file(

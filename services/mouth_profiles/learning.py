@@ -66,7 +66,7 @@ class FilmedSpeech:
 
     samples: Floats  # 16 kHz mono
     frame_s: Array  # (frames,) times of the images in the audio
-    lips: Array  # (frames, 15) FAP units, NaN where not tracked
+    lip_track: Array  # (frames, 15) FAP units, NaN where not tracked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,11 +106,13 @@ class ProfileGain:
     curves: Array  # (3, 3, n): measure; tracked, before, after
 
 
-def observe(model: NeuralModel, lips: LipPredictor, filmed: FilmedSpeech) -> Observations:
+def observe(model: NeuralModel, lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
     """Run the lip model over a recording; the result is empty if there is no speech."""
     (positions,) = record_positions(model, [filmed.samples])
-    stream = lips.create_stream(lips.delays_s)
-    predicted = np.zeros((len(positions.known_s), len(lips.delays_s), _NUM_FAPS), np.float32)
+    stream = lip_predictor.create_stream(lip_predictor.delays_s)
+    predicted = np.zeros(
+        (len(positions.known_s), len(lip_predictor.delays_s), _NUM_FAPS), np.float32
+    )
     hidden = np.zeros((len(predicted), len(stream.inner)), np.float32)
     starts = {*positions.starts}
     for position, features in enumerate(positions.features):
@@ -119,9 +121,9 @@ def observe(model: NeuralModel, lips: LipPredictor, filmed: FilmedSpeech) -> Obs
         predicted[position] = stream.step(features.astype(np.float32))[:, :_NUM_FAPS]
         hidden[position] = stream.inner
     known_s = np.array(positions.known_s)
-    time_s = known_s[:, None] - np.array(lips.delays_s)
+    time_s = known_s[:, None] - np.array(lip_predictor.delays_s)
     frame_s = filmed.frame_s - _camera_lag_s(filmed, time_s[:, -1], predicted[:, -1])
-    tracks = [interpolate_track(frame_s, track, time_s) for track in filmed.lips.T]
+    tracks = [interpolate_track(frame_s, track, time_s) for track in filmed.lip_track.T]
     return Observations(
         known_s=known_s, predicted=predicted, hidden=hidden, tracked=np.stack(tracks, axis=-1)
     )
@@ -131,7 +133,7 @@ def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> flo
     """Estimate how much later than the audio the images arrive; 0 if there is too little speech."""
     if len(time_s) * POSITION_S < MIN_SPEECH_S:
         return 0.0
-    tracked, opening = (lip_measures(lips)[:, :1] for lips in (filmed.lips, predicted))
+    tracked, opening = (lip_measures(track)[:, :1] for track in (filmed.lip_track, predicted))
     figures = np.zeros(len(_LAGS_S))
     for index, lag_s in enumerate(_LAGS_S):
         shifted = interpolate_track(filmed.frame_s, tracked[:, 0], time_s + lag_s)
@@ -164,13 +166,13 @@ def fit_profile(observations: Observations) -> MouthProfile:
     return _fit(usable, STRENGTHS[int(np.argmin(errors))])
 
 
-def measure_gain(lips: LipPredictor, observations: Observations) -> ProfileGain:
+def measure_gain(lip_predictor: LipPredictor, observations: Observations) -> ProfileGain:
     """Fit a profile to all but the last quarter, and measure it there; UserError as there."""
     first_held_out = round((1 - _HELD_OUT) * len(observations))
     profile = fit_profile(observations[:first_held_out])
     held_out = observations[first_held_out:]
-    delay_s = delay_for(lips.delays_s, FACE_DELAY_S)
-    delay = lips.delays_s.index(delay_s)
+    delay_s = delay_for(lip_predictor.delays_s, FACE_DELAY_S)
+    delay = lip_predictor.delays_s.index(delay_s)
     versions = (held_out.tracked, held_out.predicted, apply_profile(profile, held_out))
     tracked, before, after = (lip_measures(faps[:, delay]) for faps in versions)
     return ProfileGain(
@@ -269,14 +271,16 @@ class LearnedProfile:
 def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     """Learn a mouth profile; UserError if there is too little speech with lips in view."""
     model = load_model()
-    lips = lip_predictor_for(model)
-    if lips is None or not isinstance(model, NeuralModel):
+    lip_predictor = lip_predictor_for(model)
+    if lip_predictor is None or not isinstance(model, NeuralModel):
         raise UserError("the shipped lip model and acoustic model do not match; reinstall kouxing")
-    observations = Observations.join([observe(model, lips, filmed) for filmed in recordings])
+    observations = Observations.join(
+        [observe(model, lip_predictor, filmed) for filmed in recordings]
+    )
     return LearnedProfile(
-        content=fit_profile(observations).to_bytes(lips.digest),
+        content=fit_profile(observations).to_bytes(lip_predictor.digest),
         speech_s=len(observations) * POSITION_S,
-        gain=measure_gain(lips, observations),
+        gain=measure_gain(lip_predictor, observations),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
-from kouxing.shared.config import BoundEndpoint, DefaultBy, ServiceConfig
+from kouxing.shared.config import BoundEndpoint, DependentDefault, ServiceConfig
 
 _DEFAULT_RULE = OutputRuleConfig()
 
@@ -28,7 +28,7 @@ class RecognizerConfig(ServiceConfig):
     """Future audio that the neural model waits for, in ms: 10, 30, 60, 100 or 200. The neural model
     also runs alongside blocks."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
-        default_factory=DefaultBy(
+        default_factory=DependentDefault(
             "acoustic",
             {name: rule.num_stable_frames for name, rule in MODEL_RULES.items()},
             _DEFAULT_RULE.num_stable_frames,
@@ -36,7 +36,7 @@ class RecognizerConfig(ServiceConfig):
     )
     """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011)."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
-        default_factory=DefaultBy(
+        default_factory=DependentDefault(
             "acoustic",
             {name: rule.min_confidence for name, rule in MODEL_RULES.items()},
             _DEFAULT_RULE.min_confidence,

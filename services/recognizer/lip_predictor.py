@@ -247,7 +247,7 @@ def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
         form = str(archive.array("format", ()))
         if form != FORMAT:
             raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
-        return lips_from(archive)
+        return lip_predictor_from(archive)
     except ValueError as error:
         raise UserError(f"lip predictor {path}: {error}; train it again") from error
 
@@ -257,13 +257,13 @@ def lip_predictor_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredic
     network = model.early if isinstance(model, TwoNetworks) else model
     if not isinstance(network, NeuralModel):
         return None
-    lips, sizes = load_lip_predictor(path), network.session.sizes
+    lip_predictor, sizes = load_lip_predictor(path), network.session.sizes
     width = sizes.num_heads * sizes.head_size
-    fits = len(lips.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + NUM_LAYERS * width
-    return lips if fits else None
+    fits = len(lip_predictor.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + NUM_LAYERS * width
+    return lip_predictor if fits else None
 
 
-def lips_from(archive: Archive) -> LipPredictor:
+def lip_predictor_from(archive: Archive) -> LipPredictor:
     """Build the predictor after checking every size; ``ValueError`` if an array does not fit."""
     delays = archive.floats("delays", *_sizes(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:

@@ -23,7 +23,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     INSIDE,
     Floats,
     Topology,
-    no_scores,
+    empty_scores,
 )
 from kouxing.services.recognizer.front_end.features import HOP_S
 from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
@@ -96,7 +96,7 @@ class LiveDecoder:
         self._start_frame = frame
         self._done = 0  # the decoder's frame up to which phones are final
         self._num_checked = 0  # frames that the output rule has had
-        self._provisional = no_scores(self._topology.num_states)  # the last ones searched
+        self._provisional = empty_scores(self._topology.num_states)  # the last ones searched
         self._settled.reset()
         self._decoder = self._settled
         self._rule.reset()

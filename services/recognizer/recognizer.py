@@ -46,7 +46,7 @@ class Recognizer:
         *,
         sample_rate_hz: int = SAMPLE_RATE_HZ,
         num_channels: int = 1,
-        lips: LipFrameModel | None = None,
+        lip_predictor: LipFrameModel | None = None,
         face_delay_s: float = 0.0,
         speech_time: int = 0,
     ) -> SpeechStream:
@@ -56,7 +56,7 @@ class Recognizer:
         ----------
         sample_rate_hz, num_channels
             Of the audio: 8000 to 48000 Hz; channels are averaged.
-        lips
+        lip_predictor
             Predicts lip frames; the acoustic model must have positions. None: no lip frames.
         face_delay_s
             Delay of the face behind the audio. The lip frames get the longest delay that is in
@@ -75,7 +75,7 @@ class Recognizer:
             self._rule,
             sample_rate_hz=sample_rate_hz,
             num_channels=num_channels,
-            lips=lips,
+            lip_predictor=lip_predictor,
             face_delay_s=face_delay_s,
             speech_time=speech_time,
         )

@@ -96,7 +96,7 @@ class Resumption:
         """Return a stream's results that are new, preceded by whether someone speaks."""
         emitted: list[StreamOutput] = []
         for result in results:
-            new = self._new_part(result)
+            new = self._trim(result)
             if new is None:
                 continue
             if not self._has_emitted:
@@ -105,34 +105,34 @@ class Resumption:
             emitted.append(new)
         return emitted
 
-    def _new_part(self, result: StreamOutput) -> StreamOutput | None:
+    def _trim(self, result: StreamOutput) -> StreamOutput | None:
         match result:
             case Phone():
-                return self._new_phone(result)
+                return self._trim_phone(result)
             case SpeechChange():
-                return self._new_change(result)
+                return self._trim_change(result)
             case Waveform():
-                return self._new_waveform(result)
+                return self._trim_waveform(result)
             case Progress() if result.time_s <= self._time_s:
                 return None
             case LipPositions() if result.time_s < self._time_s:
                 return None
         return result
 
-    def _new_change(self, change: SpeechChange) -> SpeechChange | None:
+    def _trim_change(self, change: SpeechChange) -> SpeechChange | None:
         if not self._has_emitted and change.time_s <= self._time_s:
             self._is_speaking = change.active
             return None
         return replace(change, time_s=max(change.time_s, self._time_s))
 
-    def _new_waveform(self, waveform: Waveform) -> Waveform | None:
+    def _trim_waveform(self, waveform: Waveform) -> Waveform | None:
         num_known = max(0, to_samples(self._time_s) - to_samples(waveform.time_s))
         if num_known == 0:
             return waveform
         samples = waveform.samples[num_known:]
         return Waveform(time_s=self._time_s, samples=samples) if len(samples) else None
 
-    def _new_phone(self, phone: Phone) -> Phone | None:
+    def _trim_phone(self, phone: Phone) -> Phone | None:
         """Return a new phone; one that turns out to be known is withdrawn when it is final."""
         is_new = phone.onset_s + phone.duration_s / 2 >= self._time_s
         was_emitted = phone.index in self._emitted

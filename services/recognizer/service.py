@@ -27,7 +27,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
-from kouxing.shared.metrics import give_back_memory
+from kouxing.shared.metrics import trim_heap
 from kouxing.shared.phones.events import SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
@@ -52,7 +52,9 @@ class RecognizerService(Service):
 
     kind = KIND
 
-    def __init__(self, config: RecognizerConfig, lips: LipFrameModel | None = None) -> None:
+    def __init__(
+        self, config: RecognizerConfig, lip_predictor: LipFrameModel | None = None
+    ) -> None:
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
         self._batch: dict[str, RecognizerSession] = {}  # with audio that is not decoded yet
@@ -76,8 +78,8 @@ class RecognizerService(Service):
         model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
         self._recognizer = Recognizer(model, config.output_rule)
         self.facts = SessionFacts(language=model.inventory.language)
-        self._lips = lips or lip_predictor_for(model)
-        if self._lips is None:
+        self._lip_predictor = lip_predictor or lip_predictor_for(model)
+        if self._lip_predictor is None:
             LOG.warning(
                 "this acoustic model has no lip predictor, so the lip model learnt uses dynamic "
                 "visemes; set synthesizer.lips = dynamic-visemes to use their delay too"
@@ -127,7 +129,7 @@ class RecognizerService(Service):
                 self._unpaced.drop(session, keep_end=False)
             socket = self._audio if start.paced else self._unpaced_audio
             session = RecognizerSession(
-                start, self._recognizer, self._lips, socket, time.monotonic()
+                start, self._recognizer, self._lip_predictor, socket, time.monotonic()
             )
             self._sessions[start.session] = session
         if is_new or session.start.epoch != start.epoch:
@@ -165,7 +167,7 @@ class RecognizerService(Service):
         """
         if now_s >= self._free_memory_at_s:
             self._free_memory_at_s = math.inf
-            give_back_memory()
+            trim_heap()
         self._report_stalled(now_s)
         blocked = set()
         for session in self._sessions.values():
@@ -192,7 +194,7 @@ class RecognizerService(Service):
         if self._batch or self._audio.wait(0.0):
             return
         for session in self._sessions.values():
-            if session.becomes_stalled(tick_s):
+            if session.check_stalled(tick_s):
                 media_time = max(session.stream.media_time, session.start.media_time)
                 stalled = Progress(media_time=media_time, state=AudioState.STALLED)
                 session.link.send(stalled, now_s)

@@ -47,7 +47,7 @@ class RecognizerSession:
         self,
         start: StartSession,
         recognizer: Recognizer,
-        lips: LipFrameModel | None,
+        lip_predictor: LipFrameModel | None,
         socket: Socket,
         now_s: float,
     ) -> None:
@@ -58,15 +58,15 @@ class RecognizerSession:
         self.mouth_profile_error = ""  # why the profile is not used; empty once reported
         if start.mouth_profile is not None:
             try:
-                if lips is None:
+                if lip_predictor is None:
                     raise UserError("this recognizer has no lip predictor")
-                lips = lips.with_mouth_profile(start.mouth_profile)
+                lip_predictor = lip_predictor.with_mouth_profile(start.mouth_profile)
             except UserError as error:
                 self.mouth_profile_error = f"the mouth profile is not used: {error}"
         self.stream = recognizer.create_stream(
             sample_rate_hz=start.sample_rate_hz,
             num_channels=start.num_channels,
-            lips=lips,
+            lip_predictor=lip_predictor,
             face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
             speech_time=start.speech_time or 0,
         )
@@ -88,7 +88,7 @@ class RecognizerSession:
         self.num_gaps_counted = 0
         self.overdue_since_s: float | None = None  # the synthesizer's acknowledgements
         # After a loss, the client sends the audio that it kept in the meantime.
-        self._lead = _LeadLimit(now_s, may_catch_up=start.epoch > 1)
+        self._lead = _AheadLimit(now_s, may_catch_up=start.epoch > 1)
 
     @property
     def name(self) -> str:
@@ -150,7 +150,7 @@ class RecognizerSession:
         aligned = self.resumption.align((media_time, samples), rate_hz)
         return aligned if len(aligned[1]) else None
 
-    def becomes_stalled(self, tick_s: float) -> bool:
+    def check_stalled(self, tick_s: float) -> bool:
         """Count time in which no audio arrived; return whether a live client has now stalled."""
         before_s, self.without_audio_s = self.without_audio_s, self.without_audio_s + tick_s
         is_live = self.start.paced and not self.is_finished
@@ -188,7 +188,7 @@ class RecognizerSession:
                 self.replay_window.update(event_of(message), self.order.last)
 
 
-class _LeadLimit:
+class _AheadLimit:
     """Limits how far a paced client's audio is ahead of the clock."""
 
     def __init__(self, now_s: float, *, may_catch_up: bool) -> None:

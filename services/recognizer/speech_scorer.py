@@ -77,7 +77,7 @@ class SpeechScorer:
 
     Parameters
     ----------
-    model, lips
+    model, lip_stream
         The acoustic model must have positions if there are lip frames.
     start_frame
         Frame at which speech started, if another recognizer processed its start; negative before
@@ -88,11 +88,11 @@ class SpeechScorer:
     def __init__(
         self,
         model: AcousticModel,
-        lips: LipFrameStream | None = None,
+        lip_stream: LipFrameStream | None = None,
         start_frame: int | None = None,
     ) -> None:
-        self._stream = model.create_stream(keep_positions=lips is not None)
-        self._lips = lips
+        self._stream = model.create_stream(keep_positions=lip_stream is not None)
+        self._lip_stream = lip_stream
         self._detector = VoiceActivityDetector()
         self._start_frame = start_frame
         self._front_end = model.create_front_end()
@@ -124,7 +124,7 @@ class SpeechScorer:
     def add_event(self, event: ScoreEvent) -> None:
         """Queue an event, to be returned after the results of the audio so far."""
         self._queue.append(event)
-        self._pass_events()
+        self._release_events()
 
     @property
     def is_ready(self) -> bool:
@@ -178,14 +178,14 @@ class SpeechScorer:
         self._speaking = False
         self._queue.append(SpeechEnd(self._num_frames))
 
-    def _pass_events(self) -> None:
+    def _release_events(self) -> None:
         """Make the events available that no queued audio precedes."""
         while self._queue and not isinstance(event := self._queue[0], np.ndarray | SpeechEnd):
             self._queue.popleft()
             if isinstance(event, SpeechStart):
                 self._next_newest = event.frame + _FIRST_NEWEST_FRAME
-                if self._lips is not None:
-                    self._lips.reset()
+                if self._lip_stream is not None:
+                    self._lip_stream.reset()
             self._events.append(event)
 
     def next_work(self) -> Work:
@@ -201,13 +201,13 @@ class SpeechScorer:
             self._events.append(FrameScores(settled, provisional))
         if isinstance(item, SpeechEnd):  # positions at the end see repeated frames, not audio
             self._events.append(item)
-        elif self._lips is not None:
+        elif self._lip_stream is not None:
             for position in self._stream.positions:
                 known_s = self._next_newest * HOP_S + WINDOW_S
-                self._events += self._lips.process_position(known_s, *position)
+                self._events += self._lip_stream.process_position(known_s, *position)
                 self._next_newest += FRAMES_PER_POSITION
         self._stream.positions.clear()
-        self._pass_events()
+        self._release_events()
 
 
 def score_streams(model: AcousticModel, scorers: Sequence[SpeechScorer]) -> None:
@@ -222,10 +222,10 @@ def score_recording(
     model: AcousticModel,
     samples: Floats,
     sample_rate_hz: int,
-    lips: LipFrameStream | None = None,
+    lip_stream: LipFrameStream | None = None,
 ) -> list[ScoreEvent]:
     """Score a whole recording, shape (n,) or (n, channels)."""
-    scorer = SpeechScorer(model, lips)
+    scorer = SpeechScorer(model, lip_stream)
     scorer.accept_waveform(to_16_khz(samples, sample_rate_hz))
     scorer.input_finished()
     score_streams(model, [scorer])

@@ -54,7 +54,7 @@ class SpeechStream:
         *,
         sample_rate_hz: int,
         num_channels: int,
-        lips: LipFrameModel | None,
+        lip_predictor: LipFrameModel | None,
         face_delay_s: float,
         speech_time: int,
     ) -> None:
@@ -63,7 +63,7 @@ class SpeechStream:
         self._rule = rule
         self._rate_hz = sample_rate_hz
         self._num_channels = num_channels
-        self._lips = lips
+        self._lip_predictor = lip_predictor
         self._face_delay_s = face_delay_s
         self._speech_time = speech_time
         self._first_chunk: int | None = None  # media time of the first chunk after the last gap
@@ -129,7 +129,7 @@ class SpeechStream:
         for segment in self._segments:
             for result in segment.decode():
                 if isinstance(result, Phone):
-                    self._results.append(self._numbered(result, segment))
+                    self._results.append(self._renumber(result, segment))
                     continue
                 if isinstance(result, SpeechChange):
                     self._is_speaking = result.active
@@ -141,7 +141,7 @@ class SpeechStream:
         results, self._results = self._results, []
         return results
 
-    def _numbered(self, phone: Phone, segment: _Segment) -> Phone:
+    def _renumber(self, phone: Phone, segment: _Segment) -> Phone:
         """Continue the phone indices of the previous segments."""
         if segment.first_index is None:
             segment.first_index = self._next_index
@@ -156,16 +156,18 @@ class SpeechStream:
         self._segments = [segment] if is_first else [*self._segments, segment]
 
     def _new_segment(self, media_time: int) -> _Segment:
-        lips = start_frame = None
-        if self._lips is not None:
-            lips = self._lips.create_stream([delay_for(self._lips.delays_s, self._face_delay_s)])
+        lip_stream = start_frame = None
+        if self._lip_predictor is not None:
+            lip_stream = self._lip_predictor.create_stream(
+                [delay_for(self._lip_predictor.delays_s, self._face_delay_s)]
+            )
         if self._speech_time and self._first_chunk is not None:
             start_frame = frame_at(to_seconds(self._speech_time - media_time))
             self._speech_time = 0
         return _Segment(
             media_time,
             Resampler(self._rate_hz, self._num_channels),
-            SpeechScorer(self._model, lips, start_frame),
+            SpeechScorer(self._model, lip_stream, start_frame),
             LiveDecoder(self._model.topology, self._rule),
         )
 
@@ -214,12 +216,12 @@ class _Segment:
     def decode(self) -> list[StreamOutput]:
         """Return the new results at the session's times, without lip frames before the audio."""
         return [
-            self._place(result)
+            self._to_session_time(result)
             for result in self._decoder.decode(self.scorer.get_events())
             if not (isinstance(result, LipPositions) and result.time_s < 0.0)
         ]
 
-    def _place(self, result: StreamOutput) -> StreamOutput:
+    def _to_session_time(self, result: StreamOutput) -> StreamOutput:
         """Count the time from the session's first sample, in whole samples."""
         match result:
             case LipPositions():

@@ -32,11 +32,11 @@ PLUGIN = {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
 _ACCESS_OFF, _UNAUTHENTICATED, _DENIED, _ASKING, _IN_USE = 1, 8, 50, 51, 454  # error IDs
 
 
-class Denied(UserError):
+class AccessDenied(UserError):
     """The user denied access to VTube Studio."""
 
 
-class Dialogue:
+class VTubeStudioProtocol:
     """The messages of one connection, without I/O.
 
     ``token`` is from an earlier connection; if it is empty, VTube Studio asks the user. Frames may
@@ -60,8 +60,8 @@ class Dialogue:
     def reply(self, text: str) -> str:
         """Process a message from VTube Studio; return the reply, or an empty text.
 
-        Raises ``Denied`` if the user denies access, and ``UserError`` if the message is invalid or
-        reports an error that requires a new connection.
+        Raises ``AccessDenied`` if the user denies access, and ``UserError`` if the message is
+        invalid or reports an error that requires a new connection.
         """
         try:
             message = json.loads(text)
@@ -70,7 +70,7 @@ class Dialogue:
                 "AuthenticationTokenResponse": self._on_token,
                 "AuthenticationResponse": self._on_authenticated,
                 "InputParameterListResponse": self._on_parameters,
-                "InjectParameterDataResponse": self._on_injected,
+                "InjectParameterDataResponse": self._on_parameters_injected,
                 "APIError": self._on_error,
             }
             return handlers[kind](data) if kind in handlers else ""
@@ -109,14 +109,14 @@ class Dialogue:
         self.is_ready = True
         return ""
 
-    def _on_injected(self, _data: Any) -> str:
+    def _on_parameters_injected(self, _data: Any) -> str:
         self.problem = ""
         return ""
 
     def _on_error(self, data: Any) -> str:
         number, text = data["errorID"], str(data["message"])[:200]
         if number == _DENIED:
-            raise Denied(
+            raise AccessDenied(
                 "access to VTube Studio was denied; stop and start sending to be asked again"
             )
         if number == _ACCESS_OFF:
@@ -209,11 +209,11 @@ class VTubeStudioConnection(Connection):
         async with aiohttp.ClientSession() as http:
             while True:
                 try:
-                    await self._talk(http)
+                    await self._run_connection(http)
                     self.problem = "VTube Studio closed the connection; trying again"
                 except UserError as error:
                     self.problem = str(error)
-                    if isinstance(error, Denied):
+                    if isinstance(error, AccessDenied):
                         return
                 except (aiohttp.ClientError, OSError, TimeoutError):
                     self.problem = (
@@ -233,27 +233,27 @@ class VTubeStudioConnection(Connection):
         self._newest.put_nowait(frame)
         return True
 
-    async def _talk(self, http: aiohttp.ClientSession) -> None:
+    async def _run_connection(self, http: aiohttp.ClientSession) -> None:
         limit = aiohttp.ClientWSTimeout(ws_close=RETRY_S)
         host = f"[{self.target.host}]" if ":" in self.target.host else self.target.host
         async with asyncio.timeout(TIMEOUT_S):
             vtube_studio = await http.ws_connect(f"ws://{host}:{self.target.port}", timeout=limit)
         async with vtube_studio:
-            dialogue = Dialogue(_read_tokens().get(self._address, ""), self._save_token)
+            protocol = VTubeStudioProtocol(_read_tokens().get(self._address, ""), self._save_token)
             writer: asyncio.Task[None] | None = None
             try:
-                await vtube_studio.send_str(dialogue.first_message())
-                self.problem = dialogue.problem
+                await vtube_studio.send_str(protocol.first_message())
+                self.problem = protocol.problem
                 async for message in vtube_studio:
                     if message.type is not aiohttp.WSMsgType.TEXT:
                         continue
-                    reply = dialogue.reply(message.data)
-                    self.problem = dialogue.problem
+                    reply = protocol.reply(message.data)
+                    self.problem = protocol.problem
                     if reply:
                         await vtube_studio.send_str(reply)
-                    elif dialogue.is_ready and writer is None:
+                    elif protocol.is_ready and writer is None:
                         self._is_ready = True
-                        writer = asyncio.create_task(self._write(vtube_studio, dialogue))
+                        writer = asyncio.create_task(self._write(vtube_studio, protocol))
             finally:
                 if writer is not None:
                     writer.cancel()
@@ -261,11 +261,11 @@ class VTubeStudioConnection(Connection):
                         await writer
 
     async def _write(
-        self, vtube_studio: aiohttp.ClientWebSocketResponse, dialogue: Dialogue
+        self, vtube_studio: aiohttp.ClientWebSocketResponse, protocol: VTubeStudioProtocol
     ) -> None:
         while True:
             frame = await self._newest.get()
-            message = dialogue.frame_message(frame, is_mouth_only=self.target.is_mouth_only)
+            message = protocol.frame_message(frame, is_mouth_only=self.target.is_mouth_only)
             async with asyncio.timeout(TIMEOUT_S):
                 await vtube_studio.send_str(message)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from kouxing.services.lip_models import lip_model_info, lip_models
-from kouxing.shared.config import BoundEndpoint, DefaultBy, Form
+from kouxing.shared.config import BoundEndpoint, DependentDefault, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
@@ -32,12 +32,12 @@ class SynthesizerConfig(FaceConfig):
     """Endpoint that publishes FAP frames."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
     """FAP frames per second."""
-    lips: Annotated[str, AfterValidator(_check_lip_model), Form(" or ".join(lip_models()))] = (
+    lips: Annotated[str, AfterValidator(_check_lip_model), ValueHint(" or ".join(lip_models()))] = (
         DEFAULT_LIP_MODEL
     )
     """Default lip model. A client can choose another one for its session."""
     delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(
-        default_factory=DefaultBy("lips", _DELAYS_MS, _DELAYS_MS[DEFAULT_LIP_MODEL])
+        default_factory=DependentDefault("lips", _DELAYS_MS, _DELAYS_MS[DEFAULT_LIP_MODEL])
     )
     """Time from a frame's audio until the frame is made, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4

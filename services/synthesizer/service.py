@@ -64,7 +64,7 @@ LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
 
-class _Session:
+class _SynthesizerSession:
     """A session: its face, and its position in the streams of messages."""
 
     def __init__(self, start: StartSession, face: FaceAnimator, input_socket: Socket) -> None:
@@ -120,7 +120,7 @@ class SynthesizerService(Service):
         self.facts = SessionFacts(
             frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lip_model=config.lips
         )
-        self._sessions: dict[str, _Session] = {}
+        self._sessions: dict[str, _SynthesizerSession] = {}
         self._turn = 0  # round robin of sessions with queued events
         self._dropped_s = 0.0  # last removal of frames for stopped subscribers
         self._input = self.bus.bind_router(
@@ -144,7 +144,7 @@ class SynthesizerService(Service):
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
             settings = self._known_settings(start.session, start.face)
-            session = _Session(start, self._new_face(start, settings), self._input)
+            session = _SynthesizerSession(start, self._new_face(start, settings), self._input)
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
@@ -247,7 +247,7 @@ class SynthesizerService(Service):
             self._end(session)
         return True
 
-    def _relax(self, session: _Session, now_s: float) -> None:
+    def _relax(self, session: _SynthesizerSession, now_s: float) -> None:
         # a stalled process does not make all missed frames
         session.relax_at_s = max(session.relax_at_s, now_s - MAX_CATCH_UP_S)
         num_frames = int((now_s - session.relax_at_s) * self.frame_rate_hz)
@@ -275,7 +275,7 @@ class SynthesizerService(Service):
             self._queue_event(session, message)
 
     def _enter_epoch(
-        self, session: _Session, message: SpeechMessage, newest_frame: NewestFrame | None
+        self, session: _SynthesizerSession, message: SpeechMessage, newest_frame: NewestFrame | None
     ) -> None:
         """Continue a face with another recognizer, or after another synthesizer's frames."""
         if session.epoch_in:
@@ -288,7 +288,7 @@ class SynthesizerService(Service):
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
         session.epoch_in = message.epoch
 
-    def _admit(self, message: SpeechMessage, sender: Peer) -> _Session | None:
+    def _admit(self, message: SpeechMessage, sender: Peer) -> _SynthesizerSession | None:
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
@@ -305,7 +305,7 @@ class SynthesizerService(Service):
             return session
         return None
 
-    def _queue_event(self, session: _Session, message: SpeechMessage) -> None:
+    def _queue_event(self, session: _SynthesizerSession, message: SpeechMessage) -> None:
         event = event_of(message)
         language = session.start.facts.language or DEFAULT_LANGUAGE
         if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
@@ -317,7 +317,7 @@ class SynthesizerService(Service):
         if len(session.queue) == 1:
             self._make_frames(session)
 
-    def _make_frames(self, session: _Session) -> None:
+    def _make_frames(self, session: _SynthesizerSession) -> None:
         """Publish the frames of queued events, up to ``MAX_BURST_S``."""
         num_left = max(1, round(MAX_BURST_S * self.frame_rate_hz))
         while session.queue:
@@ -339,7 +339,7 @@ class SynthesizerService(Service):
 
     # --- out -------------------------------------------------------------------------------------
 
-    def _end(self, session: _Session) -> None:
+    def _end(self, session: _SynthesizerSession) -> None:
         session.finished = True
         session.sequence_out += 1
         self._send(
@@ -353,7 +353,7 @@ class SynthesizerService(Service):
         )
         LOG.info("end of frames", extra={"session": session.start.session})
 
-    def _publish(self, session: _Session, frames: Sequence[Frame]) -> None:
+    def _publish(self, session: _SynthesizerSession, frames: Sequence[Frame]) -> None:
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
             session.sequence_out += 1
@@ -371,7 +371,7 @@ class SynthesizerService(Service):
             )
             self._send(session, session.newest)
 
-    def _send(self, session: _Session, message: FapFrame | EndOfFaps) -> None:
+    def _send(self, session: _SynthesizerSession, message: FapFrame | EndOfFaps) -> None:
         self._faps.send(message)
         if session.just_resumed:
             session.recently_published.append(message)

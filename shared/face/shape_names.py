@@ -47,7 +47,7 @@ def find_shapes(set_name: str, names: Iterable[str], listed: Iterable[str] = ())
     for name in names:
         key = next((key for key in _candidates(name) if key in keys), "")
         by_key.setdefault(key, name)
-    shape_of = {}
+    shape_of: dict[str, str] = {}
     for shape, choices in entries.items():
         parts = next((parts for parts in choices if not by_key.keys().isdisjoint(parts)), [])
         shape_of |= {by_key[key]: shape for key in parts if key in by_key}

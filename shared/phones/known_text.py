@@ -15,7 +15,7 @@ Characters = Sequence[tuple[str, Syllable]]  # each character and its phones
 GAP = 0.7  # cost of a missing or inserted syllable; a wrong one costs up to 1
 
 
-def place_in_text(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> list[int | None]:
+def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> list[int | None]:
     """Return the index in the text of each syllable recognized so far; None: not in the text."""
     costs = [
         [GAP * j for j in range(len(text) + 1)]
@@ -23,13 +23,13 @@ def place_in_text(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> l
     for i, syllable in enumerate(recognized, start=1):
         costs.append([GAP * i])
         for j, spoken in enumerate(text):
-            both = costs[i - 1][j] + _difference(syllable, spoken)
+            both = costs[i - 1][j] + _syllable_distance(syllable, spoken)
             costs[i].append(min(both, GAP + costs[i - 1][j + 1], GAP + costs[i][j]))
     places: list[int | None] = [None] * len(recognized)
     i = len(recognized)
     j = min(range(len(text) + 1), key=costs[i].__getitem__)  # the rest is not spoken yet
     while i and j:
-        if costs[i][j] == costs[i - 1][j - 1] + _difference(recognized[i - 1], text[j - 1]):
+        if costs[i][j] == costs[i - 1][j - 1] + _syllable_distance(recognized[i - 1], text[j - 1]):
             i, j = i - 1, j - 1
             places[i] = j
         elif costs[i][j] == GAP + costs[i - 1][j]:
@@ -39,7 +39,7 @@ def place_in_text(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> l
     return places
 
 
-def _difference(one: Syllable, other: Syllable) -> float:
+def _syllable_distance(one: Syllable, other: Syllable) -> float:
     """Return 0 for the same syllable, up to 1 without common phones."""
     return 1.0 - len({*one} & {*other}) / max(len(one), len(other))
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.phones.known_text import Characters, place_in_text
+from kouxing.shared.phones.known_text import Characters, match_syllables
 
 MAX_PHONES = 40  # that may still be revised; older ones are dropped
 
@@ -78,7 +78,7 @@ class SyllableTrack:
         symbols = [tuple(phone.symbol for phone in group) for group in groups]
         spoken = [syllable for syllable in symbols if syllable != silence]
         text = [phones for _, phones in self._characters[self._num_dropped :]]
-        indices = iter(place_in_text(spoken, text) if text else [None] * len(spoken))
+        indices = iter(match_syllables(spoken, text) if text else [None] * len(spoken))
         places = (None if syllable == silence else next(indices) for syllable in symbols)
         return [None if place is None else place + self._num_dropped for place in places]
 

@@ -34,7 +34,7 @@ class FaceSettings:
     hold_s: Annotated[float, Meta(ge=0, le=MAX_HOLD_S)] = DEFAULT_HOLD_S  # until they fade
     shapes: ShapeSets | None = None  # also publish these sets of shapes
 
-    def updated(self, change: FaceSettings) -> FaceSettings:
+    def merged_with(self, change: FaceSettings) -> FaceSettings:
         """Return these settings after a change."""
         shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])
         expressed = self if change.expressions is None else change
@@ -65,7 +65,7 @@ class CurrentFace:
 
     def change(self, change: FaceSettings, now_s: float) -> None:
         """Apply a change."""
-        self.settings, self.set_at_s = self.at(now_s).updated(change), now_s
+        self.settings, self.set_at_s = self.at(now_s).merged_with(change), now_s
 
     def at(self, now_s: float) -> FaceSettings:
         """Return the settings with which a new face would show the same."""

@@ -238,7 +238,7 @@ def test_a_disconnected_address_is_blocked_for_a_while(
 def test_drops_a_message_of_very_many_parts_step_by_step(
     bus: Bus, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(connections, "LOOK_S", 600.0)  # the limiter comes too late
+    monkeypatch.setattr(connections, "CHECK_INTERVAL_S", 600.0)  # the limiter comes too late
     bound = (bus.bind_router if kind == "DEALER" else bus.bind_publisher)(LOCAL, "bound")
     with connected(port_of(bound), kind) as hostile:
         num_parts = 20 * MAX_DROPPED

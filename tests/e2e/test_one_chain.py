@@ -162,7 +162,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
         load_live_model(),
         load_lip_model(name="learnt"),
         synthesizer=SynthesizerConfig(delay_ms=delay_ms),
-        lips_from_sound=LoudLips(),
+        lip_predictor=LoudLips(),
     )
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
@@ -176,7 +176,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
 
 def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "bilabials-female.wav")
-    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"), lips_from_sound=LoudLips())
+    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"), lip_predictor=LoudLips())
     frames = chain.accept_waveform(samples) + chain.input_finished()
     settings = {
         "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",

@@ -37,7 +37,9 @@ def events() -> tuple[SoundEvent, ...]:
     """Return a live recognizer's output for a sentence with many closures."""
     samples, _ = read_audio(DEMO / "bilabials-female.wav")
     model = load_live_model()
-    outputs = recognize_live(model, samples, lips=lip_predictor_for(model), face_delay_s=0.06)
+    outputs = recognize_live(
+        model, samples, lip_predictor=lip_predictor_for(model), face_delay_s=0.06
+    )
     return tuple(event for event in outputs if not isinstance(event, Waveform))
 
 

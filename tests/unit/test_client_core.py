@@ -6,12 +6,12 @@ from typing import Any, cast
 
 import pytest
 from kouxing_client import SHAPE_NAMES, FapFrame
-from kouxing_client.audio import ANSWER_S
+from kouxing_client.audio import ANSWER_LIMITS_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.messages import Joined
 from kouxing_client.session_core import (
     MOVE_LIMIT_S,
-    REJOIN_S,
+    RESUBSCRIBE_S,
     SILENT_S,
     Inbox,
     SessionCore,
@@ -161,7 +161,7 @@ def test_reconnects_and_resends_if_acknowledgements_stop() -> None:
     scene.push(3)
     dead = scene.audio()
     dead.answer("acknowledge", sequence=1)
-    scene.pass_time(ANSWER_S[0] + 0.1)
+    scene.pass_time(ANSWER_LIMITS_S[0] + 0.1)
     assert not dead.is_open
     assert sequences(scene.audio()) == [2, 3]
     assert scene.audio().connect_ms < 300, "the round trip was shorter"
@@ -173,9 +173,9 @@ def test_audio_waits_for_subscriptions_so_that_no_frame_is_missed() -> None:
     scene.confirm()
     scene.push(2)
     scene.audio().answer("acknowledge", sequence=1)
-    scene.pass_time(ANSWER_S[0] + 0.1)
+    scene.pass_time(ANSWER_LIMITS_S[0] + 0.1)
     assert sequences(scene.audio()) == []
-    scene.pass_time(REJOIN_S)
+    scene.pass_time(RESUBSCRIBE_S)
     assert sequences(scene.audio()) == [2]
 
 

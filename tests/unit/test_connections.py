@@ -43,7 +43,7 @@ class Scene:
         self.socket = self.limiter.limit(raw, AUDIO)  # type: ignore[arg-type]
         self.socket.port = 5560
         self.socket.accepted = lambda: iter(())  # type: ignore[method-assign]
-        self.look = self.limiter.look
+        self.enforce_limits = self.limiter.enforce_limits
 
     def deliver(self, descriptor: int, key: str = "") -> Connection:
         return cast(Connection, self.socket.deliver(descriptor, key))
@@ -71,12 +71,12 @@ def test_a_budget_recovers_up_to_its_start_and_a_blocked_one_only_later() -> Non
 
 def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
     hostile, honest = scene.deliver(1), scene.deliver(2)
-    scene.look(0.0)
+    scene.enforce_limits(0.0)
     for look in range(1, 100):
         scene.socket.num_polls += 1
         scene.deliver(2)
         scene.traffic = dict.fromkeys((1, 2), Traffic(read=20_000 * look))
-        scene.look(float(look))
+        scene.enforce_limits(float(look))
     assert hostile.is_cut
     assert not honest.is_cut
 
@@ -85,10 +85,10 @@ def test_sheds_the_owner_with_the_most_undelivered_bytes(scene: Scene) -> None:
     scene.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
     many = [scene.deliver(number, "many") for number in (1, 2, 3)]
     single = scene.deliver(4, "single")
-    scene.look(0.0)
+    scene.enforce_limits(0.0)
     scene.traffic = dict.fromkeys((1, 2, 3), Traffic(read=200_000))
     scene.traffic[4] = Traffic(read=300_000)
-    scene.look(1.0)
+    scene.enforce_limits(1.0)
     assert sum(connection.is_cut for connection in many) == 1
     assert not single.is_cut
 
@@ -97,14 +97,14 @@ def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
     scene.patch.setattr(connections, "MAX_UNREAD", 3 * MAX_QUEUED)
     silent = [scene.deliver(number, "silent") for number in range(1, 5)]
     other = scene.deliver(5, "other")
-    scene.look(0.0)
+    scene.enforce_limits(0.0)
     scene.socket.num_sent += 10 * MAX_QUEUED
     scene.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000))
-    scene.look(1.0)
+    scene.enforce_limits(1.0)
     assert other.unread == 0, "all of them read"
     scene.socket.num_sent += 10 * MAX_QUEUED
     scene.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000, unsent=1))
-    scene.look(2.0)
+    scene.enforce_limits(2.0)
     assert other.unread == MAX_QUEUED, "libzmq drops more"
     assert sum(connection.is_cut for connection in silent) == 2
     assert not other.is_cut
@@ -112,11 +112,11 @@ def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
 
 def test_a_subscriber_is_stalled_when_nothing_is_acknowledged(scene: Scene) -> None:
     peer = scene.deliver(1)
-    scene.look(0.0)
+    scene.enforce_limits(0.0)
     scene.socket.num_sent += 1
     for now_s in (0.5, 1.5, 2.5):  # slow, but it reads
         scene.traffic[1] = Traffic(acknowledged=int(now_s * 100), unsent=1)
-        scene.look(now_s)
+        scene.enforce_limits(now_s)
         assert not peer.is_stalled(now_s)
     assert peer.is_stalled(2.5 + 1.1 * STALLED_S)
 
@@ -127,7 +127,7 @@ def test_one_peer_cannot_take_all_connections(scene: Scene, shares: str) -> None
     for number in range(1, 9):
         scene.addresses[number] = "10.0.0.1" if shares == "address" else f"10.0.1.{number}"
         made.append(scene.deliver(number, "key" if shares == "key" else f"key {number}"))
-        scene.look(0.0)
+        scene.enforce_limits(0.0)
     assert [connection.is_cut for connection in made] == [False] * 6 + [True] * 2
 
 
@@ -135,14 +135,14 @@ def test_silent_connections_make_room(scene: Scene) -> None:
     scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
     silent = [scene.limiter.find(number, scene.socket) for number in range(8)]
     talker = scene.deliver(8, "talker")
-    scene.look(0.0)
+    scene.enforce_limits(0.0)
     assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 7
     assert not talker.is_cut
 
 
 def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scene) -> None:
     scene.deliver(1, "key").disconnect("test", PENALTY_S)
-    scene.look(0.0)
+    scene.enforce_limits(0.0)
     assert scene.limiter.is_blocked("key")
     assert not scene.limiter.is_blocked("other")
     assert list(scene.socket.ended) == [1]
@@ -154,7 +154,7 @@ def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scen
 def test_a_reused_descriptor_is_another_connection(scene: Scene) -> None:
     before = scene.deliver(1)
     scene.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 77)
-    assert not scene.limiter.has(1)
+    assert not scene.limiter.is_open(1)
     assert scene.deliver(1) is not before
     scene.patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 80)
     scene.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 78)

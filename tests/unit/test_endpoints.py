@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.endpoints import own_address
+from kouxing.shared.endpoints import local_address
 
 ROUTES = {"10.77.0.1": "10.77.0.2", "fd77::1": "fd77::2", "192.0.2.1": "10.88.0.2"}
 
@@ -40,4 +40,4 @@ def test_advertises_the_address_on_the_way_to_control(
     monkeypatch.setattr(socket, "socket", Probe)
     assert SynthesizerConfig(control=control).reachable(bound) == advertised
     monkeypatch.setattr(Probe, "routes", {})
-    assert own_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"
+    assert local_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"

@@ -15,7 +15,7 @@ from kouxing.services.cli.animation import Motion
 from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves, Row
 from kouxing.services.cli.exporters import open_exporter
 from kouxing.services.cli.follow import follow
-from kouxing.services.cli.options import CurveForm, ExportOptions, Shown
+from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import NUM_FAPS
@@ -73,7 +73,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"unknown format; .*\.mp4, .*\.png, .*\.csv"):
             open_exporter(output, ExportOptions())
         with pytest.raises(UserError, match=r"unknown format; .*\.fap, \.csv, \.jsonl"):
-            follow("", output, Shown.FAPS, CurveForm.FAPS, control="")
+            follow("", output, ListenOutput.FAPS, CurveForm.FAPS, control="")
         assert not output.exists()
 
 

@@ -103,7 +103,7 @@ def with_header(**changes: object) -> bytes:
 def test_parses_a_landmark_file() -> None:
     filmed = parse_landmark_file(CONTENT)
     np.testing.assert_array_equal(filmed.frame_s, TIMES)
-    assert filmed.lips[:, LIP_FAPS.index(5)].min() == pytest.approx(-512, abs=2)
+    assert filmed.lip_track[:, LIP_FAPS.index(5)].min() == pytest.approx(-512, abs=2)
     assert len(filmed.samples) == pytest.approx(3 * 16_000, abs=2)
 
 

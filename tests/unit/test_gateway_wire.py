@@ -45,7 +45,7 @@ def test_rejects_a_bad_hello_and_names_the_field(fields: object, field: str) -> 
 def test_parses_microphone_commands() -> None:
     assert wire.parse_command('{"flush": true}').flush
     assert wire.parse_command('{"skip": 960}').num_skipped == 960
-    assert wire.parse_command('{"lips": "ferguson"}').lips == "ferguson"
+    assert wire.parse_command('{"lips": "ferguson"}').lip_model == "ferguson"
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ import pytest
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.kinds import (
     KINDS,
-    available_addresses,
+    available_port_environment,
+    extra_worker_environments,
     kind_of,
-    more_workers,
     read_settings,
 )
 from kouxing.shared.errors import UserError
@@ -24,7 +24,7 @@ def test_rejects_a_configured_port_that_is_taken(host: str) -> None:
         port = other.getsockname()[1]
         chosen = read_settings(assignments={"gateway.port": str(port)})
         with pytest.raises(UserError, match=f"gateway.port: another program uses port {port}"):
-            available_addresses(chosen)
+            available_port_environment(chosen)
         chosen = read_settings(
             assignments={
                 "control.events": f"tcp://{host}:{port}",
@@ -33,7 +33,7 @@ def test_rejects_a_configured_port_that_is_taken(host: str) -> None:
             }
         )
         with pytest.raises(UserError, match=r"control\.events"):
-            available_addresses(chosen)
+            available_port_environment(chosen)
 
 
 def test_a_taken_default_and_port_0_are_replaced_by_a_free_port() -> None:
@@ -42,7 +42,7 @@ def test_a_taken_default_and_port_0_are_replaced_by_a_free_port() -> None:
         with contextlib.suppress(OSError):  # another program has it, which is as good
             stack.enter_context(socket.create_server(("127.0.0.1", taken)))
         for settings in (read_settings(), read_settings(assignments={"gateway.port": "0"})):
-            port = int(available_addresses(settings)["KOUXING_GATEWAY_PORT"])
+            port = int(available_port_environment(settings)["KOUXING_GATEWAY_PORT"])
             assert port not in (0, taken)
 
 
@@ -50,8 +50,8 @@ def test_more_workers_bind_other_ports_of_the_same_address() -> None:
     settings = read_settings(
         assignments={"recognizer.audio": "tcp://127.0.0.5:5560", "recognizer.instance": "ours"}
     )
-    assert more_workers(settings, 1) == {}
-    more = more_workers(settings, 3)
+    assert extra_worker_environments(settings, 1) == {}
+    more = extra_worker_environments(settings, 3)
     assert list(more) == ["recognizer-2", "recognizer-3", "synthesizer-2", "synthesizer-3"]
     assert more["recognizer-3"] == {
         "KOUXING_RECOGNIZER_INSTANCE": "",

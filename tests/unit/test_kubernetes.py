@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from kouxing.services.kinds import KINDS
-from kouxing.shared.config import Bound, Settings, bound_keys
+from kouxing.shared.config import BindAddress, Settings, bound_keys
 from tests.system import ROOT
 
 FOLDER = ROOT / "deploy" / "kubernetes"
@@ -58,10 +58,10 @@ def test_the_settings_of_a_service_are_valid(name: str) -> None:
     assert config.metrics_port == ports(name)["metrics"]
     for key, bound in bound_keys(type(config)).items():
         value = getattr(config, "bound_control" if key == "control" else key)
-        if bound is Bound.ENDPOINT:
+        if bound is BindAddress.ENDPOINT:
             port = "commands" if key == "control" else key.replace("_", "-")
             assert value == f"tcp://0.0.0.0:{ports(name)[port]}"
-        elif bound is Bound.PORT:
+        elif bound is BindAddress.PORT:
             assert value == ports(name)["page"]
 
 

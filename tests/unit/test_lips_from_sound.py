@@ -98,7 +98,9 @@ def test_uses_the_predictor_only_with_its_network(tmp_path: Path) -> None:
 
 
 def test_the_shipped_predictor_opens_rounds_and_closes_the_lips() -> None:
-    outputs = recognize_live(load_model(), SAMPLES, lips=load_lip_predictor(), face_delay_s=0.2)
+    outputs = recognize_live(
+        load_model(), SAMPLES, lip_predictor=load_lip_predictor(), face_delay_s=0.2
+    )
     lips = [output for output in outputs if isinstance(output, LipPositions)]
 
     def mean(fap: int, start_s: float, end_s: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from prometheus_client import CollectorRegistry
 
-from kouxing.shared.metrics import WINDOW, BusyShare, Metrics
+from kouxing.shared.metrics import WINDOW, LoadMeter, Metrics
 from kouxing.shared.prometheus import MetricsCollector
 
 
@@ -26,13 +26,13 @@ def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
     assert metrics.snapshot(11.0)["frames_per_s"] == 0.0
 
 
-def busy_share(until_s: float, work_s: float) -> BusyShare:
+def busy_share(until_s: float, work_s: float) -> LoadMeter:
     """Return the share of a loop that works at the start of each second, read every 0.25 s."""
-    busy = BusyShare(2.0, 0.0)
+    busy = LoadMeter(2.0, 0.0)
     for quarter in range(int(4 * until_s)):
         if quarter % 4 == 0:
-            busy.works(quarter / 4)
-            busy.waits(quarter / 4 + work_s)
+            busy.start_working(quarter / 4)
+            busy.start_waiting(quarter / 4 + work_s)
         busy.share(quarter / 4 + 0.25)
     return busy
 
@@ -47,7 +47,7 @@ def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None
     for quarter in range(1, 13):
         last = busy.share(4.0 + quarter / 4)
     assert last == 0.0
-    busy.works(7.0)
+    busy.start_working(7.0)
     assert busy.share(9.0) == 1.0
 
 

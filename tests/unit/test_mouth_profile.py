@@ -129,7 +129,7 @@ def test_corrects_the_lag_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "MIN_SPEECH_S", 1.0)
     samples = samples_of_file(VOWELS_FILE)[:80_000]
     frame_s = np.arange(250) / 50
-    still = FilmedSpeech(samples=samples, frame_s=frame_s, lips=np.zeros((250, NUM_FAPS)))
+    still = FilmedSpeech(samples=samples, frame_s=frame_s, lip_track=np.zeros((250, NUM_FAPS)))
     model = load_model()
     assert isinstance(model, NeuralModel)
     plain = observe(model, MODEL, still)
@@ -137,7 +137,7 @@ def test_corrects_the_lag_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     lips = np.stack(
         [np.interp(frame_s - 0.08, time_s, track) for track in plain.predicted[:, -1].T], axis=1
     )
-    late = observe(model, MODEL, FilmedSpeech(samples=samples, frame_s=frame_s, lips=lips))
+    late = observe(model, MODEL, FilmedSpeech(samples=samples, frame_s=frame_s, lip_track=lips))
     assert opening_error(late) < 0.1 * opening_error(plain)
 
 

@@ -124,8 +124,8 @@ def test_a_live_client_stalls_once_until_audio_arrives() -> None:
     session = make_session()
     for _ in range(2):
         session.without_audio_s = 0.0
-        assert sum(session.becomes_stalled(0.01) for _ in range(100)) == 1
-    assert not make_session(paced=False).becomes_stalled(2 * STALLED_AFTER_S)
+        assert sum(session.check_stalled(0.01) for _ in range(100)) == 1
+    assert not make_session(paced=False).check_stalled(2 * STALLED_AFTER_S)
 
 
 def test_a_mouth_profile_that_does_not_fit_is_not_used() -> None:

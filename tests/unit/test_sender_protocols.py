@@ -12,7 +12,11 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import connect, parse_target
 from kouxing.services.senders.senders import PAUSE_S, WINDOW_S, PlayoutClock
-from kouxing.services.senders.vtube_studio import Denied, Dialogue, tracking_parameters
+from kouxing.services.senders.vtube_studio import (
+    AccessDenied,
+    VTubeStudioProtocol,
+    tracking_parameters,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -130,11 +134,11 @@ def response(kind: str, **data: object) -> str:
 
 
 def test_vtube_studio_errors() -> None:
-    dialogue = Dialogue("revoked", lambda _: None)
+    dialogue = VTubeStudioProtocol("revoked", lambda _: None)
     assert json.loads(dialogue.first_message())["messageType"] == "AuthenticationRequest"
     request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=False)))
     assert request["messageType"] == "AuthenticationTokenRequest"
-    with pytest.raises(Denied):
+    with pytest.raises(AccessDenied):
         dialogue.reply(response("APIError", errorID=50, message="denied"))
     for number, reason in ((1, "Start API"), (51, "press Allow"), (500, "no such")):
         with pytest.raises(UserError, match=reason):

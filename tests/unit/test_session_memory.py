@@ -14,7 +14,7 @@ from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.metrics import give_back_memory, memory_mb
+from kouxing.shared.metrics import memory_mb, trim_heap
 from tests.system import DEMO
 
 pytestmark = pytest.mark.slow
@@ -38,7 +38,9 @@ class Sessions:
 
     def start(self) -> None:
         recognizer = self._recognizer
-        self._streams = [recognizer.create_stream(lips=self._lips) for _ in range(NUM_SESSIONS)]
+        self._streams = [
+            recognizer.create_stream(lip_predictor=self._lips) for _ in range(NUM_SESSIONS)
+        ]
 
     def end(self) -> None:
         self._streams.clear()
@@ -57,7 +59,7 @@ class Sessions:
 
 def used_mb() -> float:
     """Return the memory of this process, without the C library's free memory."""
-    give_back_memory()
+    trim_heap()
     return memory_mb()
 
 

@@ -61,7 +61,7 @@ class System:
 
     def lose(self, instance: str) -> None:
         self.registry.remove(instance)
-        self.sessions.lose_worker(instance, 1.0)
+        self.sessions.mark_worker_lost(instance, 1.0)
 
     def open(self, name: str = "", client: Peer = CLIENT, **fields: object) -> SessionRecord:
         opening = OpenSession(session=name, request="r", **fields)  # type: ignore[arg-type]
@@ -255,32 +255,34 @@ def test_a_worker_wrongly_declared_lost_keeps_its_sessions(system: System) -> No
     record.announced, record.waiting_for = True, set()
     system.lose("recognizer-1")
     assert not system.sessions.move(record, 1.0)
-    assert system.sessions.unsettled() == [record]
+    assert system.sessions.pending() == [record]
     assert "recognizer-1" not in system.sessions.participants(record)
     system.add(worker("recognizer", "recognizer-1"))
-    assert system.registry.pop_lost("recognizer-1", Peer(b"recognizer-1"))
+    assert system.registry.reclaim_lost("recognizer-1", Peer(b"recognizer-1"))
     assert system.sessions.reinstate_worker("recognizer-1") == []
-    assert (record.epoch, system.sessions.unsettled()) == (1, [])
+    assert (record.epoch, system.sessions.pending()) == (1, [])
     assert "recognizer-1" in system.sessions.participants(record)
 
 
 def test_services_become_silent_in_the_order_of_their_heartbeats(system: System) -> None:
     system.add(worker("recognizer", "recognizer-1"), now_s=2.0)
-    assert system.registry.silent(2.9) == []
-    assert system.registry.silent(3.5) == ["synthesizer-1"]
+    assert system.registry.overdue(2.9) == []
+    assert system.registry.overdue(3.5) == ["synthesizer-1"]
     system.registry.exclude_pause(1.0)
-    assert system.registry.silent(3.5) == [], "control did not run"
-    assert system.registry.silent(6.5) == ["synthesizer-1", "recognizer-1"]
+    assert system.registry.overdue(3.5) == [], "control did not run"
+    assert system.registry.overdue(6.5) == ["synthesizer-1", "recognizer-1"]
 
 
 def test_distinguishes_a_restarted_worker_from_the_crashed_one(system: System) -> None:
     old, peer = worker("recognizer", "recognizer-1"), Peer(b"recognizer-1")
     new = replace(old, instance="recognizer-9")
-    assert system.registry.displaced_by(new, CLIENT) is None, "its endpoints have another key"
-    assert system.registry.displaced_by(new, peer) == "recognizer-1"
-    assert system.registry.displaced_by(old, peer) is None
+    assert system.registry.replaced_by(new, CLIENT) is None, "its endpoints have another key"
+    assert system.registry.replaced_by(new, peer) == "recognizer-1"
+    assert system.registry.replaced_by(old, peer) is None
     assert not system.registry.is_other_process(old, peer)
     assert system.registry.is_other_process(old, Peer(b"restarted"))
     assert system.registry.is_other_process(replace(old, endpoints={"audio": "tcp://new:1"}), peer)
     system.lose("recognizer-1")
-    assert not system.registry.pop_lost("recognizer-1", Peer(b"restarted")), "it is not the same"
+    assert not system.registry.reclaim_lost("recognizer-1", Peer(b"restarted")), (
+        "it is not the same"
+    )

@@ -30,7 +30,7 @@ from tests.system import VOWELS_FILE
 MODEL = load_model()
 SAMPLES = samples_of_file(VOWELS_FILE)
 RATE_HZ = 16_000
-FACE: dict[str, Any] = {"lips": LoudLips(), "face_delay_s": 0.1}
+FACE: dict[str, Any] = {"lip_predictor": LoudLips(), "face_delay_s": 0.1}
 E = TypeVar("E")
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.known_text import characters_of, place_in_text
+from kouxing.shared.phones.known_text import characters_of, match_syllables
 from kouxing.shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
 
 MANDARIN = load_inventory("mandarin")
@@ -80,7 +80,7 @@ def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
 
 
 def test_spells_syllables_that_are_not_in_the_text() -> None:
-    places = place_in_text([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")])
+    places = match_syllables([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")])
     assert places == [None, 0, 1]
     track = SyllableTrack(MANDARIN, characters_of("好。", MANDARIN))
     texts: dict[int, str] = {}

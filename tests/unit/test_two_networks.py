@@ -46,7 +46,7 @@ def test_the_newest_frames_have_causal_scores() -> None:
 def events_of(model: AcousticModel, chunk: int = 320) -> list[StreamOutput]:
     lips = lip_predictor_for(model)
     assert lips is not None
-    return recognize_live(model, HELLO, chunk, lips=lips, face_delay_s=0.06)
+    return recognize_live(model, HELLO, chunk, lip_predictor=lips, face_delay_s=0.06)
 
 
 def test_lip_frames_come_from_the_causal_network() -> None:

@@ -136,12 +136,16 @@ def _frames(
     source = source_frames(len(frames), speed, num_source)
     draw = rng.random()
     if draw < _TEMPO_PROB + _HURRY_PROB:
-        frames, changed = (change_tempo if draw < _TEMPO_PROB else _hurry)(frames, rng)
+        frames, changed = (change_tempo if draw < _TEMPO_PROB else _shorten_steady_sounds)(
+            frames, rng
+        )
         source = source[changed]
     return frames, source
 
 
-def _hurry(frames: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.int64]]:
+def _shorten_steady_sounds(
+    frames: Floats, rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.int64]]:
     """Shorten steady sounds, like fast speakers.
 
     Return frames, (m, k), and their source frames, (m,).

@@ -32,7 +32,7 @@ from torch import Tensor
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
 from kouxing.training.neural.batches import Batch, Recording, Targets, augment, sampling_probs
 from kouxing.training.neural.network import Readout, ReadoutShape, mixed_precision
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy, rise_and_fall
+from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
 from kouxing.training.neural.teacher import WholeEncoder
 from kouxing.training.training_set import Report
 
@@ -81,7 +81,7 @@ def train_readout(
 
     return optimizer.train(
         loss,
-        lambda step: rise_and_fall(step, num_steps, _WARM_UP_STEPS, _FALLING),
+        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
         num_steps=num_steps,
         seed=seed,
         report=report,

@@ -151,6 +151,6 @@ def train_blocks(
         recordings=examples,
         errors=errors,
     )
-    errors.print_to(report)
+    errors.report_to(report)
     for path in stored:
         path.unlink()

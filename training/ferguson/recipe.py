@@ -252,7 +252,7 @@ def train_ferguson(
     errors = RowErrors()
     rows = training_rows(corpora, inventory, errors, any_license=any_license)
     table = phone_table(openings, aligned_speech(model, rows, errors), inventory)
-    errors.print_to(report)
+    errors.report_to(report)
     of_fap = dict(zip(MOUTH_FAPS, travel_of(used), strict=True))
     for name, point in lip_points().items():
         if point.fap is not None:
@@ -289,7 +289,7 @@ def training_rows(
                 of_speaker[row.speaker] = number + 1
                 chosen.append(row)
     if not chosen:
-        raise errors.nothing_left(f"in {', '.join(map(str, corpora))}")
+        raise errors.no_recording_error(f"in {', '.join(map(str, corpora))}")
     return chosen
 
 

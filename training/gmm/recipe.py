@@ -98,7 +98,7 @@ def train_gmm(
         errors=errors,
         chosen=chosen,
     )
-    errors.print_to(report)
+    errors.report_to(report)
 
 
 def _train_mixtures(

@@ -26,7 +26,7 @@ from kouxing.training.heads.measures import (
 )
 from kouxing.training.heads.occlusion import shade
 from kouxing.training.heads.paint_parts import encode
-from kouxing.training.heads.parts import Piece, eye_pieces, teeth_pieces, tongue_piece, write
+from kouxing.training.heads.parts import HeadPiece, eye_pieces, teeth_pieces, tongue_piece, write
 from kouxing.training.heads.people import REFERENCE, Person, Shape
 from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivided
 
@@ -115,7 +115,7 @@ class Builder:
         output.parent.mkdir(parents=True, exist_ok=True)
         write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
 
-    def _skin_piece(self, skin: Skin, person: Person, fields: Fields) -> Piece:
+    def _skin_piece(self, skin: Skin, person: Person, fields: Fields) -> HeadPiece:
         layout = self.reference.vertices
         covered = person.hair.hidden(layout) & ~self._cavity
         covered |= layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
@@ -124,10 +124,10 @@ class Builder:
             triangles = subdivision.triangles_of(quads)
             return triangles[~covered[triangles].all(axis=1)]
 
-        part = parts.Part(
+        part = parts.Geometry(
             skin.vertices, visible(skin.quads), paint.skin_uv(layout), np.ones_like(layout)
         )
-        return Piece(
+        return HeadPiece(
             "skin",
             part,
             "skin",
@@ -138,7 +138,7 @@ class Builder:
             coarse_triangles=visible(skin.coarse_quads),
         )
 
-    def _garment(self, vertices: Float) -> Piece:
+    def _garment(self, vertices: Float) -> HeadPiece:
         """Make a round-necked top: the torso, slightly enlarged, cut off around the neck."""
         torso, plain = (subdivided(shape, self._torso) for shape in (vertices, self._plain))
         smooth, layout = (skin.vertices[: len(skin.base)] for skin in (torso, plain))
@@ -163,15 +163,15 @@ class Builder:
         everything = np.concatenate([points + 0.034 * normals, *folds])
         used, compact = np.unique(np.concatenate([triangles, *strips]), return_inverse=True)
         everything = everything[used]
-        part = parts.Part(
+        part = parts.Geometry(
             everything,
             compact.reshape(-1, 3),
             np.full((len(everything), 2), 0.5),
             np.ones_like(everything),
         )
-        return Piece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
+        return HeadPiece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
 
-    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], raised: float) -> list[Piece]:
+    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], raised: float) -> list[HeadPiece]:
         lips = ("2.2", "2.3")
         middle, target = (
             one.vertices[one.points(*lips)].mean(axis=0) for one in (self.reference, skin)
@@ -185,7 +185,7 @@ class Builder:
                 piece.part.vertices[:, 1] += raised
         return pieces
 
-    def _hair(self, skin: Skin, person: Person) -> list[Piece]:
+    def _hair(self, skin: Skin, person: Person) -> list[HeadPiece]:
         layout = self.reference.vertices
         outer = np.flatnonzero((layout[:, 1] > 4.7) & ~self._cavity)[::5]
         warp = interpolate.RBFInterpolator(
@@ -199,14 +199,16 @@ class Builder:
             # long locks need all their rows
             is_short = name == "hair_tips" and isinstance(person.hair, Crop)
             coarse = coarse_locks(count) if is_short else None
-            pieces.append(Piece(name, part, "hair", 0.7, np.ones(count), coarse_triangles=coarse))
+            pieces.append(
+                HeadPiece(name, part, "hair", 0.7, np.ones(count), coarse_triangles=coarse)
+            )
         return pieces
 
-    def _lashes(self, skin: Skin, fields: Fields, length: float) -> Piece:
+    def _lashes(self, skin: Skin, fields: Fields, length: float) -> HeadPiece:
         """Make two ribbons of lashes along the edges of the upper eyelids."""
         columns, rows = 25, 4
         layout = self.reference.vertices[: len(skin.base)]
-        ribbons: list[parts.Part] = []
+        ribbons: list[parts.Geometry] = []
         shifts: dict[int, list[Float]] = {fap: [] for fap in fields}
         for side in (1.0, -1.0):
             lid = skin.number[np.array(LEFT_LID)]
@@ -230,7 +232,7 @@ class Builder:
             u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(1, 0, rows))
             uv = np.stack([u.ravel(), v.ravel()], axis=1)
             triangles = parts.grid_triangles(rows, columns)
-            ribbons.append(parts.Part(points, triangles, uv, np.ones_like(points)))
+            ribbons.append(parts.Geometry(points, triangles, uv, np.ones_like(points)))
             for fap, shift in fields.items():
                 moved = np.zeros((columns, 3))
                 if np.abs(shift[lid]).max() > 1e-6:
@@ -238,7 +240,7 @@ class Builder:
                 shifts[fap].append(np.tile(moved, (rows, 1)))
         both = {fap: np.concatenate(halves) for fap, halves in shifts.items() if np.any(halves)}
         part = join(ribbons)
-        return Piece("lashes", part, "lashes", 0.9, np.ones(len(part.vertices)), both)
+        return HeadPiece("lashes", part, "lashes", 0.9, np.ones(len(part.vertices)), both)
 
     def _face_map(self) -> paint.FaceMap:
         skin = self.reference

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kouxing.training.heads.parts import Part, grid_triangles
+from kouxing.training.heads.parts import Geometry, grid_triangles
 
 Float = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Sheet:
         ).reshape(*across.shape, 6)
         return layers[..., :3], layers[..., 3:]
 
-    def body(self, shown: NDArray[np.bool_]) -> Part:
+    def body(self, shown: NDArray[np.bool_]) -> Geometry:
         """Make the opaque body from the quads (A - 1, S - 1) that are shown.
 
         The texture's first band repeats across it, alternately mirrored.
@@ -69,7 +69,9 @@ class Sheet:
             triangles = triangles[:, ::-1]
         used, compact = np.unique(triangles, return_inverse=True)
         vertices = self.points.reshape(-1, 3)[used]
-        return Part(vertices, compact.reshape(-1, 3), uv[used], np.full((len(used), 3), _BODY_TONE))
+        return Geometry(
+            vertices, compact.reshape(-1, 3), uv[used], np.full((len(used), 3), _BODY_TONE)
+        )
 
 
 @dataclass(slots=True)
@@ -86,7 +88,7 @@ class Locks:
     root_lift: float  # fraction of the lift, as tip_lift
     tip_lift: float
 
-    def part(self, sheet: Sheet, rng: np.random.Generator) -> Part:
+    def part(self, sheet: Sheet, rng: np.random.Generator) -> Geometry:
         """Make three-sided tapes, from the inside outward, so that outer ones blend over inner."""
         order = np.argsort(self.lift)
         fields = (self.across, self.start, self.end, self.width, self.lift, self.drift)
@@ -118,7 +120,7 @@ class Locks:
         tone *= np.interp(self.lift[order], [0, max(self.lift.max(), 1e-9)], [0.85, 1])[:, None]
         tone = _BODY_TONE + (tone - _BODY_TONE) * np.clip(t / 0.3, 0, 1)
         colors = np.repeat(tone.ravel(), 3)[:, None] * np.ones(3)
-        return Part(
+        return Geometry(
             points.reshape(-1, 3),
             (one[None] + first).reshape(-1, 3),
             np.stack([u, v], axis=-1).reshape(-1, 2),
@@ -135,10 +137,10 @@ def coarse_locks(count: int) -> NDArray[np.int64]:
     return (one[None] + first).reshape(-1, 3)
 
 
-def join(parts: list[Part]) -> Part:
+def join(parts: list[Geometry]) -> Geometry:
     """Join parts."""
     first = np.cumsum([0] + [len(part.vertices) for part in parts])
-    return Part(
+    return Geometry(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.triangles + at for part, at in zip(parts, first, strict=False)]),
         np.concatenate([part.uv for part in parts]),

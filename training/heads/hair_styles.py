@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import interpolate, ndimage
 
 from kouxing.training.heads.hair import SKULL, Locks, Sheet, join
-from kouxing.training.heads.parts import Part
+from kouxing.training.heads.parts import Geometry
 
 Float = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Bob:
     length: float = 1.06  # from the ears to the tips, dm
     turn_in: float = 0.17  # how far the tips turn toward the neck, dm
 
-    def parts(self, scalp: Float) -> dict[str, Part]:
+    def parts(self, scalp: Float) -> dict[str, Geometry]:
         """Make the opaque body of the hair and the locks over it."""
         bodies, locks = [], []
         rng = np.random.default_rng(1)
@@ -175,7 +175,7 @@ class Crop:
         points[:, 1] -= 0.10 * self.ends * np.clip(t - 0.7, 0, 1)
         return Sheet(points.reshape(rows, columns, 3)), 0.78 * line
 
-    def parts(self, scalp: Float) -> dict[str, Part]:
+    def parts(self, scalp: Float) -> dict[str, Geometry]:
         """Make the opaque body of the hair and the locks over it."""
         rng = np.random.default_rng(3)
         sheet, reach = self._sheet(scalp)
@@ -234,7 +234,7 @@ class Crop:
         return 0.5 * np.clip((line - polar) / 0.2 + 0.6, 0, 1)
 
 
-def _bun(radius: float, rng: np.random.Generator) -> Part:
+def _bun(radius: float, rng: np.random.Generator) -> Geometry:
     rows, columns = 41, 24
     turn = np.linspace(0, 2 * np.pi, rows)[:, None]
     polar = np.linspace(0.02, np.pi - 0.02, columns)[None, :]

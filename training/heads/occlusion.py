@@ -14,7 +14,7 @@ from kouxing.services.driver.render.renderer import standalone_context
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.hair_styles import Hair
 from kouxing.training.heads.measures import neckline_height
-from kouxing.training.heads.parts import Piece
+from kouxing.training.heads.parts import HeadPiece
 
 Float = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ _OPEN = {
 }  # fmt: skip
 
 
-def _opened(piece: Piece) -> Float:
+def _opened(piece: HeadPiece) -> Float:
     vertices = piece.part.vertices.copy()
     for fap, value in _OPEN.items():
         if fap in piece.fields:
@@ -95,7 +95,7 @@ def _opened(piece: Piece) -> Float:
     return vertices
 
 
-def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: Hair) -> None:
+def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_], hair: Hair) -> None:
     """Bake the ambient occlusion into the vertex colors of a head's pieces; the first is the skin.
 
     ``layout`` (V, 3) are the skin's vertices on the reference head, dm. ``cavity`` (V,) are those

@@ -26,7 +26,7 @@ Index = NDArray[np.int64]
 
 
 @dataclass(slots=True)
-class Part:
+class Geometry:
     """Geometry of one piece of the head."""
 
     vertices: Float  # (V, 3)
@@ -52,7 +52,7 @@ EYE_RINGS = np.radians([0.0, 5.0, 9.5, 13.0, 17.0, 21.0, 25.0, 30.0, 38.0, 48.0,
 _EYE_SEGMENTS = 32
 
 
-def eyeball(center: Float, radius: float) -> Part:
+def eyeball(center: Float, radius: float) -> Geometry:
     """Make a sphere, open at the back; its texture is a view from the front."""
     turn = np.linspace(0.0, 2 * np.pi, _EYE_SEGMENTS + 1)
     angle, turn = np.meshgrid(EYE_RINGS, turn, indexing="ij")
@@ -64,10 +64,10 @@ def eyeball(center: Float, radius: float) -> Part:
     reach = (angle / EYE_RINGS[-1]).ravel()  # the texture's radius is proportional to the angle
     uv = 0.5 + 0.5 * np.stack([reach * np.cos(turn).ravel(), -reach * np.sin(turn).ravel()], axis=1)
     triangles = grid_triangles(*angle.shape)
-    return Part(vertices, triangles, uv, np.ones((len(vertices), 3)))
+    return Geometry(vertices, triangles, uv, np.ones((len(vertices), 3)))
 
 
-def pupil_growth(part: Part, center: Float) -> Float:
+def pupil_growth(part: Geometry, center: Float) -> Float:
     """Return radial directions (V, 3), of unit length at the pupil's edge, for FAPs 29 and 30."""
     angle = np.repeat(EYE_RINGS, _EYE_SEGMENTS + 1)
     weight = np.interp(angle, [0.0, PUPIL_ANGLE, IRIS_ANGLE], [0.0, 1.0, 0.0])
@@ -98,7 +98,7 @@ _PROFILE = np.array(
 )
 
 
-def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: float) -> Part:
+def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: float) -> Geometry:
     """Sweep the profile of a tooth along the dental arch.
 
     ``widths`` are those of one half in mm, outward. The cutting edge of the front teeth is at
@@ -146,10 +146,10 @@ def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: floa
     shade = np.clip(1.0 - 0.95 * np.tile(back, len(rows)) ** 1.2, 0.06, 1.0)
     by_row = np.interp(_PROFILE[:, 2], [0.0, 0.3, 0.7, 1.0], [0.45, 0.9, 1.0, 0.4])
     shade *= np.repeat(by_row, columns)
-    return Part(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))
+    return Geometry(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))
 
 
-def middle_of_teeth(row: Part) -> tuple[int, int]:
+def middle_of_teeth(row: Geometry) -> tuple[int, int]:
     """Find the vertices between the middle teeth, at the cutting edge and at the gum."""
     columns = len(row.vertices) // len(_PROFILE)
     edge = int(np.argmin(np.abs(_PROFILE[:, 1])))
@@ -160,11 +160,11 @@ TRANSPARENT = ("hair_tips", "lashes")
 
 
 @dataclass(slots=True)
-class Piece:
+class HeadPiece:
     """A part with its material and motion."""
 
     name: str
-    part: Part
+    part: Geometry
     texture: str
     roughness: float
     head_weight: Float  # (V,)
@@ -175,7 +175,7 @@ class Piece:
 
 def write(
     output: Path,
-    pieces: list[Piece],
+    pieces: list[HeadPiece],
     textures: dict[str, bytes],
     skin: Skin,
     tongue: Skin,
@@ -270,7 +270,7 @@ def write(
     np.savez_compressed(output, allow_pickle=False, **arrays)
 
 
-def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[Piece]:
+def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[HeadPiece]:
     """Make the eyeballs; they can move forward, and their pupils can grow."""
     pieces = []
     for row, name in enumerate(("eye_left", "eye_right")):
@@ -281,11 +281,11 @@ def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[
             27 + row: np.tile([0.0, 0.0, fapu["ES"]], (count, 1)),
             29 + row: pupil_growth(part, center) * fapu["IRISD"] / 2,
         }
-        pieces.append(Piece(name, part, "eye", 0.12, np.ones(count), fields))
+        pieces.append(HeadPiece(name, part, "eye", 0.12, np.ones(count), fields))
     return pieces
 
 
-def teeth_pieces(fapu: dict[str, float]) -> list[Piece]:
+def teeth_pieces(fapu: dict[str, float]) -> list[HeadPiece]:
     """Make the upper and the lower teeth; the lower teeth move with the jaw."""
     pieces = []
     for name, widths, edge, front, up in (
@@ -295,11 +295,11 @@ def teeth_pieces(fapu: dict[str, float]) -> list[Piece]:
         part = tooth_row(widths, edge, front, up)
         still = np.ones(len(part.vertices))
         fields = jaw_fields(part.vertices, still, fapu) if up < 0 else {}
-        pieces.append(Piece(name, part, name, 0.35, still, fields))
+        pieces.append(HeadPiece(name, part, name, 0.35, still, fields))
     return pieces
 
 
-def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
+def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> HeadPiece:
     """Make the tongue: wide, flat behind the lower teeth, grooved along its middle."""
     x, y, z = tongue.vertices.T
     top = np.clip((y - 5.15) / 0.05, 0, 1)
@@ -308,8 +308,8 @@ def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
     sunk = 0.110 - 0.052 * to_tip**2 + groove + 0.02 * np.abs(x) / 0.19
     points = np.stack([1.28 * x, y - sunk, z - 0.03], axis=1)
     uv = np.clip(points[:, [0, 2]] * [1.8, 1.4] + [0.5, -0.65], 0, 1)
-    part = Part(points, subdivision.triangles_of(tongue.quads), uv, np.ones_like(points))
-    return Piece(
+    part = Geometry(points, subdivision.triangles_of(tongue.quads), uv, np.ones_like(points))
+    return HeadPiece(
         "tongue",
         part,
         "tongue",

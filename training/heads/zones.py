@@ -112,7 +112,7 @@ def smoothest(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
     return surface.smoothest(skin.vertices, subdivision.triangles_of(skin.quads), points, fixed)
 
 
-def _along(fap: int, weight: Float) -> Float:
+def _axis_field(fap: int, weight: Float) -> Float:
     """Make a field (V, 3) along the axis of a FAP."""
     axis, sign = axis_of(fap)
     field = np.zeros((len(weight), 3))
@@ -147,7 +147,7 @@ class FaceFields:
         self._zones()
 
     def _add(self, fap: int, weight: Float) -> None:
-        self.fields[fap] = _along(fap, weight) * self.fapu[FAPS[fap - 1].fapu]
+        self.fields[fap] = _axis_field(fap, weight) * self.fapu[FAPS[fap - 1].fapu]
 
     def _far(self, names: tuple[str, ...], reach: float) -> NDArray[np.bool_]:
         return self._geodesics.distance(self.skin.points(*names)) > reach
@@ -297,8 +297,8 @@ def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
     at_tip = geodesics.zone(tip, np.concatenate([body, root]))
     near = geodesics.distance(body)
     at_body = geodesics.zone(np.flatnonzero(near < 0.04), np.concatenate([tip, root]))
-    fields = {fap: _along(fap, at_tip) * fapu[FAPS[fap - 1].fapu] for fap in (43, 44, 45)}
-    fields[46] = _along(46, at_body) * fapu["MNS"]
+    fields = {fap: _axis_field(fap, at_tip) * fapu[FAPS[fap - 1].fapu] for fap in (43, 44, 45)}
+    fields[46] = _axis_field(46, at_body) * fapu["MNS"]
     half = np.abs(tongue.vertices[edges, 0]).mean()
     roll = np.zeros_like(tongue.vertices)
     reach = np.clip((z - z.min()) / (0.5 * length), 0, 1)
@@ -314,7 +314,7 @@ def jaw_fields(
     """Compute the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
     lever = share * np.maximum(vertices[:, 2] - _HINGE_Z, 0) / (chin_z - _HINGE_Z)
     return {
-        3: _along(3, lever) * fapu["MNS"],
-        14: _along(14, share) * fapu["MNS"],
-        15: _along(15, lever) * fapu["MW"],
+        3: _axis_field(3, lever) * fapu["MNS"],
+        14: _axis_field(14, share) * fapu["MNS"],
+        15: _axis_field(15, lever) * fapu["MW"],
     }

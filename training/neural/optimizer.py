@@ -44,7 +44,7 @@ class Optimizer(Generic[N]):
         mean_exponent: int,
     ) -> None:
         self._network = network
-        self._averaged = AveragedModel(network, avg_fn=_late_mean(mean_exponent))
+        self._averaged = AveragedModel(network, avg_fn=_weight_average(mean_exponent))
         self._averaged.eval()
         self._adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
         self._rates = [group["lr"] for group in self._adam.param_groups]
@@ -108,7 +108,9 @@ class Optimizer(Generic[N]):
         return {"network": self._network, "averaged": self._averaged, "optimizer": self._adam}
 
 
-def rise_and_fall(step: int, num_steps: int, warm_up_steps: int, falling: float) -> float:
+def warm_up_and_decay_factor(
+    step: int, num_steps: int, warm_up_steps: int, falling: float
+) -> float:
     """Learning-rate factor: a linear rise, and a fall to 0 in the last fraction of the steps."""
     rise = min(1.0, (step + 1) / warm_up_steps)
     return rise * min(1.0, (num_steps - step) / (falling * num_steps))
@@ -122,7 +124,7 @@ def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tens
     return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
 
 
-def _late_mean(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
+def _weight_average(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
     def updated(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
         factor = (exponent + 1) / (int(num_before) + exponent + 2)
         return mean + factor * (weights - mean)

@@ -124,7 +124,7 @@ def train_neural(
         errors=errors,
         chosen=chosen,
     )
-    errors.print_to(report)
+    errors.report_to(report)
 
 
 def train_network(

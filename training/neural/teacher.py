@@ -50,7 +50,7 @@ from kouxing.training.neural.batches import (
     sampling_probs,
 )
 from kouxing.training.neural.network import Encoder, Readout, ReadoutShape, Shape, mixed_precision
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy, rise_and_fall
+from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
 from kouxing.training.training_set import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder
@@ -158,7 +158,7 @@ def train_teacher(
 
     trained = optimizer.train(
         loss,
-        lambda step: rise_and_fall(step, _NUM_STEPS, _WARM_UP_STEPS, _FALLING),
+        lambda step: warm_up_and_decay_factor(step, _NUM_STEPS, _WARM_UP_STEPS, _FALLING),
         num_steps=_NUM_STEPS,
         seed=seed,
         report=lambda line: report(f"teacher, {line}"),

@@ -235,7 +235,7 @@ def train_phone_lm(
     write_archive(output, phone_lm_arrays(phone_lm))
     levels = phone_lm.levels
     sizes = ", ".join(f"{end - first}" for first, end in pairwise(levels[1:]))
-    errors.print_to(report)
+    errors.report_to(report)
     report(f"n-grams of 1 to {len(levels) - 2} phones kept: {sizes}")
 
 

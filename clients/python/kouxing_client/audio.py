@@ -15,9 +15,10 @@ _CODES = {"s16le": "h", "f32le": "f"}
 _FULL_SCALE = 32767
 RESEND_S = 10.0  # acknowledged audio that is kept in case another recognizer needs it
 MAX_KEPT = 5000  # messages
-ANSWER_S = (0.6, 10.0)  # shortest and longest wait for an acknowledgement before reconnecting
+# Shortest and longest wait for an acknowledgement before reconnecting
+ANSWER_LIMITS_S = (0.6, 10.0)
 UNPACED_ANSWER_S = 5.0  # shortest wait if audio arrives faster than real time and may queue
-NEAREST_MS = 50  # shortest limit for making a connection
+MIN_CONNECT_MS = 50  # shortest limit for making a connection
 QUICK_ANSWER_S = 2.5  # up to this wait, the round trip measured before limits a new connection
 MAX_TIMED = 200  # messages whose send time is remembered
 
@@ -73,7 +74,7 @@ class AudioStream:
         self._next = 1  # number of the next message for the socket
         self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED)  # sequence and time
         self._progress_s = 0.0  # time of the last acknowledgement, or of the first open message
-        self._min_answer_s = ANSWER_S[0] if is_paced else UNPACED_ANSWER_S
+        self._min_answer_s = ANSWER_LIMITS_S[0] if is_paced else UNPACED_ANSWER_S
         self._answer_s = self._min_answer_s  # how long to wait before reconnecting
 
     @property
@@ -129,7 +130,7 @@ class AudioStream:
         while self._sent_s and self._sent_s[0][0] <= sequence:
             number, sent_s = self._sent_s.popleft()
             if number == sequence:
-                measured_ms = max(round(2e3 * (now_s - sent_s)), NEAREST_MS)
+                measured_ms = max(round(2e3 * (now_s - sent_s)), MIN_CONNECT_MS)
                 self.round_trip_ms = min(measured_ms, self.round_trip_ms or measured_ms)
         self.acknowledged = min(sequence, self.sequence)
         self._progress_s = now_s
@@ -141,7 +142,7 @@ class AudioStream:
 
     def resend(self, now_s: float) -> None:
         """Send unacknowledged messages again, and wait longer for the next acknowledgement."""
-        self._answer_s = min(2 * self._answer_s, ANSWER_S[1])
+        self._answer_s = min(2 * self._answer_s, ANSWER_LIMITS_S[1])
         self._next = self.acknowledged + 1
         self._progress_s = now_s
 

@@ -131,7 +131,8 @@ class Session(BaseSession):
         ----------
         audio
             Bytes of PCM in the session's encoding, of any length, or numbers (16-bit integers, or
-            floats within ±1): a list, an ``array`` or a NumPy array of shape ``(n,)`` or ``(n, channels)``.
+            floats within ±1): a list, an ``array`` or a NumPy array of shape ``(n,)`` or
+            ``(n, channels)``.
         timeout_s
             How long to wait until the recognizer takes more audio; None: without limit.
 

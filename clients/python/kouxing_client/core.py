@@ -126,7 +126,7 @@ class ClientCore:
         now_s = self._sockets.now_s
         for name, request in list(self._requests.items()):
             if now_s > request.end_s:
-                self._requests.pop(name).answer.set_exception(KouxingError(self._no_answer()))
+                self._requests.pop(name).answer.set_exception(KouxingError(self._timeout_error()))
             elif now_s >= request.retry_s:
                 self._send(request)
         for session in list(self.sessions):
@@ -160,7 +160,7 @@ class ClientCore:
             self._commands = self._connect()
             self._sockets.send(self._commands, request.parts)
 
-    def _no_answer(self) -> str:
+    def _timeout_error(self) -> str:
         address, _, key = self._control.partition(" ")
         if not self._is_refused:
             return f"control at {address} does not answer. Start it with 'kouxing run'"
@@ -236,14 +236,14 @@ class ClientCore:
         for inbox in self._inboxes.get(event.session, ()):
             inbox.add(event)
         if event.name == "session-closed":
-            for session in self._sessions_called(event.session):
-                session.close_soon(event.detail)
+            for session in self._sessions_named(event.session):
+                session.close_after_results(event.detail)
 
     def _on_moved(self, fields: Fields) -> None:
-        for session in self._sessions_called(fields["session"]):
+        for session in self._sessions_named(fields["session"]):
             session.move(fields)
 
-    def _sessions_called(self, name: str) -> list[SessionCore]:
+    def _sessions_named(self, name: str) -> list[SessionCore]:
         return [session for session in self.sessions if session.name == name]
 
 

@@ -99,7 +99,7 @@ class Follower:
         self._on_new_epoch = on_new_epoch
         self._connection: object | None = None
         self._old_connection: object | None = None  # open until the new one is complete, or longer
-        self._close_old_s = math.inf
+        self._close_old_due_s = math.inf
         self._retry_s = math.inf
         self._addresses: set[str] = set()
         self._live_addresses: set[str] = set()
@@ -138,10 +138,10 @@ class Follower:
             self._transport.close_connection(replaced)  # so far, only the old one works
             self._stays = self._stays and stays
         else:
-            self._close_old()
+            self._close_old_connection()
             self._old_connection, self._stays = replaced, stays
             self._newest_before, self._seen = dict(self._newest), set()
-        self._close_old_s = math.inf
+        self._close_old_due_s = math.inf
         self._first_epoch = self._first_epoch or epoch
         self.epoch = self.epoch or epoch
         self._subscribe()
@@ -149,18 +149,18 @@ class Follower:
     def tick(self) -> None:
         """Subscribe again, or close the old connection, if it is time; call this regularly."""
         now_s = self._transport.now_s
-        if now_s >= self._close_old_s:
-            self._close_old()
+        if now_s >= self._close_old_due_s:
+            self._close_old_connection()
         if self._connection is not None and now_s >= self._retry_s:
             self._transport.close_connection(self._connection)
             self._subscribe()
 
     def drain(self) -> None:
         """Pass on all messages that have arrived."""
-        self._close_old()
+        self._close_old_connection()
         if self._connection is not None:
             self._transport.drain(self._connection)
-        self._release_held()
+        self._deliver_held()
 
     def close(self) -> None:
         """Unsubscribe; no message is passed on any more."""
@@ -169,7 +169,7 @@ class Follower:
                 self._transport.close_connection(connection)
         self._connection = self._old_connection = None
         self.is_complete = False
-        self._retry_s = self._close_old_s = math.inf
+        self._retry_s = self._close_old_due_s = math.inf
 
     def _subscribe(self) -> None:
         confirmed = self._confirmed = set()
@@ -183,9 +183,9 @@ class Follower:
             lambda message: self._on_arrival(message, confirmed),
         )
 
-    def _close_old(self) -> None:
+    def _close_old_connection(self) -> None:
         """Take what the old connection has received, and close it."""
-        self._close_old_s = math.inf
+        self._close_old_due_s = math.inf
         if (connection := self._old_connection) is None:
             return
         self._transport.drain(connection)
@@ -200,13 +200,13 @@ class Follower:
         elif self._live and message.kind == "fap-frame" and self._is_catching_up():
             self._held_frames.append(message)
         else:
-            self._release_held()
+            self._deliver_held()
             self._accept(message)
 
     def _is_catching_up(self) -> bool:
         return self._transport.now_s < self._transport.resumed_at_s + CATCH_UP_S
 
-    def _release_held(self) -> None:
+    def _deliver_held(self) -> None:
         while self._held_frames:
             self._accept(self._held_frames.popleft())
 
@@ -218,7 +218,7 @@ class Follower:
         if len(confirmed) >= len(self._addresses):
             self.is_complete = True
             self._retry_s = math.inf
-            self._close_old_s = self._transport.now_s + (KEEP_S if self._stays else 0.0)
+            self._close_old_due_s = self._transport.now_s + (KEEP_S if self._stays else 0.0)
             self.tick()
             self._on_complete()
 

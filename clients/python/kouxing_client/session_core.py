@@ -23,7 +23,7 @@ from kouxing_client.messages import (
 if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
-REJOIN_S = 1.0  # how long audio waits until subscriptions are in effect again
+RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
 MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may take to move
 LAST_S = 0.5  # for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
@@ -166,7 +166,7 @@ class SessionCore:
         self.is_blocked = False  # the audio socket takes no more
         self._audio: Connection | None = None
         self._subscriptions: list[Subscription] = []
-        self._rejoin_end_s = 0.0  # until then audio waits for subscriptions
+        self._resubscribe_end_s = 0.0  # until then audio waits for subscriptions
         self._unknown: tuple[float, Refused] | None = None  # its recognizer does not know it
         self._closing: tuple[float, str] | None = None  # deadline and reason of control
 
@@ -189,7 +189,7 @@ class SessionCore:
     def send_audio(self) -> None:
         """Give the socket as much audio as it takes, unless audio waits for subscriptions."""
         self.is_blocked = False
-        if self.stream is None or self._audio is None or self._is_rejoining():
+        if self.stream is None or self._audio is None or self._is_resubscribing():
             return
         for message in self.stream.unsent():
             parts = encode("audio-chunk", self.name, {**message, "epoch": self.epoch})
@@ -248,7 +248,7 @@ class SessionCore:
                 self._reconnect(self.stream)
             self.send_audio()
 
-    def close_soon(self, reason: str) -> None:
+    def close_after_results(self, reason: str) -> None:
         """End after the last results have arrived: control has closed the session."""
         self._closing = self._closing or (self.sockets.now_s + LAST_S, reason)
 
@@ -273,13 +273,13 @@ class SessionCore:
         self.sockets.connect_ms = usual_ms
 
     def _subscribe_again(self) -> None:
-        self._rejoin_end_s = self.sockets.now_s + REJOIN_S
+        self._resubscribe_end_s = self.sockets.now_s + RESUBSCRIBE_S
         for subscription in self._subscriptions:
             subscription.start()
 
-    def _is_rejoining(self) -> bool:
+    def _is_resubscribing(self) -> bool:
         """Return whether audio waits for subscriptions, so that no frame of it is missed."""
-        return self.sockets.now_s < self._rejoin_end_s and not all(
+        return self.sockets.now_s < self._resubscribe_end_s and not all(
             subscription.follower.is_complete for subscription in self._subscriptions
         )
 

@@ -40,7 +40,7 @@ from kouxing.services.driver.head.glb_document import (
     MAX_SHORT_VERTICES,
     GlbDocument,
 )
-from kouxing.services.driver.head.head import ASSETS, Head, Part
+from kouxing.services.driver.head.head import ASSETS, Head, HeadPart
 from kouxing.services.driver.head.morphs import (
     ARKIT_MORPHS,
     AVATAR_MORPHS,
@@ -100,7 +100,7 @@ def export_glb(
     nodes: dict[str, int] = {}
     for part in head.parts:
         nodes[part.name] = _part_node(document, head, part, textures, morphs)
-    carriers = {part.name: _carrier(head, part) for part in head.parts}
+    carriers = {part.name: _attachment(head, part) for part in head.parts}
     on_head, on_body, skinned = (
         [nodes[name] for name, carrier in carriers.items() if carrier == kind]
         for kind in ("head", "body", "both")
@@ -124,7 +124,7 @@ def export_glb(
         Path(path),
         scene=0,
         scenes=[{"name": head.name, "nodes": [nodes["kouxing"], *skinned], "extras": extras}],
-        **(_avatar(document, head, nodes) if is_avatar else {}),
+        **(_vrm_extension(document, head, nodes) if is_avatar else {}),
     )
 
 
@@ -139,7 +139,7 @@ def _add_skeleton(document: GlbDocument, nodes: dict[str, int]) -> None:
             entries[nodes[parent]].setdefault("children", []).append(nodes[bone])
 
 
-def _avatar(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
+def _vrm_extension(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
     """Return the VRM extension."""
     bindings: dict[str, list[tuple[int, int]]] = {morph.name: [] for morph in AVATAR_MORPHS}
     for number, node in enumerate(document.json["nodes"]):
@@ -198,7 +198,7 @@ def _rotation(node: str, faps: NDArray[np.float32]) -> NDArray[np.float64]:
     return quaternions
 
 
-def _carrier(head: Head, part: Part) -> str:
+def _attachment(head: Head, part: HeadPart) -> str:
     """Return what a part is attached to: "head", "body", or "both" (the neck)."""
     share = np.round(head.head_weight[part.vertices] * 255)
     return "head" if share.min() == 255 else "body" if share.max() == 0 else "both"
@@ -209,7 +209,11 @@ def _parent(name: str, children: list[int]) -> dict[str, Any]:
 
 
 def _part_node(
-    document: GlbDocument, head: Head, part: Part, textures: dict[str, int], morphs: Sequence[Morph]
+    document: GlbDocument,
+    head: Head,
+    part: HeadPart,
+    textures: dict[str, int],
+    morphs: Sequence[Morph],
 ) -> int:
     vertices = head.vertices[part.vertices]
     node: dict[str, Any] = {"name": part.name}
@@ -227,7 +231,7 @@ def _part_node(
             np.round(colors * 65535).astype(np.uint16), "VEC4", normalized=True
         ),
     }
-    if _carrier(head, part) == "both":
+    if _attachment(head, part) == "both":
         share = np.round(head.head_weight[part.vertices] * 255).astype(np.uint8)
         joints, weights = np.zeros((2, len(vertices), 4), np.uint8)
         joints[:, 1] = share > 0  # an unused joint must be 0
@@ -260,7 +264,7 @@ def _part_node(
     return document.add("nodes", node)
 
 
-def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
+def _material(part: HeadPart, textures: dict[str, int]) -> dict[str, Any]:
     wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
     material: dict[str, Any] = {
         "name": part.name,
@@ -279,7 +283,7 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
 
 
 def _targets(
-    document: GlbDocument, head: Head, part: Part, morphs: Sequence[Morph]
+    document: GlbDocument, head: Head, part: HeadPart, morphs: Sequence[Morph]
 ) -> tuple[list[dict[str, int]], list[str]]:
     """Return the morph targets of a part, and their names."""
     count = part.vertices.stop - part.vertices.start

@@ -30,7 +30,7 @@ from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
 from kouxing.services.driver.head.head import Head, assemble
 from kouxing.services.driver.head.morphs import units_per_weight
-from kouxing.services.driver.head.pieces import Fields, Piece, pack, part_names
+from kouxing.services.driver.head.pieces import Fields, Primitive, pack, part_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shape_names import choose_set, find_shapes
@@ -72,7 +72,7 @@ def read_glb(path: Path) -> Head:
         raise UserError(f"{path} is damaged or is not a GLB file ({error!r})") from error
 
 
-def _recognize(pieces: list[Piece]) -> Names:
+def _recognize(pieces: list[Primitive]) -> Names:
     """Keep the known shapes of the pieces under their standard names; return their FAPs.
 
     Raises ``BadGlbError`` if the shapes cannot express speech.
@@ -113,11 +113,13 @@ def _recognize(pieces: list[Piece]) -> Names:
 # --- the head -------------------------------------------------------------------------------------
 
 
-def _head(name: str, glb: Glb, pieces: list[Piece], known: Names) -> Head:
+def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
     names = part_names(pieces)
     _check_single_face(pieces, known)
     eyes = _eyes(glb, pieces, names)
-    turn = _upright(eyes, _moved(pieces, [name for name in known if not _NOT_MOUTH.match(name)]))
+    turn = _upright(
+        eyes, _moved_center(pieces, [name for name in known if not _NOT_MOUTH.match(name)])
+    )
     for piece in pieces:
         piece.vertices = piece.vertices @ turn.T
         piece.shapes = {name: shift @ turn.T for name, shift in piece.shapes.items()}
@@ -160,7 +162,7 @@ def fade(height: Float64) -> Float64:
     return faded
 
 
-def _check_single_face(pieces: list[Piece], known: Names) -> None:
+def _check_single_face(pieces: list[Primitive], known: Names) -> None:
     """Raise ``BadGlbError`` if two meshes far from each other have a mouth."""
     opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
     places: list[Float64] = []
@@ -192,7 +194,7 @@ def _upright(eyes: Float64, mouth: Float64 | None) -> Float64:
     return turn
 
 
-def _eyes(glb: Glb, pieces: list[Piece], names: list[str]) -> Float64:
+def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
     """Return the centers of the left and right eye (2, 3), from bones, eyeballs, lids or mouth."""
     bones = {bone: number for number, bone in find_bones(glb).items()}
     places = dict(glb.nodes())
@@ -203,7 +205,7 @@ def _eyes(glb: Glb, pieces: list[Piece], names: list[str]) -> Float64:
             for piece, name in zip(pieces, names, strict=True)
             if name.startswith(f"eye_{side}")
         ]
-        lids = _moved(pieces, [f"eyeBlink{side.title()}", f"blink{side.title()}"])
+        lids = _moved_center(pieces, [f"eyeBlink{side.title()}", f"blink{side.title()}"])
         if bones.get(f"{side}Eye") in places:
             centers.append(places[bones[f"{side}Eye"]][:3, 3])
         elif balls:
@@ -213,7 +215,7 @@ def _eyes(glb: Glb, pieces: list[Piece], names: list[str]) -> Float64:
             centers.append(lids)
     if len(centers) == 2:
         return np.array(centers)
-    mouth = _moved(pieces, [name for piece in pieces for name in piece.shapes])
+    mouth = _moved_center(pieces, [name for piece in pieces for name in piece.shapes])
     skin = max((piece for piece in pieces if piece.shapes), key=lambda piece: len(piece.vertices))
     near = np.abs(skin.vertices[:, 1] - (mouth if mouth is not None else skin.vertices.mean(0))[1])
     width = np.ptp(skin.vertices[near < np.quantile(near, 0.5), 0])
@@ -225,7 +227,7 @@ def _eyes(glb: Glb, pieces: list[Piece], names: list[str]) -> Float64:
     return np.stack([middle + half, middle - half])
 
 
-def _moved(pieces: list[Piece], names: list[str]) -> Float64 | None:
+def _moved_center(pieces: list[Primitive], names: list[str]) -> Float64 | None:
     """Return the mean position of the vertices that some shapes move."""
     total, place = 0.0, np.zeros(3)
     for piece in pieces:
@@ -247,7 +249,7 @@ def _pivot(glb: Glb, turn: Float64, middle: Float64, unit: float) -> Float64:
     return middle + PIVOT * unit
 
 
-def _head_weight(pieces: list[Piece], height: Float64) -> Float64:
+def _head_weight(pieces: list[Primitive], height: Float64) -> Float64:
     """Return the share (V,) of the head rotation; heights above the eyes are in eye distances."""
     shares = [piece.head_weight for piece in pieces if piece.head_weight is not None]
     return np.concatenate(shares) if len(shares) == len(pieces) else fade(height)
@@ -268,7 +270,7 @@ def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:
     return dict(zip(names, weights, strict=True))
 
 
-def _fields(piece: Piece, weights: dict[str, Float64]) -> Fields:
+def _fields(piece: Primitive, weights: dict[str, Float64]) -> Fields:
     """Return the displacements (V, 3) of a piece by one unit of each FAP, m."""
     names = [name for name in piece.shapes if name in weights]
     if not names:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
-from kouxing.services.driver.head.pieces import Piece
+from kouxing.services.driver.head.pieces import Primitive
 from kouxing.shared.errors import UserError
 
 MAX_VERTICES = 300_000
@@ -26,13 +26,13 @@ MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
 
 
-def read_pieces(glb: Glb) -> list[Piece]:
+def read_pieces(glb: Glb) -> list[Primitive]:
     """Return the triangles of the scene with everything that moves them."""
     nodes = glb.nodes()
     places = dict(nodes)
     turn_shares = _turn_shares(glb, places)
     expressions = _expressions(glb)
-    pieces: list[Piece] = []
+    pieces: list[Primitive] = []
     num_vertices = num_triangles = num_shifts = 0
     for number, place in nodes:
         node = glb.item("nodes", number)
@@ -65,7 +65,7 @@ def read_pieces(glb: Glb) -> list[Piece]:
     return pieces
 
 
-def _check_textures(pieces: list[Piece]) -> None:
+def _check_textures(pieces: list[Primitive]) -> None:
     """Decode every texture once; formats outside the glTF core are converted to PNG."""
     known = {b"": b""}
     num_pixels = 0
@@ -143,7 +143,7 @@ def _piece(
     place: Float64,
     turn_shares: dict[int, float],
     binds: Binds,
-) -> Piece:
+) -> Primitive:
     material = glb.item("materials", primitive["material"]) if "material" in primitive else {}
     base, uv_name = _texture(material)
     attributes = glb.attributes(
@@ -174,7 +174,7 @@ def _piece(
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
             raise BadGlbError("a coordinate or color is not finite or very large")
-    return Piece(
+    return Primitive(
         name=str(node.get("name") or mesh.get("name") or "part"),
         vertices=vertices,
         triangles=_corners(index, primitive.get("mode", 4)),

@@ -48,7 +48,7 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class HeadPart:
     """A range of vertices and triangles with one material."""
 
     name: str
@@ -65,7 +65,7 @@ class Head:
     """A head with V vertices and F triangles that FAPs move."""
 
     name: str
-    parts: tuple[Part, ...]  # skin, garment, eyes, teeth, tongue, hair, lashes
+    parts: tuple[HeadPart, ...]  # skin, garment, eyes, teeth, tongue, hair, lashes
     vertices: Float32  # (V, 3), neutral face, m
     triangles: NDArray[np.uint32]  # (F, 3), counter-clockwise from outside
     coarse_triangles: tuple[NDArray[np.uint32], ...]  # of each part in the coarse head, (C, 3)
@@ -110,27 +110,27 @@ class Head:
                 f"{file} is damaged or is not a head ({error}); make one with kouxing head import"
             ) from error
 
-    def part(self, name: str) -> Part:
+    def part(self, name: str) -> HeadPart:
         """Return a part by name."""
         return next(part for part in self.parts if part.name == name)
 
     def deform(self, faps: Float32) -> Float32:
         """Return the vertices (V, 3), m, moved by FAPs (68,); FAPs 1 and 2 are ignored."""
-        return self._turn(self._bend(faps), faps, points=True)
+        return self._rotate(self._displace(faps), faps, points=True)
 
     def pose(self, faps: Float32) -> tuple[Float32, Float32]:
         """Return the vertices moved by FAPs (68,), and their normals, both (V, 3)."""
-        vertices = self._bend(faps)
+        vertices = self._displace(faps)
         normals = self.shading.normals(vertices)
-        return self._turn(vertices, faps, points=True), self._turn(normals, faps, points=False)
+        return self._rotate(vertices, faps, points=True), self._rotate(normals, faps, points=False)
 
-    def _bend(self, faps: Float32) -> Float32:
+    def _displace(self, faps: Float32) -> Float32:
         if faps.shape != (NUM_FAPS,):
             raise ValueError(f"expected FAPs of shape ({NUM_FAPS},), got {faps.shape}")
         moved: Float32 = self.basis @ np.asarray(faps, dtype=np.float32)
         return self.vertices + moved.reshape(-1, 3)
 
-    def _turn(self, rows: Float32, faps: Float32, *, points: bool) -> Float32:
+    def _rotate(self, rows: Float32, faps: Float32, *, points: bool) -> Float32:
         """Rotate eyeballs and head; ``rows`` are points or normals."""
         angle = np.asarray(faps, dtype=np.float64) * RADIANS_PER_ANGLE_UNIT
         for side, (name, yaw, pitch) in enumerate((("eye_left", 23, 25), ("eye_right", 24, 26))):
@@ -185,7 +185,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         coarse_triangles.append(coarse_part.astype(np.uint32))
         from_vertex = int(place[first[row]])
         parts.append(
-            Part(
+            HeadPart(
                 name=str(part_name),
                 vertices=slice(from_vertex, from_vertex + int(ends[row] - first[row])),
                 triangles=slice(num_triangles, num_triangles + len(part_triangles)),

@@ -69,10 +69,10 @@ class FaceFields:
 
     def jaw_fields(self, vertices: Float) -> Fields:
         """Return the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
-        lever = self._lever(vertices[:, 2])
+        lever = self._jaw_share(vertices[:, 2])
         whole = np.ones(len(vertices))
         moved = {3: lever, 14: whole, 15: lever}
-        return {fap: self._along(fap, weight) for fap, weight in moved.items()}
+        return {fap: self._axis_field(fap, weight) for fap, weight in moved.items()}
 
     def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> Fields:
         """Return the fields (R, 3) of a tongue, ``rows`` (R,) of a mesh, without the jaw's motion.
@@ -86,21 +86,21 @@ class FaceFields:
         beyond = np.clip((along - middle) / max(1 - middle, 1e-9), 0, 1)
         at_tip = 0.5 - 0.5 * np.cos(np.pi * beyond)
         hump = 0.5 + 0.5 * np.cos(np.pi * np.clip((along - middle) / max(middle, 1e-9), -1, 0))
-        fields = {fap: self._along(fap, at_tip) for fap in (43, 44, 45)}
-        fields[46] = self._along(46, hump * (1 - at_tip))
+        fields = {fap: self._axis_field(fap, at_tip) for fap in (43, 44, 45)}
+        fields[46] = self._axis_field(46, hump * (1 - at_tip))
         return fields
 
-    def _at(self, name: str) -> Float:
+    def _point(self, name: str) -> Float:
         place: Float = self._vertices[self._points[name]]
         return place
 
-    def _all(self, *names: str) -> Index:
+    def _points_named(self, *names: str) -> Index:
         return np.array([self._points[name] for name in names if name in self._points], np.int64)
 
     def _distance(self, *names: str) -> Float:
-        return self._geodesics.distance(self._all(*names))
+        return self._geodesics.distance(self._points_named(*names))
 
-    def _along(self, fap: int, weight: Float) -> Float:
+    def _axis_field(self, fap: int, weight: Float) -> Float:
         """Return a field (V, 3) along the axis of a FAP."""
         entry = FAPS[fap - 1]
         axis, sign = AXES[entry.direction]
@@ -109,7 +109,7 @@ class FaceFields:
         return field
 
     def _add(self, fap: int, weight: Float) -> None:
-        self.fields[fap] = self._along(fap, weight)
+        self.fields[fap] = self._axis_field(fap, weight)
 
     def _smoothest(self, points: Index, fixed: NDArray[np.bool_]) -> Float:
         held = np.setdiff1d(np.flatnonzero(fixed), points)
@@ -118,16 +118,18 @@ class FaceFields:
     def _mouth(self) -> None:
         x, y, z = self._vertices.T
         unit, width = self._unit, self._fapu["MW"]
-        lips = self._at("2.2")
+        lips = self._point("2.2")
         # surfaces behind the lips: palate, inner cheeks, floor of the mouth
         self._behind = (np.abs(x - lips[0]) < 0.62 * width) & (z < lips[2] - 0.41 * unit)
         nose = (
-            y > self._at("8.1")[1] + 0.75 * (lips[1] + self._fapu["MNS"] - self._at("8.1")[1])
+            y > self._point("8.1")[1] + 0.75 * (lips[1] + self._fapu["MNS"] - self._point("8.1")[1])
         ) & (np.abs(x - lips[0]) < 0.6 * width)
         far = self._distance(*INNER, *OUTER) > 0.72 * width
-        fixed = far | nose | (y < self._at("2.10")[1]) | self._behind
+        fixed = far | nose | (y < self._point("2.10")[1]) | self._behind
         names = INNER + OUTER
-        self._lip_y = dict(zip(names, self._smoothest(self._all(*names), fixed).T, strict=True))
+        self._lip_y = dict(
+            zip(names, self._smoothest(self._points_named(*names), fixed).T, strict=True)
+        )
         for fap in FAPS[2:]:
             if fap.direction in ("up", "down") and set(fap.feature_points) & set(names):
                 self._add(fap.number, self._lip_y[fap.feature_points[0]])
@@ -135,7 +137,7 @@ class FaceFields:
         corners = ("2.4", "2.5", "8.3", "8.4")
         between = ("2.6", "2.8", "2.7", "2.9", "8.5", "8.7", "8.6", "8.8")
         middles = ("2.2", "2.3", "8.1", "8.2")
-        single = self._smoothest(self._all(*corners, *between, *middles), fixed)
+        single = self._smoothest(self._points_named(*corners, *between, *middles), fixed)
         self._lip_x = {}
         for row, (fap_x, name) in enumerate(zip((6, 7, 53, 54), corners, strict=True)):
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
@@ -145,14 +147,14 @@ class FaceFields:
             self.fields[fap_x][:, 2] = (
                 -CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
             )
-        pushed = self._smoothest(self._all("2.3", "2.2", *corners), fixed)[:, :2]
+        pushed = self._smoothest(self._points_named("2.3", "2.2", *corners), fixed)[:, :2]
         self._lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
         self._add(16, self._lip_z["2.3"])
         self._add(17, self._lip_z["2.2"])
 
     def _jaw(self) -> None:
         _, y, z = self._vertices.T
-        unit, lips, chin = self._unit, self._at("2.2"), self._at("2.1")
+        unit, lips, chin = self._unit, self._point("2.2"), self._point("2.1")
         inside = self._behind & (y > chin[1] + 0.1 * unit)
         upper = self._distance(*UPPER_LIP) < 0.055 * unit
         lower = self._distance(*LOWER_LIP) < 0.055 * unit
@@ -165,7 +167,7 @@ class FaceFields:
         away &= ~inside
         moving = np.flatnonzero((below | lower | floor) & ~away & ~upper)
         weight = self._geodesics.zone(moving, np.flatnonzero((upper | roof | away) & ~lower))
-        lever = self._lever(z)
+        lever = self._jaw_share(z)
         for fap, share, taken_out in (
             (3, weight * lever, self._lip_y),
             (14, weight, self._lip_z),
@@ -176,9 +178,9 @@ class FaceFields:
                 left = left - left[self._points[name]] * field
             self._add(fap, left)
 
-    def _lever(self, z: Float) -> Float:
+    def _jaw_share(self, z: Float) -> Float:
         """Return how far a depth follows the jaw rotation, 1 at the chin."""
-        chin = self._at("2.1")[2]
+        chin = self._point("2.1")[2]
         lever: Float = np.maximum(z - chin + _HINGE * self._unit, 0) / (_HINGE * self._unit)
         return lever
 
@@ -189,9 +191,9 @@ class FaceFields:
         ):
             names = [name for name in (upper, lower) if name in self._points]
             if names:
-                still = self._all(*corners)
+                still = self._points_named(*corners)
                 far = self._distance(*names) > 0.45 * self._unit
-                points = np.concatenate([self._all(*names), still])
+                points = np.concatenate([self._points_named(*names), still])
                 weights = self._smoothest(points, far)
                 for name, weight in zip(names, weights.T, strict=False):
                     fap = faps[0] if name == upper else faps[1]
@@ -206,10 +208,12 @@ class FaceFields:
             return
         fixed = (y < eyes + 0.17 * self._unit) | (y > eyes + 1.13 * self._unit)
         fixed |= self._distance(*names) > 0.9 * self._unit
-        for name, weight in zip(names, self._smoothest(self._all(*names), fixed).T, strict=True):
+        for name, weight in zip(
+            names, self._smoothest(self._points_named(*names), fixed).T, strict=True
+        ):
             self._add(faps[name], weight)
         if {"4.1", "4.2"} <= set(names):
-            ends = self._all("4.1", "4.2", "4.5", "4.6")
+            ends = self._points_named("4.1", "4.2", "4.5", "4.6")
             squeezed = self._smoothest(ends, fixed)
             self._add(37, squeezed[:, 0])
             self._add(38, squeezed[:, 1])
@@ -219,10 +223,12 @@ class FaceFields:
             if name in self._points:
                 # a zone ends at the other points of the face
                 others = [other for other in _FACE if other != name]
-                near = self._geodesics.distance(self._all(name))
-                fixed = np.union1d(np.flatnonzero(near > reach * self._unit), self._all(*others))
+                near = self._geodesics.distance(self._points_named(name))
+                fixed = np.union1d(
+                    np.flatnonzero(near > reach * self._unit), self._points_named(*others)
+                )
                 moving = np.setdiff1d(np.flatnonzero(near <= core * self._unit), fixed)
-                moving = np.union1d(moving, self._all(name))
+                moving = np.union1d(moving, self._points_named(name))
                 self._add(fap, self._geodesics.zone(moving, np.setdiff1d(fixed, moving)))
                 if name in ("5.1", "5.2"):  # a puffed cheek also moves forward
                     self.fields[fap][:, 2] = 0.5 * np.abs(self.fields[fap][:, 0])

@@ -27,7 +27,7 @@ from kouxing.services.driver.head.import_fields import (
     FaceFields,
 )
 from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
-from kouxing.services.driver.head.pieces import Fields, Piece, pack, weld
+from kouxing.services.driver.head.pieces import Fields, Primitive, pack, weld
 from kouxing.services.driver.head.points_file import Points, read_points
 from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
@@ -69,7 +69,7 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     return remarks
 
 
-def _places(mesh: Path, path: Path, pieces: list[Piece], points: Points) -> dict[str, Float64]:
+def _places(mesh: Path, path: Path, pieces: list[Primitive], points: Points) -> dict[str, Float64]:
     """Return the coordinates of every point in the mesh's own axes."""
     vertices, named = numbered_vertices(mesh, pieces)
     places = {}
@@ -92,7 +92,12 @@ class _Import:
     """The steps of one import."""
 
     def __init__(
-        self, mesh: Path, path: Path, pieces: list[Piece], places: dict[str, Float64], given: Points
+        self,
+        mesh: Path,
+        path: Path,
+        pieces: list[Primitive],
+        places: dict[str, Float64],
+        given: Points,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
         self._remarks: list[str] = []
@@ -113,7 +118,7 @@ class _Import:
         place = np.empty(len(order), np.int64)
         place[order] = np.arange(len(order))
         first_of = {int(w): int(v) for v, w in reversed(list(enumerate(self._weld_of)))}
-        self._remark_on(fields, points)
+        self._check_movements(fields, points)
         height = (self._vertices[order, 1] - self._eyes.mean(axis=0)[1]) / EYE_DISTANCE_M
         arrays = pack(
             pieces,
@@ -325,7 +330,7 @@ class _Import:
                 return number
         return 0
 
-    def _split(self, roles: NDArray[np.int8]) -> tuple[list[Piece], list[Index]]:
+    def _split(self, roles: NDArray[np.int8]) -> tuple[list[Primitive], list[Index]]:
         """Split pieces so that each eyeball is separate; return them and their vertex rows."""
         pieces, rows = [], []
         first = 0
@@ -352,7 +357,7 @@ class _Import:
             first += len(piece_roles)
         return pieces, rows
 
-    def _remark_on(self, fields: Fields, points: dict[str, int]) -> None:
+    def _check_movements(self, fields: Fields, points: dict[str, int]) -> None:
         still = [
             fap.name
             for fap in FAPS[2:]

@@ -12,7 +12,7 @@ import trimesh
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
-from kouxing.services.driver.head.pieces import Piece
+from kouxing.services.driver.head.pieces import Primitive
 from kouxing.shared.errors import UserError
 
 MAX_MESH_BYTES = 256 * 1024 * 1024  # size of a file
@@ -21,7 +21,7 @@ _NO_DIFFUSE = [102, 102, 102]  # trimesh's default
 _SKIN_COLOR = (0.58, 0.40, 0.32)  # linear, for meshes without color
 
 
-def read_mesh(path: Path) -> list[Piece]:
+def read_mesh(path: Path) -> list[Primitive]:
     """Read the triangles of a mesh file; a GLB is read in its skeleton's rest pose.
 
     Raises ``UserError`` if the file cannot be read, has no triangles, or is too large.
@@ -51,7 +51,7 @@ def read_mesh(path: Path) -> list[Piece]:
     return pieces
 
 
-def _from_trimesh(mesh: Any) -> Piece:
+def _from_trimesh(mesh: Any) -> Primitive:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if not np.isfinite(vertices).all():
         raise ValueError("a coordinate is not finite")
@@ -71,7 +71,7 @@ def _from_trimesh(mesh: Any) -> Piece:
         given = visual.vertex_colors
     if given is not None and len(given) == len(vertices):
         colors = (np.asarray(given, dtype=np.float64)[:, :3] / 255) ** 2
-    return Piece(
+    return Primitive(
         name=str(mesh.metadata.get("name", "part")),
         vertices=vertices,
         triangles=np.asarray(mesh.faces, dtype=np.int64),
@@ -83,7 +83,7 @@ def _from_trimesh(mesh: Any) -> Piece:
     )
 
 
-def numbered_vertices(mesh: Path, pieces: list[Piece]) -> tuple[Float64, dict[str, Float64]]:
+def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> tuple[Float64, dict[str, Float64]]:
     """Return the vertices (V, 3) in file order: all of them, and by mesh name.
 
     Raises ``UserError`` if a vertex line of an OBJ file is invalid.

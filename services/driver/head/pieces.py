@@ -22,7 +22,7 @@ Fields = dict[int, Float64]  # FAP: displacements (V, 3) by one unit, m
 
 
 @dataclass(slots=True)
-class Piece:
+class Primitive:
     """A primitive in scene axes."""
 
     name: str
@@ -54,7 +54,7 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
     return welded
 
 
-def part_names(pieces: list[Piece]) -> list[str]:
+def part_names(pieces: list[Primitive]) -> list[str]:
     """Return a unique name for each part; eyeballs get the names that the package uses."""
     names: list[str] = []
     taken, last = set(_NODES), dict[str, int]()
@@ -75,7 +75,7 @@ def part_names(pieces: list[Piece]) -> list[str]:
 
 
 def pack(
-    pieces: list[Piece],
+    pieces: list[Primitive],
     *,
     fields: list[Fields],
     head_weight: Float64,

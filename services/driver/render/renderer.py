@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.head import Head, Part
+from kouxing.services.driver.head.head import Head, HeadPart
 from kouxing.services.driver.render import shaders
 from kouxing.shared.errors import UserError
 
@@ -183,7 +183,7 @@ class Renderer:
         self._draw()
         return self._read()
 
-    def stages_s(self, faps: Float32) -> dict[str, float]:
+    def measure_stages_s(self, faps: Float32) -> dict[str, float]:
         """Draw one picture; return the durations of deform, upload, draw and read-back, seconds."""
         times = [time.perf_counter()]
 
@@ -218,7 +218,7 @@ class Renderer:
         width, height = self.size
         raw = self._result.read(components=channels, alignment=1)
         pixels = np.frombuffer(raw, np.uint8).reshape(height, width, channels)[::-1]
-        return _unmixed(pixels) if self.transparent else pixels
+        return _remove_background(pixels) if self.transparent else pixels
 
     def draw_on_screen(self, faps: Float32) -> None:
         """Draw into the window that the context belongs to."""
@@ -260,7 +260,7 @@ class Renderer:
             if part.transparent:
                 self._draw_part(part)
 
-    def _draw_part(self, part: Part) -> None:
+    def _draw_part(self, part: HeadPart) -> None:
         program = self._eye_program if part.name in shaders.EYES else self._program
         wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
         for name, value in (
@@ -281,7 +281,7 @@ class Renderer:
             self._context.release()
 
 
-def _unmixed(pixels: UInt8) -> UInt8:
+def _remove_background(pixels: UInt8) -> UInt8:
     """Remove the black background from translucent pixels (H, W, 4)."""
     out = pixels.copy()
     row, column = np.nonzero((pixels[..., 3] > 0) & (pixels[..., 3] < 255))

@@ -114,7 +114,7 @@ def check_name(path: Path, others: Iterable[str] = ()) -> None:
             " or a name with a number such as face%05d.png"
         )
     if not path.parent.is_dir():
-        raise _unwritable(path, FileNotFoundError(errno.ENOENT, "no such folder"))
+        raise _write_error(path, FileNotFoundError(errno.ENOENT, "no such folder"))
 
 
 def is_sequence(path: Path) -> bool:
@@ -176,7 +176,7 @@ class VideoWriter:
                 str(self._unfinished), "w", format=container, options=form.options
             )
         except OSError as error:
-            raise _unwritable(self._path, error) from error
+            raise _write_error(self._path, error) from error
         rate = Fraction(frame_rate_hz).limit_denominator(1001)
         video: Any = self._container.add_stream(codec.name, rate=rate, options=codec.options)
         self._video = video
@@ -237,7 +237,7 @@ class VideoWriter:
             self._container.mux(packets)
         except OSError as error:
             self.discard()
-            raise _unwritable(self._path, error) from error
+            raise _write_error(self._path, error) from error
 
     def close(self) -> Path:
         """Finish the file under its final name; return its path."""
@@ -246,11 +246,11 @@ class VideoWriter:
             self._mux(self._sound.encode(None))
         try:
             self._container.close()
-            path = self._path if self._overwrite else _reserve(self._path)
+            path = self._path if self._overwrite else _create_unique(self._path)
             return self._unfinished.replace(path)
         except OSError as error:
             self._delete_unfinished()
-            raise _unwritable(self._path, error) from error
+            raise _write_error(self._path, error) from error
 
     def discard(self) -> None:
         """Delete the unfinished file."""
@@ -274,7 +274,7 @@ class PictureSequence:
             try:
                 path.mkdir(exist_ok=True)
             except OSError as error:
-                raise _unwritable(path, error) from error
+                raise _write_error(path, error) from error
             self._pattern = path / "%05d.png"
 
     def write_image(self, image: UInt8) -> None:
@@ -302,10 +302,10 @@ def write_picture(path: Path, image: UInt8) -> None:
     try:
         path.write_bytes(picture.encode(image))
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise _write_error(path, error) from error
 
 
-def _reserve(path: Path) -> Path:
+def _create_unique(path: Path) -> Path:
     """Create an empty file with this name or, if it exists, with the next free one; return it."""
     free, number = path, 1
     while True:
@@ -318,7 +318,7 @@ def _reserve(path: Path) -> Path:
             return free
 
 
-def _unwritable(path: Path, error: OSError) -> UserError:
+def _write_error(path: Path, error: OSError) -> UserError:
     return UserError(
         f"cannot write {path} ({error.strerror or error}); give a path in an existing, writable"
         " folder"

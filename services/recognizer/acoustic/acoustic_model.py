@@ -78,7 +78,7 @@ class AcousticStream(ABC):
     def __init__(self, model: AcousticModel) -> None:
         self._model = model
         self.positions = []
-        self.provisional = no_scores(model.topology.num_states)
+        self.provisional = empty_scores(model.topology.num_states)
 
     def score(self, frames: Floats | None) -> Floats:
         """Score the front end's frames, (n, k), without other streams; None ends the segment.
@@ -92,7 +92,7 @@ class AcousticStream(ABC):
         """Forget the segment and the speaker."""
 
 
-def no_scores(num_states: int) -> Floats:
+def empty_scores(num_states: int) -> Floats:
     """Return the scores of no frames, (0, states)."""
     return np.empty((0, num_states), np.float32)
 

@@ -49,7 +49,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, Work
-from kouxing.services.recognizer.acoustic.caches import CacheMemory, CacheSizes, Halves, cache_names
+from kouxing.services.recognizer.acoustic.caches import (
+    CacheMemory,
+    CacheSizes,
+    Float16,
+    cache_names,
+)
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
@@ -78,9 +83,9 @@ class BlockModel(NetworkModel):
     """A network that runs on blocks."""
 
     @cached_property
-    def session(self) -> BlockSession:
+    def session(self) -> BlockRunner:
         """The network, ready to run."""
-        return BlockSession(self.network)
+        return BlockRunner(self.network)
 
     @cached_property
     def caches(self) -> CacheMemory:
@@ -99,9 +104,9 @@ class BlockModel(NetworkModel):
         while ready := [stream for stream in streams if stream.is_due]:
             for numbers, rings in self.caches.runs([stream.cache for stream in ready]):
                 self._run([ready[number] for number in numbers], rings)
-        return [stream.take_settled() for stream in streams]
+        return [stream.take_final_scores() for stream in streams]
 
-    def _run(self, streams: Sequence[BlockStream], rings: Halves) -> None:
+    def _run(self, streams: Sequence[BlockStream], rings: Float16) -> None:
         blocks = [stream.block() for stream in streams]
         log_posteriors, states, new = self.session.run(blocks, rings)
         scores = self.scores_of(log_posteriors)
@@ -140,7 +145,7 @@ class BlockSizes:
 
 
 @dataclass(slots=True)
-class Past:
+class NetworkState:
     """A session's network state before a block, besides its cache."""
 
     state: Floats  # of the recurrent layer, (width,)
@@ -154,10 +159,10 @@ class Block:
     frames: Floats  # (2 positions + 3, 80), from two before the first position's
     row: int  # of the first position in the table
     num_positions: int
-    past: Past
+    past: NetworkState
 
 
-class BlockSession:
+class BlockRunner:
     """A network that is ready to run; ``ValueError`` if the file has another kind."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
@@ -167,7 +172,7 @@ class BlockSession:
         unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
 
-    def run(self, blocks: Sequence[Block], rings: Halves) -> tuple[Floats, Floats, Halves]:
+    def run(self, blocks: Sequence[Block], rings: Float16) -> tuple[Floats, Floats, Float16]:
         """Run the network on the next blocks of ``n`` sessions, with their caches.
 
         ``rings`` has the shape (2 layers, n, heads, PAST, size). Returns log posteriors,
@@ -200,13 +205,13 @@ class BlockStream(AcousticStream):
         super().__init__(model)
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
-        self._no_scores = self.provisional
+        self._empty_scores = self.provisional
         self.cache = model.caches.open()  # what lies beyond the past's positions is masked
         self.reset()
 
     def reset(self) -> None:
         """Forget the segment. The network has no memory of the speaker."""
-        self.provisional = self._no_scores
+        self.provisional = self._empty_scores
         self._settled: list[Floats] = []  # not yet returned
         self._num_frames = 0  # of the segment
         self._num_settled = 0
@@ -219,7 +224,7 @@ class BlockStream(AcousticStream):
         """Start at the first row of the table of positions, with an empty past."""
         self._row = 0  # of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
-        self.past = Past(np.zeros(self._sizes.state, np.float32))
+        self.past = NetworkState(np.zeros(self._sizes.state, np.float32))
 
     def append_frames(self, frames: Floats | None) -> None:
         """Append frames, (n, 80); None, the end of the segment, repeats the last frame."""
@@ -251,7 +256,7 @@ class BlockStream(AcousticStream):
         frames = self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1]
         return Block(frames, self._row, num_positions, self.past)
 
-    def append_outputs(self, scores: Floats, state: Floats, new: Halves) -> None:
+    def append_outputs(self, scores: Floats, state: Floats, new: Float16) -> None:
         """Append the scores, new state, and keys and values of ``block()``; shapes as of a run."""
         sizes, block = self._sizes, self.block()
         ends_table = block.row + block.num_positions == MAX_POSITIONS
@@ -276,9 +281,9 @@ class BlockStream(AcousticStream):
             self._num_due += sizes.block
         self._num_due = min(self._num_due, MAX_POSITIONS - self._row)
 
-    def take_settled(self) -> Floats:
+    def take_final_scores(self) -> Floats:
         """Return the new settled scores, (m, states); at the end those of all remaining frames."""
-        rows = np.concatenate([self._no_scores, *self._settled])
+        rows = np.concatenate([self._empty_scores, *self._settled])
         self._settled = []
         self._num_settled += len(rows)
         if self._ended:
@@ -322,7 +327,7 @@ def _sizes_of(session: Any) -> BlockSizes:
     return sizes
 
 
-def blocks_from(archive: Archive) -> BlockModel:
+def block_model_from(archive: Archive) -> BlockModel:
     """Build the model after checking every size; ``ValueError`` if something does not fit."""
     topology = topology_from(archive)
     model = BlockModel(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 NUM_PLACES = 16  # for caches in a block of memory
 
-Halves = NDArray[np.float16]
+Float16 = NDArray[np.float16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,16 +46,16 @@ class Cache:
     Positions that were not written yet may hold another session's values and must be masked.
     """
 
-    __slots__ = ("__weakref__", "place", "shelf")
+    __slots__ = ("__weakref__", "place", "pool")
 
-    def __init__(self, shelf: Shelf, place: int) -> None:
-        self.shelf = shelf
+    def __init__(self, pool: CachePool, place: int) -> None:
+        self.pool = pool
         self.place = place
 
     @property
-    def rings(self) -> Halves:
+    def rings(self) -> Float16:
         """Keys and values, (rings, heads, slots, size), to read and write."""
-        return self.shelf.rings[:, self.place]
+        return self.pool.rings[:, self.place]
 
 
 class CacheMemory:
@@ -64,44 +64,44 @@ class CacheMemory:
     def __init__(self, sizes: CacheSizes, max_batch: int) -> None:
         self._sizes = sizes
         self._max_batch = max_batch
-        self._shelves: list[weakref.ref[Shelf]] = []
+        self._pools: list[weakref.ref[CachePool]] = []
 
     def open(self) -> Cache:
         """Return a cache for a new session."""
-        shelves = [shelf for reference in self._shelves if (shelf := reference()) is not None]
-        shelf = next((shelf for shelf in shelves if None in shelf.caches), None)
-        if shelf is None:
-            shelf = Shelf(self._sizes)
-            shelves.append(shelf)
-        self._shelves = [weakref.ref(shelf) for shelf in shelves]
-        return shelf.open()
+        pools = [pool for reference in self._pools if (pool := reference()) is not None]
+        pool = next((pool for pool in pools if None in pool.caches), None)
+        if pool is None:
+            pool = CachePool(self._sizes)
+            pools.append(pool)
+        self._pools = [weakref.ref(pool) for pool in pools]
+        return pool.open()
 
-    def runs(self, caches: Sequence[Cache]) -> Iterator[tuple[list[int], Halves]]:
+    def runs(self, caches: Sequence[Cache]) -> Iterator[tuple[list[int], Float16]]:
         """Yield runs for sessions with these caches, until all sessions are covered.
 
         A run has the indices of its sessions, in the order of their rows, and their keys and
         values, (rings, sessions, heads, slots, size), valid until the next run.
         """
-        numbers: dict[Shelf, list[int]] = {}
+        numbers: dict[CachePool, list[int]] = {}
         for number, cache in enumerate(caches):
-            numbers.setdefault(cache.shelf, []).append(number)
-        for shelf, members in numbers.items():
-            first = shelf.gather([caches[number] for number in members])
+            numbers.setdefault(cache.pool, []).append(number)
+        for pool, members in numbers.items():
+            first = pool.gather([caches[number] for number in members])
             members.sort(key=lambda number: caches[number].place)
             for begin in range(0, len(members), self._max_batch):
                 batch = members[begin : begin + self._max_batch]
                 place = first + begin
-                yield batch, shelf.rings[:, place : place + len(batch)]
+                yield batch, pool.rings[:, place : place + len(batch)]
 
 
-class Shelf:
+class CachePool:
     """Adjacent places for caches; free places use no memory."""
 
     def __init__(self, sizes: CacheSizes) -> None:
         flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
         self._memory = mmap.mmap(-1, NUM_PLACES * sizes.num_bytes, flags=flags)
         shape = (sizes.rings, NUM_PLACES, sizes.heads, sizes.slots, sizes.head_size)
-        self.rings: Halves = np.frombuffer(self._memory, np.float16).reshape(shape)
+        self.rings: Float16 = np.frombuffer(self._memory, np.float16).reshape(shape)
         self.caches: list[weakref.ref[Cache] | None] = [None] * NUM_PLACES
 
     def open(self) -> Cache:

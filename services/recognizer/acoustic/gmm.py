@@ -172,7 +172,7 @@ class GmmStream(AcousticStream):
         self._mean.reset()
 
 
-def gmm_from(archive: Archive) -> GmmModel:
+def gmm_model_from(archive: Archive) -> GmmModel:
     """Build the model after checking every size; ``ValueError`` if an array does not fit."""
     topology = topology_from(archive)
     num_mixtures = archive.array("weights", None).shape[-1]

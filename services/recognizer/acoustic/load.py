@@ -17,9 +17,9 @@ SHIPPED = ("blocks", "gmm", "neural")
 DEFAULT_MODEL = "blocks"
 NEURAL_PATH = MODELS / "neural.npz"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
-    gmm.FORMAT: gmm.gmm_from,
-    neural.FORMAT: neural.neural_from,
-    blocks.FORMAT: blocks.blocks_from,
+    gmm.FORMAT: gmm.gmm_model_from,
+    neural.FORMAT: neural.neural_model_from,
+    blocks.FORMAT: blocks.block_model_from,
 }
 
 

@@ -106,7 +106,7 @@ def check_outputs(outputs: Sequence[NDArray[Any]], shapes: Sequence[tuple[int, .
         raise ValueError("its network scores with values that are not finite")
 
 
-class NetworkSession:
+class NetworkRunner:
     """The neural model's network, ready to run; ``ValueError`` if the file has another kind."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:

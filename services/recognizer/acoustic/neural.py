@@ -54,9 +54,9 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Floats,
     NetworkPosition,
     Work,
-    no_scores,
+    empty_scores,
 )
-from kouxing.services.recognizer.acoustic.caches import CacheMemory, Halves, cache_names
+from kouxing.services.recognizer.acoustic.caches import CacheMemory, Float16, cache_names
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
     MAX_POSITIONS,
@@ -64,7 +64,7 @@ from kouxing.services.recognizer.acoustic.network import (
     SEEN_FRAMES,
     WINDOW,
     NetworkModel,
-    NetworkSession,
+    NetworkRunner,
     check_outputs,
     past_masks,
     position_table,
@@ -95,9 +95,9 @@ class NeuralModel(NetworkModel):
         return int(self.look_aheads[self.output_layer])
 
     @cached_property
-    def session(self) -> NetworkSession:
+    def session(self) -> NetworkRunner:
         """The network, ready to run."""
-        return NetworkSession(self.network)
+        return NetworkRunner(self.network)
 
     @cached_property
     def caches(self) -> CacheMemory:
@@ -132,7 +132,7 @@ class NeuralModel(NetworkModel):
                 stream.reset()
         return scores
 
-    def _advance(self, streams: Sequence[NeuralStream], rings: Halves) -> None:
+    def _advance(self, streams: Sequence[NeuralStream], rings: Float16) -> None:
         log_posteriors, keys, values = self.run(streams, rings, self.output_layer)
         new = np.concatenate([keys, values], axis=1)
         for row, stream in enumerate(streams):
@@ -140,7 +140,7 @@ class NeuralModel(NetworkModel):
             stream.append_outputs(log_posteriors[row], values[row])
 
     def run(
-        self, streams: Sequence[NeuralStream], rings: Halves, output_layer: int
+        self, streams: Sequence[NeuralStream], rings: Float16, output_layer: int
     ) -> list[Floats]:
         """Run the network at the next position of every stream, with one of its output layers.
 
@@ -255,10 +255,10 @@ class NeuralStream(AcousticStream):
         rows = self._rows[: self._num_frames - self._num_scored] if is_end else self._rows
         self._num_scored += len(rows)
         self._rows = []
-        return np.stack(rows) if rows else no_scores(len(self._model.log_prior))
+        return np.stack(rows) if rows else empty_scores(len(self._model.log_prior))
 
 
-def neural_from(archive: Archive) -> NeuralModel:
+def neural_model_from(archive: Archive) -> NeuralModel:
     """Build the model after checking every size; ``ValueError`` if something does not fit."""
     topology = topology_from(archive)
     look_aheads = archive.array("look_aheads", None).astype(np.int64)

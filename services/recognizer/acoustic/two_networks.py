@@ -59,14 +59,14 @@ class TwoNetworksStream(AcousticStream):
         self.late = model.late.create_stream()
         self.positions = self.early.positions
         self.look_ahead_frames = self.late.look_ahead_frames
-        self._no_scores = self.provisional
+        self._empty_scores = self.provisional
         self.reset()
 
     def reset(self) -> None:
         """Forget the segment."""
         self.early.reset()
         self.late.reset()
-        self._early_scores = self.provisional = self._no_scores
+        self._early_scores = self.provisional = self._empty_scores
 
     def update_provisional(self, early: Floats, settled: Floats, *, is_end: bool) -> None:
         """Combine the new scores of both networks, (m, states) each."""

@@ -97,9 +97,9 @@ def phones_of_syllable(syllable: str) -> tuple[str, ...]:
     ('van',)
     """
     plain = _plain(syllable)
-    phones = _whole(plain)
+    phones = _syllable_phones(plain)
     if phones is None and plain.endswith("r"):  # er-hua: hua + r
-        stem = _whole(plain[:-1])
+        stem = _syllable_phones(plain[:-1])
         phones = (*stem, "er") if stem else None
     if phones is None:
         raise UserError(
@@ -228,7 +228,7 @@ def _plain(syllable: str) -> str:
 
 
 @lru_cache(maxsize=1024)
-def _whole(plain: str) -> tuple[str, ...] | None:
+def _syllable_phones(plain: str) -> tuple[str, ...] | None:
     """Return the phones of a syllable without er-hua, or None if it does not exist."""
     if plain in _WITHOUT_INITIAL:
         return _WITHOUT_INITIAL[plain]

@@ -66,7 +66,9 @@ class ClosureTracker:
                 shortened[closes] = np.minimum(shortened[closes], left_s)
         return shortened
 
-    def note(self, timeline: Timeline, time_s: float, mouth: NDArray[np.float64]) -> None:
+    def record_closures(
+        self, timeline: Timeline, time_s: float, mouth: NDArray[np.float64]
+    ) -> None:
         """Record which closures the mouth, FAPs (num_mouth_faps,), shows at a time."""
         for row in self._closing_rows(timeline):
             if timeline.apex_start_s[row] - self._frame_s <= time_s:

@@ -143,7 +143,7 @@ class VisemeStream:
         difference = self._transition.at(time_s - self._transition_start_s)
         self._mouth = self._within_hull(self._trajectory.at(time_s) + difference)
         self._time_s = time_s
-        self._closures.note(active, time_s, self._mouth.value)
+        self._closures.record_closures(active, time_s, self._mouth.value)
         return self._frame()
 
     def relax(self, step_s: float) -> MouthFrame:

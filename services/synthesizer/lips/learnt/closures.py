@@ -109,12 +109,14 @@ class ClosingPhones:
     def log_odds(self, time_s: float) -> float:
         """Return the log odds of a closure that the phones add at a time."""
         closing = [known for known in self._phones.values() if known[0].symbol in self._symbols]
-        added = max((self._support(*known, time_s) for known in closing), default=0.0)
+        added = max(
+            (self._closing_phone_log_odds(*known, time_s) for known in closing), default=0.0
+        )
         if added > 0.0 or self._rule.other == 0.0:
             return added
         return -max(
             (
-                self._against(phone, time_s)
+                self._open_phone_log_odds(phone, time_s)
                 for phone, _ in self._phones.values()
                 if phone.symbol not in self._symbols
                 and phone.onset_s <= time_s < phone.onset_s + phone.duration_s
@@ -122,7 +124,7 @@ class ClosingPhones:
             default=0.0,
         )
 
-    def _against(self, phone: Phone, time_s: float) -> float:
+    def _open_phone_log_odds(self, phone: Phone, time_s: float) -> float:
         """Return the log odds that a phone without closure subtracts."""
         log_odds = log_odds_of(max(phone.confidence, 0.5))
         subtracted = min(log_odds, self._rule.other)
@@ -136,7 +138,7 @@ class ClosingPhones:
         neighbors = (self._phones.get(phone.index + step) for step in (-1, 1))
         return all(known is not None and known[0].symbol in self._symbols for known in neighbors)
 
-    def _support(self, phone: Phone, known_s: float, time_s: float) -> float:
+    def _closing_phone_log_odds(self, phone: Phone, known_s: float, time_s: float) -> float:
         """Return the log odds that a closing phone adds."""
         maximum = min(log_odds_of(max(phone.confidence, 0.5)), self._rule.phone)
         end_s = phone.onset_s + min(phone.duration_s, _HOLD_S)

@@ -180,7 +180,7 @@ class LearntStream:
         now = self._track.at(self._time_s)
         if self._rest is not None:
             self._start_transition(now, _SLOW_TRANSITION_S)
-        elif _differs(before, now):
+        elif _is_different(before, now):
             self._start_transition(now, _TRANSITION_S)
         difference = self._transition.at(time_s - self._transition_start_s)
         self._mouth = self._track.at(time_s) + difference
@@ -198,12 +198,12 @@ class LearntStream:
             phones.forget_before(time_s - _MEMORY_S)
         while self._queue and self._track.end_s < time_s:
             frame = self._queue.popleft()
-            self._track.append(frame.time_s, self._process(frame))
+            self._track.append(frame.time_s, self._stabilize(frame))
             # lip frames with a longer delay than the face are late
             self._late_s = max(0.0, frame.delay_s - self._delay_s)
         self._track.hold_s = HOLD_S + self._late_s if self._is_speaking else 0.0
 
-    def _process(self, frame: LipPositions) -> Array:
+    def _stabilize(self, frame: LipPositions) -> Array:
         """Return the FAPs of the next lip frame, stabilized and with closures."""
         faps = frame.faps.astype(np.float64)
         if frame.time_s - self._track.end_s <= MAX_GAP_S:
@@ -234,7 +234,7 @@ class LearntStream:
         return MouthFrame(faps, articulation)
 
 
-def _differs(one: FapState, other: FapState) -> bool:
+def _is_different(one: FapState, other: FapState) -> bool:
     return bool(
         np.abs(one.value - other.value).max() > _EPSILON
         or np.abs(one.velocity - other.velocity).max() > _EPSILON

@@ -64,13 +64,13 @@ class LipTrack:
         if not knots or time_s < knots[0].time_s:
             return self._rest
         if time_s >= knots[-1].time_s:
-            knots = [*knots[-1:], *self._after_the_last()]
+            knots = [*knots[-1:], *self._return_to_rest()]
         after = bisect_right(knots, time_s, key=lambda knot: knot.time_s)
         if after == len(knots):
             return self._rest
         return _interpolate(knots[after - 1], knots[after], time_s)
 
-    def _after_the_last(self) -> list[_Knot]:
+    def _return_to_rest(self) -> list[_Knot]:
         value = self._knots[-1].state.value
         rest = _Knot(self.end_s + self.hold_s + CLOSE_S, self._rest)
         if self.hold_s == 0.0:
