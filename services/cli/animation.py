@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,11 +83,16 @@ def animate(
     """
     model = load_live_model()
     predictor = _load_lip_predictor(model, mouth)
-    settings = [_synthesizer_settings(name, expressiveness) for name in lip_models]
+    changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
+    settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
+    models = [load_lip_model(name=name) for name in lip_models]
     samples = read_mono_16k(source, track)
     events: Sequence[SoundEvent]
     if live:
-        chains = [_new_chain(model, predictor, config) for config in settings]
+        chains = [
+            LiveChain(model, lip_model, synthesizer=config, lip_predictor=predictor)
+            for lip_model, config in zip(models, settings, strict=True)
+        ]
         faces = [_stream(chain, samples, progress) for chain in chains]
         events = chains[-1].events
     else:
@@ -94,8 +100,8 @@ def animate(
         phones = None if text is None else _align(model, samples, source, text)
         recording = analyze_recording(model, samples, predictor, phones)
         faces = [
-            animate_recording(recording, load_lip_model(name=config.lips), config)
-            for config in settings
+            animate_recording(recording, lip_model, config)
+            for lip_model, config in zip(models, settings, strict=True)
         ]
         events = recording.events
     return Motion(
@@ -105,19 +111,6 @@ def animate(
         samples,
         _spoken_phones(events, model.inventory.silence),
     )
-
-
-def _synthesizer_settings(lip_model: str, expressiveness: float | None) -> SynthesizerConfig:
-    if expressiveness is None:
-        return SynthesizerConfig(lips=lip_model)
-    return SynthesizerConfig(lips=lip_model, expressiveness=expressiveness)
-
-
-def _new_chain(
-    model: AcousticModel, predictor: LipPredictor | None, settings: SynthesizerConfig
-) -> LiveChain:
-    lip_model = load_lip_model(name=settings.lips)
-    return LiveChain(model, lip_model, synthesizer=settings, lip_predictor=predictor)
 
 
 def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) -> list[film.Frame]:

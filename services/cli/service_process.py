@@ -11,33 +11,11 @@ import weakref
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from kouxing.shared.clock import StallDetector
 from kouxing.shared.service import PARENT_VARIABLE, PULSE_VARIABLE
 
 POLL_S = 0.2  # between two checks of a process
 HANG_S = 5.0  # a loop that sends no heartbeat for longer hangs
-
-
-class HangDetector:
-    """Detects that a service sends no heartbeats anymore.
-
-    Call ``hangs`` about every ``POLL_S``. Of a longer pause between two calls only
-    ``2 * POLL_S`` count, because then this process itself did not run.
-    """
-
-    def __init__(self, limit_s: float, now_s: float) -> None:
-        self._limit_s = limit_s
-        self._checked_s = now_s
-        self._silent_s = 0.0
-        self._is_ready = False
-
-    def hangs(self, has_beaten: bool, now_s: float) -> bool:
-        """Return whether the service has been silent too long since its first heartbeat."""
-        self._silent_s += min(now_s - self._checked_s, 2 * POLL_S)
-        self._checked_s = now_s
-        if has_beaten or not self._is_ready:
-            self._silent_s = 0.0
-        self._is_ready = self._is_ready or has_beaten
-        return self._silent_s > self._limit_s
 
 
 class ServiceProcess(subprocess.Popen[bytes]):
@@ -70,11 +48,15 @@ class ServiceProcess(subprocess.Popen[bytes]):
             )
         finally:
             os.close(write_end)
-        self._detector = HangDetector(hang_limit_s, time.monotonic())
+        self._hang_limit_s = hang_limit_s
+        self._stall = StallDetector(time.monotonic(), limit_s=2 * POLL_S)
+        self._silent_s = 0.0
+        self._is_ready = False  # it has sent a heartbeat
 
     def hangs(self) -> bool:
         """Return whether the service's loop hangs. Call this about every ``POLL_S``."""
-        beats = b""
+        self._silent_s += self._stall.elapsed_s(time.monotonic())
         with contextlib.suppress(BlockingIOError):
-            beats = os.read(self._pulse, 65536)
-        return self._detector.hangs(bool(beats), time.monotonic())
+            if os.read(self._pulse, 65536):
+                self._silent_s, self._is_ready = 0.0, True
+        return self._is_ready and self._silent_s > self._hang_limit_s

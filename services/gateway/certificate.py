@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import os
-import socket
 import ssl
 from collections.abc import Iterable
 from pathlib import Path
@@ -38,12 +37,6 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
             "a certificate and its private key, or the path of a file to create"
         ) from None
     return context
-
-
-def local_host_names() -> tuple[str, str]:
-    """Return the names of this machine in its local network."""
-    name = socket.gethostname()
-    return name, f"{name}.local"
 
 
 def _self_signed(hosts: Iterable[str]) -> bytes:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import secrets
+import socket
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
 from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.certificate import local_host_names, tls_context
+from kouxing.services.gateway.certificate import tls_context
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, local_address
 
@@ -32,7 +33,8 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     """
     host = config.advertise or (local_address() if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
-    names = {host, *local_host_names(), *config.names}
+    local_name = socket.gethostname()
+    names = {host, local_name, f"{local_name}.local", *config.names}
     tls = None
     if config.certificate:
         tls = tls_context(Path(config.certificate), [*sorted(names), "localhost", "127.0.0.1"])
