@@ -17,7 +17,6 @@ import soxr
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import (
-    MIN_UNKNOWN_BYTES,
     MediaSound,
     RawFormat,
     has_video,
@@ -30,6 +29,7 @@ from kouxing.shared.sound_formats import (
     needs_all,
     needs_more,
     other_kind,
+    stated_bytes,
 )
 
 MIN_RATE_HZ = 8_000
@@ -353,11 +353,8 @@ def _resample(
 
 
 def _missing(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
-    """Return a remark if a WAV or AIFF file is shorter than its header states."""
-    if begin[:4] not in (b"RIFF", b"FORM"):
-        return []
-    stated = int.from_bytes(begin[4:8], "little" if begin[:4] == b"RIFF" else "big") + 8
-    missing_s = read_s * (stated / num_bytes - 1)
-    if stated > MIN_UNKNOWN_BYTES or missing_s < _MIN_MISSING_S:
+    """Return a remark if a file is shorter than its header states."""
+    missing_s = read_s * ((stated_bytes(begin) or 0) / num_bytes - 1)
+    if missing_s < _MIN_MISSING_S:
         return []
     return [f"{path}: the file is cut off after {read_s:.1f} s of {read_s + missing_s:.1f} s"]

@@ -50,7 +50,6 @@ class CancellationGuard:
         if not self._has_remarked:
             self._has_remarked = True
             self._remarks.append(
-                f"{self._name}: the mix of the channels is silent, since they cancel each other;"
-                f" only channel {loudest + 1} is used"
+                f"{self._name}: mixed, the channels are silent; only channel {loudest + 1} is used"
             )
         return channels[:, [loudest] * self._num_channels]

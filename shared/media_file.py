@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_formats import why_unreadable
+from kouxing.shared.sound_formats import MIN_UNKNOWN_BYTES, is_sound, why_unreadable
 
 _MAX_STREAMS = 64
 _OPTIONS = {"protocol_whitelist": "none"}  # no network, and no files that a playlist names
@@ -23,9 +23,10 @@ _JITTER_S = 0.05  # timestamps that differ less from the number of samples are i
 _MAX_OVERLAP_S = 1.0  # timestamps that go back further start again
 _MAX_GAP_S = 3600.0  # a larger one is an error in the timestamps
 _MAX_GAP_OF_BROADCAST_S = 10.0  # its timestamps may start again at any value
-_MAX_UNSTATED_S = 0.5  # of a file that is not reported as cut off; also the length of a video frame
-MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
+_MIN_MISSING_S = 0.1  # of a track that is reported as cut off
+_MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
+_TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
 _HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|avi|flv|caf|ape|tta|wv|au|w64")
 
 
@@ -65,7 +66,7 @@ class MediaSound:
         self.remarks: list[str] = []
         self.notices: list[str] = []
         self._name = name
-        self._downmixers: dict[tuple[str, str, int], Any] = {}
+        self._mixers: dict[tuple[str, str, int], list[Any]] = {}
         try:
             self._container: Any = av.open(
                 file,
@@ -77,7 +78,7 @@ class MediaSound:
         except (av.error.FFmpegError, ValueError) as error:
             raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
         try:
-            self._stream = self._choose(track)
+            self._stream = self._choose(track, begin)
             self._frames = self._decode()
             first = next(self._frames, None)
             if first is None:
@@ -87,15 +88,21 @@ class MediaSound:
             raise
         self.sample_rate_hz: int = first.sample_rate
         self.num_channels = min(2, first.layout.nb_channels)
+        kind = self._container.format
+        self._restarts = bool(kind.flags & av.format.Flags.ts_discont.value)
+        has_index = not kind.flags & av.format.Flags.generic_index.value
+        self._has_times = self._restarts or has_index or kind.name == "flac"
         self.duration_s = None if is_pipe else self._stated_s()
         self.blocks = self._blocks(first)
 
-    def _choose(self, track: int | None) -> Any:
+    def _choose(self, track: int | None, begin: bytes) -> Any:
         tracks = self._container.streams.audio
+        if not self._container.streams or not (tracks or is_sound(begin)):
+            raise UserError(f"{self._name}: {why_unreadable(begin, 'no audio')}")
         if not tracks or len(self._container.streams) > _MAX_STREAMS:
             kinds = {stream.type for stream in self._container.streams}
-            contents = f"; it has only {' and '.join(sorted(kinds))}" if kinds else ""
-            raise UserError(f"{self._name}: the file has no audio{contents}")
+            only = " and ".join(sorted(kinds))
+            raise UserError(f"{self._name}: the file has no audio, only {only}; record the sound")
         listing = "; ".join(f"{place} {_describe(one)}" for place, one in enumerate(tracks, 1))
         if track is not None and not 1 <= track <= len(tracks):
             raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")
@@ -119,6 +126,7 @@ class MediaSound:
         self._read_end_s = self._track_end_s = 0.0  # of all tracks, and of this one
         self._first_place: int | None = None  # of the first packet in the file, bytes
         self._num_damaged = 0
+        self._is_stopped = False  # the rest cannot be read
         self._damaged_s = 0.0  # time of the first damaged packet
         self._is_encrypted = _tag(self._stream) == "drms"
         packets = self._container.demux()
@@ -127,6 +135,7 @@ class MediaSound:
                 packet = next(packets, None)
             except (av.error.FFmpegError, ValueError):
                 self._on_damage(self._read_end_s)
+                self._is_stopped = True
                 return
             except OSError as error:
                 raise UserError(f"{self._name}: cannot read on: {error.strerror}") from None
@@ -163,16 +172,16 @@ class MediaSound:
 
     def _blocks(self, first: Any) -> Iterator[tuple[int, Samples]]:
         """Yield the samples, with silence in gaps."""
-        start = self._container.start_time
-        origin_s = first.time or 0.0 if start is None else start / av.time_base
-        position_s = 0.0
+        origin_s, position_s = self._origin_s(first), 0.0
         guard = CancellationGuard(self._name, self.num_channels, self.remarks)
         frame: Any = first
         with self._container:
             while frame is not None:
                 rate_hz = frame.sample_rate
                 samples = guard.mix(*self._mix(frame))
-                ahead_s = 0.0 if frame.time is None else frame.time - origin_s - position_s
+                ahead_s = 0.0
+                if self._has_times and frame.time is not None:
+                    ahead_s = frame.time - origin_s - position_s
                 if not self._is_continuous(ahead_s):
                     origin_s += ahead_s
                 elif ahead_s > _JITTER_S:
@@ -190,20 +199,28 @@ class MediaSound:
                 frame = next(self._frames, None)
             self._check_end(position_s)
 
+    def _origin_s(self, first: Any) -> float:
+        """Return the time in the container's timestamps that is the start of the file."""
+        start = self._container.start_time
+        if _TIMES_COUNT_FROM_ZERO.match(self._container.format.name):
+            return min(0.0, (start or 0) / av.time_base)
+        return float((first.time or 0.0) if start is None else start / av.time_base)
+
     def _mix(self, frame: Any) -> tuple[Samples, Samples]:
         """Return all channels of a frame, and FFmpeg's mix of them if there are more than two."""
-        channels = _samples_of(frame)
         if frame.layout.nb_channels <= 2:
+            channels = _samples_of(frame)
             return channels, channels
         kind = (frame.layout.name, frame.format.name, frame.sample_rate)
-        if kind not in self._downmixers:
-            self._downmixers[kind] = av.AudioResampler(format="flt", layout="stereo")
-        (mixed,) = self._downmixers[kind].resample(frame)
-        return channels, _samples_of(mixed)
+        if kind not in self._mixers:  # PyAV cannot convert planes of eight channels
+            layouts = (frame.layout.name, "stereo")
+            self._mixers[kind] = [av.AudioResampler("flt", layout) for layout in layouts]
+        all_channels, mixed = (mixer.resample(frame)[0] for mixer in self._mixers[kind])
+        return _samples_of(all_channels), _samples_of(mixed)
 
     def _is_continuous(self, ahead_s: float) -> bool:
         """Return whether a difference between timestamps and samples is a gap or an overlap."""
-        if self._container.format.flags & av.format.Flags.ts_discont.value:
+        if self._restarts:
             return -_JITTER_S < ahead_s < _MAX_GAP_OF_BROADCAST_S
         return -_MAX_OVERLAP_S < ahead_s < _MAX_GAP_S
 
@@ -216,16 +233,19 @@ class MediaSound:
     def _check_end(self, read_s: float) -> None:
         """Remark on damage, and on a file that ends before its header states."""
         stream, stated_s, end_s = self._stream, self._stated_s(), self._read_end_s
+        min_missing_s = _MIN_MISSING_OF_FILE_S
         if stream.duration is not None and stream.time_base is not None:
             stated_s = float(((stream.start_time or 0) + stream.duration) * stream.time_base)
-            end_s = self._track_end_s
-        elif stated_s is not None:
-            stated_s += (self._container.start_time or 0) / av.time_base
+            end_s, min_missing_s = self._track_end_s, _MIN_MISSING_S
         missing_s = 0.0 if stated_s is None else stated_s - end_s
-        if missing_s > _MAX_UNSTATED_S and self._states_length():
+        if missing_s > min_missing_s and self._states_length():
             self.remarks.append(
                 f"{self._name}: the file is cut off after {read_s:.1f} s of"
                 f" {read_s + missing_s:.1f} s"
+            )
+        elif self._is_stopped:
+            self.remarks.append(
+                f"{self._name}: the file cannot be read after {read_s:.1f} s; export it again"
             )
         elif self._num_damaged and self._damaged_s < end_s:
             self.remarks.append(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+from typing import Literal
 
 import av
 
@@ -22,6 +23,15 @@ _FRAMED = (
     ("ac3", 0xFFFF, 0x0B77),
 )
 _TS_PACKET, _TS_SYNC = 188, 0x47
+MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
+# The place of a file's size, its number of bytes and their order, and the bytes that it leaves out.
+_SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
+    b"RIFF": (4, 4, "little", 8),
+    b"RIFX": (4, 4, "big", 8),
+    b"FORM": (4, 4, "big", 8),
+    b"RF64": (20, 8, "little", 8),
+    b"riff": (16, 8, "little", 0),
+}
 _OTHER = {
     b"PK\3\4": "a zip archive; unpack it first",
     b"\x1f\x8b": "a gzip archive; unpack it first",
@@ -65,16 +75,24 @@ def why_unreadable(begin: bytes, reason: str) -> str:
     if kind := other_kind(begin):
         return f"cannot read audio: this is {kind}"
     if not any(begin):
-        return "the file has only zeros, as it was not stored completely; copy or record it again"
-    if begin.startswith(b"ftyp", 4) or begin.startswith(b"mdat", 4):
-        return (
-            "cannot read audio: the file is cut off, so its index is missing; copy or record it"
-            " again"
-        )
+        return "cannot read audio: the file has only zeros; copy or record it again"
+    if begin[4:8] in (b"ftyp", b"mdat"):
+        return "cannot read audio: the file is cut off before its index; copy or record it again"
+    if is_sound(begin):
+        return f"cannot read audio: the file is damaged or cut off ({reason}); copy it again"
     return (
         f"cannot read audio from this file ({reason}); use wav, flac, mp3, m4a, mp4, webm or ogg."
         " Raw samples need: kouxing speak --raw"
     )
+
+
+def stated_bytes(begin: bytes) -> int | None:
+    """Return the size that the header of a WAV, W64, AVI or AIFF file states; None if unknown."""
+    for mark, (start, size, order, num_before) in _SIZES.items():
+        if begin.startswith(mark):
+            stated = int.from_bytes(begin[start : start + size], order) + num_before
+            return stated if stated < MIN_UNKNOWN_BYTES else None
+    return None
 
 
 def needs_all(begin: bytes) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import soundfile
@@ -59,17 +60,65 @@ def test_honors_the_start_of_a_late_track(tmp_path: Path, name: str, codec: str)
     assert source.remarks == []
 
 
-def test_times_count_from_the_start_of_the_file(tmp_path: Path) -> None:
-    write_media(tmp_path / "a.mkv", "pcm_s16le", TONE, RATE_HZ, start_s=100.0)
-    np.testing.assert_allclose(read_audio(tmp_path / "a.mkv")[0][:, 0], TONE, atol=1e-4)
-
-
-def test_reads_a_chained_ogg_file_to_its_end(tmp_path: Path) -> None:
-    soundfile.write(tmp_path / "a.ogg", TONE, RATE_HZ)
-    (tmp_path / "a.ogg").write_bytes((tmp_path / "a.ogg").read_bytes() * 2)
-    source = open_audio(tmp_path / "a.ogg")
-    assert len(_read(source)) == pytest.approx(2 * RATE_HZ, abs=1200)
+@pytest.mark.parametrize(
+    ("start_s", "silence_s"), [(2.0, 2.0), (40_000.0, 0.0)], ids=["late", "time of day"]
+)
+def test_honors_the_start_of_the_only_track(
+    tmp_path: Path, start_s: float, silence_s: float
+) -> None:
+    write_media(tmp_path / "a.mkv", "pcm_s16le", TONE, RATE_HZ, start_s=start_s)
+    source = open_audio(tmp_path / "a.mkv")
+    assert _spans(_read(source)) == [pytest.approx((silence_s, silence_s + 1.0), abs=0.02)]
     assert source.remarks == []
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "rates_hz"),
+    [("a.ogg", "libopus", [48_000, 48_000]), ("a.ts", "aac", [48_000, 48_000]),
+     ("a.aac", "aac", [16_000, 44_100]), ("a.mp3", "libmp3lame", [44_100, 44_100])],
+)  # fmt: skip
+def test_reads_files_that_were_joined(
+    tmp_path: Path, name: str, codec: str, rates_hz: list[int]
+) -> None:
+    data = b""
+    for rate_hz in rates_hz:
+        write_media(tmp_path / name, codec, TONE[:rate_hz], rate_hz)
+        data += (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(data)
+    source = open_audio(tmp_path / name)
+    samples = _read(source)
+    assert source.sample_rate_hz == rates_hz[0]
+    assert len(samples) / rates_hz[0] == pytest.approx(2.0, abs=0.25)
+    assert np.abs(samples[-rates_hz[0] // 2 : -rates_hz[0] // 4]).max() > 0.3
+
+
+def test_says_where_a_joined_file_cannot_be_read(tmp_path: Path) -> None:
+    data = b""
+    for rate_hz in (16_000, 8_000):
+        soundfile.write(tmp_path / "a.ogg", TONE[:rate_hz], rate_hz)
+        data += (tmp_path / "a.ogg").read_bytes()
+    (tmp_path / "a.ogg").write_bytes(data)
+    source = open_audio(tmp_path / "a.ogg")
+    assert len(_read(source)) == pytest.approx(16_000, abs=600)
+    (remark,) = source.remarks
+    assert "cannot be read after 1.0 s" in remark
+
+
+@pytest.mark.parametrize("codec", ["aac", "pcm_s16le"])
+def test_mixes_eight_channels(tmp_path: Path, codec: str) -> None:
+    channels = np.zeros((RATE_HZ, 8), np.float32)
+    channels[:, 2] = TONE
+    with av.open(tmp_path / "a.mka", "w") as container:
+        stream = container.add_stream(codec, rate=RATE_HZ, layout="7.1")
+        assert isinstance(stream, av.AudioStream)
+        frame = av.AudioFrame.from_ndarray(channels.reshape(1, -1), format="flt", layout="7.1")
+        frame.sample_rate = RATE_HZ
+        resampler = av.AudioResampler(stream.format.name, "7.1", RATE_HZ, frame_size=1024)
+        for part in [*resampler.resample(frame), *resampler.resample(None)]:
+            container.mux(stream.encode(part))
+        container.mux(stream.encode(None))
+    mixed = read_audio(tmp_path / "a.mka")[0].mean(axis=1)
+    assert np.abs(mixed[2000:-2000]).max() == pytest.approx(0.35, abs=0.02)
 
 
 def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
@@ -90,7 +139,9 @@ def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
         open_audio(path, track=3)
 
 
-@pytest.mark.parametrize("name", ["a.wav", "a.aiff", "a.flac", "a.mp3", "a.mkv", "a.mp4"])
+@pytest.mark.parametrize(
+    "name", ["a.wav", "a.rf64", "a.w64", "a.aiff", "a.flac", "a.mp3", "a.mkv", "a.mp4"]
+)
 def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     path, samples = tmp_path / name, np.tile(TONE, 3)
     if path.suffix in (".mkv", ".mp4"):
