@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import av
 import numpy as np
@@ -88,9 +88,9 @@ class MediaSound:
             raise
         self.sample_rate_hz: int = first.sample_rate
         self.num_channels = min(2, first.layout.nb_channels)
-        kind = self._container.format
-        self._restarts = bool(kind.flags & av.format.Flags.ts_discont.value)
-        has_index = not kind.flags & av.format.Flags.generic_index.value
+        kind, flags = self._container.format, cast(Any, av.format.Flags)
+        self._restarts = bool(kind.flags & flags.ts_discont.value)
+        has_index = not kind.flags & flags.generic_index.value
         self._has_times = self._restarts or has_index or kind.name == "flac"
         self.duration_s = None if is_pipe else self._stated_s()
         self.blocks = self._blocks(first)
