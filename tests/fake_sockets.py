@@ -59,8 +59,7 @@ class FakeSockets:
     ) -> FakeConnection:
         return self._open({endpoint}, on_message, on_refused)
 
-    def connect_events(self, endpoint: str, on_message: Callable[[Any], None]) -> FakeConnection:
-        return self._open({endpoint}, on_message)
+    connect_events = connect
 
     def subscribe(
         self,

@@ -31,14 +31,12 @@ test("the microphone is cut into chunks of 20 ms without gaps, and clipped", () 
 
 /** Play blocks; return the output. */
 function play(player, numBlocks) {
-  const output = [];
-  for (let i = 0; i < numBlocks; i++) {
+  return Array.from({ length: numBlocks }, () => {
     const block = new Float32Array(BLOCK);
     player.process([], [[block]]);
     globalThis.currentFrame += BLOCK;
-    output.push(...block);
-  }
-  return output;
+    return [...block];
+  }).flat();
 }
 
 function playerWith(anchor) {

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
 from functools import cache
 from typing import Any, cast
 
@@ -28,32 +28,20 @@ from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import (
-    Heartbeat,
     SessionInput,
     SessionStarted,
     StartSession,
 )
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
+from tests.control_stage import LOCAL, PROVIDED, beat
 from tests.samples import SAMPLES
 from tests.system import free_port
 
-LOCAL = "tcp://127.0.0.1:*"
 NO_CONTROL = f"tcp://127.0.0.1:{free_port()}"
 MAX_SESSIONS = 4
-WORKERS = [
-    Heartbeat(
-        service=service,
-        instance=f"{service}-1",
-        role="worker",
-        state="ready",
-        sent_ns=0,
-        endpoints={name: f"tcp://127.0.0.1:{port}" for port, name in enumerate(names, start=1)},
-    )
-    for service, names in
-    (("recognizer", ("audio", "phones")), ("synthesizer", ("faps", "phone_input")))
-]  # fmt: skip
-START = dataclasses.replace(
+WORKERS = [replace(beat(kind), instance=f"{kind}-1") for kind in PROVIDED]
+START = replace(
     cast(StartSession, SAMPLES["start-session"]),
     paced=False,
     endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
@@ -90,10 +78,10 @@ def values_like(value: object) -> st.SearchStrategy[Any]:
 def messages(draw: st.DrawFn) -> Message:
     """Draw a message of any kind, of which up to three fields have invalid values."""
     sample = draw(st.sampled_from([*SAMPLES.values()]))
-    names = [field.name for field in dataclasses.fields(sample)]
+    names = [field.name for field in fields(sample)]
     changed = draw(st.lists(st.sampled_from(names), max_size=3, unique=True))
     values = {name: draw(values_like(getattr(sample, name))) for name in changed}
-    return dataclasses.replace(sample, **values)
+    return replace(sample, **values)
 
 
 PARTS = st.lists(st.binary(max_size=300), min_size=1, max_size=6)
@@ -105,7 +93,7 @@ ACTIONS = st.lists(
         st.tuples(st.just("subscribe"), PARTS),
         st.tuples(st.just("rename"), st.binary(min_size=1, max_size=4)),
         st.tuples(st.just("start"), st.builds(
-            lambda token, epoch, endpoint: dataclasses.replace(
+            lambda token, epoch, endpoint: replace(
                 START, token=token, epoch=epoch, endpoints={"phone_input": endpoint}),
             st.sampled_from(["t", "7"]), st.integers(0, 2),
             st.one_of(st.just(START.endpoints["phone_input"]), TEXTS))),

@@ -33,17 +33,14 @@ def num_admitted(load: WorkerLoad, now_s: float) -> int:
     return load.num_sessions - before
 
 
-def test_a_new_worker_gets_a_few_sessions() -> None:
-    assert num_admitted(WorkerLoad(), 0.0) == 3
-
-
 @pytest.mark.parametrize(
     ("num_sessions", "measured", "admitted"),
-    [(2, 0.19, 6), (6, 0.57, 2), (8, 0.76, 0), (8, 1.0, 0), (1, 0.01, 79)],
+    [(2, 0.19, 6), (8, 0.76, 0), (1, 0.01, 79)],
 )
 def test_admits_as_many_sessions_as_the_measured_load_leaves_room_for(
     num_sessions: int, measured: float, admitted: int
 ) -> None:
+    assert num_admitted(WorkerLoad(), 0.0) == 3, "its cost is unknown"
     assert num_admitted(loaded(num_sessions, measured), 10.0) == admitted
 
 

@@ -65,16 +65,6 @@ def test_vrm_blinks_add_up() -> None:
     assert wink["blinkRight"] == 0
 
 
-def test_vrm_gaze() -> None:
-    for name, faps in (
-        ("lookLeft", {"yaw_l_eyeball": 40_000, "yaw_r_eyeball": 40_000}),
-        ("lookDown", {"pitch_l_eyeball": 30_000, "pitch_r_eyeball": 30_000}),
-    ):
-        found = weights_by_name(neutral_faps(**faps), VRM)
-        assert max(found, key=found.__getitem__) == name
-        assert found[name] > 0.5
-
-
 def test_shapes_move_the_mesh_as_named() -> None:
     head = heads.load("woman")
 
