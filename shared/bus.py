@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterable
+from enum import Enum
 from typing import Self
 
 import zmq
@@ -32,6 +33,14 @@ SUBSCRIPTIONS = Limits(part_bytes=512, queue_length=32, cost=1.0)  # most of it 
 RECONNECT_MS = (20, 50)  # between attempts to connect, initial and maximum
 CONNECT_MS = 300  # for one attempt; limits the round-trip time
 HANDSHAKE_MS = 2000
+
+
+class Reach(Enum):
+    """How a connection to an endpoint ends."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"  # the service rejects this key, or has another key itself
+    UNREACHABLE = "unreachable"
 
 
 class Bus:
@@ -92,12 +101,12 @@ class Bus:
             socket.connect(endpoint)
         return socket
 
-    def is_refused(self, endpoint: str) -> bool:
-        """Return whether a service at an endpoint rejects this key, or has another key itself.
+    def probe(self, endpoint: str, *, is_publisher: bool = False) -> Reach:
+        """Try to connect to a router or a publisher; this takes up to four seconds.
 
         A service that rejects the key closes the connection. A service that hangs does not.
         """
-        probe = self._connect(zmq.DEALER, queue_length=1)
+        probe = self._connect(zmq.SUB if is_publisher else zmq.DEALER, queue_length=1)
         probe.raw.setsockopt(zmq.HANDSHAKE_IVL, 3 * HANDSHAKE_MS)  # not closed from here first
         ends = {zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_CONNECT_RETRIED}
         monitor = probe.raw.get_monitor_socket(sum({zmq.EVENT_CONNECTED, *ends}))
@@ -108,7 +117,10 @@ class Bus:
         probe.raw.disable_monitor()
         monitor.close()
         self.drop(probe, linger_s=0.0)
-        return {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
+        if zmq.EVENT_HANDSHAKE_SUCCEEDED in events:
+            return Reach.ACCEPTED
+        is_refused = {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
+        return Reach.REFUSED if is_refused else Reach.UNREACHABLE
 
     def drop(self, socket: Socket, *, linger_s: float = 1.0) -> None:
         """Close one socket (see ``Socket.close``)."""

@@ -43,6 +43,35 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def is_local(host: str) -> bool:
+    """Return whether a host name or address belongs to this machine."""
+    if host in WILDCARDS:
+        return True
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_DGRAM)
+        for family, kind, _, _, address in found:
+            with socket.socket(family, kind) as probe:
+                probe.bind(address)
+    except OSError:  # the name is unknown, or it is the address of another machine
+        return False
+    return True
+
+
+def reach_error(host: str, port: str, timeout_s: float = 3.0) -> str:
+    """Return why a TCP port cannot be reached from here, or an empty string."""
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout_s).close()
+    except TimeoutError:
+        return "no answer; open this port in the firewalls between the machines"
+    except ConnectionRefusedError:
+        return "nothing listens there; start the service, or correct its address"
+    except socket.gaierror:
+        return "the host name is unknown; correct it, or write an IP address"
+    except OSError as error:
+        return f"{error.strerror}; check the address and the network"
+    return ""
+
+
 def with_host(endpoint: str, host: str) -> str:
     """Replace the host of an endpoint by another name or address."""
     _, port = split_endpoint(endpoint, "endpoint")

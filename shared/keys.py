@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from kouxing.shared.endpoints import with_key
+from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 
 CONTROL = "control"
@@ -78,31 +78,51 @@ def key_folder() -> Path:
     return (Path(state) if state else Path.home() / ".local" / "state") / "kouxing"
 
 
-def load_key(name: str, roles: Collection[str]) -> Key:
+def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
     """Return a key of this machine. On control's machine, create and allow a missing key.
 
-    Raises ``UserError`` if the key cannot be read or created, or other users can read it.
+    ``control`` is control's address; empty: this machine. Raises ``UserError`` if the key cannot be
+    read or created, other users can read it, or it belongs to another system than control's key.
     """
     if credential := _credential(f"{name}.key"):
         return read_key(credential)
+    is_here = not control or is_local(split_endpoint(control, CONTROL)[0])
     with _locked_folder() as folder:
-        path = folder / f"{name}.key"
+        path, control_path = folder / f"{name}.key", folder / "control.key"
         if not path.exists():
-            if not (folder / "control.key").exists():
-                if any(folder.glob("*.key")):
+            if not control_path.exists():
+                if not is_here or any(folder.glob("*.key")):
                     raise UserError(
                         f"{path} is missing, and a new key can be created only on control's"
                         f" machine. Run there: {add_key_hint(roles)}"
                     )
-                _write(folder / "control.key", _new_key())
+                _write(control_path, _new_key())
             if name != CONTROL:
                 _add_key(folder, path, name, roles)
-        return read_key(path)
+        key = read_key(path)
+        if control_path.exists() and read_key(control_path).public != key.control:
+            raise UserError(
+                f"{path} belongs to another system than {control_path}. If control runs on another"
+                f" machine, run: rm {control_path} {folder / _ALLOWED}. If it runs here, run:"
+                f" rm {path}"
+            )
+        return key
 
 
-def user_key() -> Key:
-    """Return the key of the user's commands and clients. Raises the errors of ``load_key``."""
-    return load_key(CLIENT, CLIENT_ROLES)
+def user_key(*, control: str = "") -> Key:
+    """Return the key of the user's commands and clients. Parameter and errors as ``load_key``."""
+    return load_key(CLIENT, CLIENT_ROLES, control=control)
+
+
+def local_keys() -> dict[str, Key]:
+    """Return this machine's keys by name, without control's. Raises ``UserError`` as ``read_key``.
+
+    The folder of the keys may not exist.
+    """
+    credentials = os.environ.get("CREDENTIALS_DIRECTORY")
+    folders = [key_folder(), *([Path(credentials)] if credentials else [])]
+    paths = {path.stem: path for folder in folders for path in sorted(folder.glob("*.key"))}
+    return {name: read_key(path) for name, path in paths.items() if name != CONTROL}
 
 
 def control_endpoint(address: str, *, insecure: bool) -> str:
@@ -110,7 +130,7 @@ def control_endpoint(address: str, *, insecure: bool) -> str:
 
     Raises ``UserError`` if the user's key cannot be read (see ``load_key``).
     """
-    return with_key(address, "" if insecure else user_key().control)
+    return with_key(address, "" if insecure else user_key(control=address).control)
 
 
 def rejection_hint(control: str, name: str, roles: Collection[str]) -> str:

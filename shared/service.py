@@ -15,12 +15,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
 from typing import ClassVar
 
-from kouxing.shared.bus import Bus
+from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
-from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
+from kouxing.shared.endpoints import is_loopback, reach_error, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Grant, Peer, load_key, rejection_hint, save_grants
 from kouxing.shared.logs import LOG
@@ -48,12 +49,14 @@ SESSIONS_PER_HEARTBEAT = 16  # of a worker, so that a heartbeat's cost does not 
 RESYNC_AFTER_S = 0.8  # without a heartbeat; control may have moved the sessions
 REPLY_TIMEOUT_S = 0.5
 NO_REPLY_S = 10.0  # without a reply from control, until the service looks for the reason
+FIRST_REPLY_S = 3.0  # the same at startup
 LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0
 HAND_OVER_S = 1.5  # in which control moves the sessions of a worker that stops
 MAX_TICK_GAP_S = 5.0  # without a tick, the service is not healthy
 EXIT_AFTER_S = 15.0  # without a tick, a health check ends the process
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id; the underscore: not a setting
+_BUILD = version("kouxing")
 PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
 
 
@@ -73,7 +76,13 @@ class Service(MessageLoop):
         self.config = config
         self.name = self.kind.name
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
-        self.key = None if config.insecure else load_key(self.name, self.kind.key_roles)
+        self.key = (
+            None
+            if config.insecure
+            else load_key(
+                self.name, self.kind.key_roles, control=config.control if has_control else ""
+            )
+        )
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
         super().__init__(Bus(self.key, extra_connections=extra_connections))
         self.stall = StallDetector(time.monotonic())
@@ -88,7 +97,7 @@ class Service(MessageLoop):
         self._heartbeat_s = time.monotonic()  # when the newest heartbeat was sent
         self._num_reported = 0  # sessions in earlier heartbeats
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
-        self._reply_s = time.monotonic()
+        self._reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S
         self._control_instance = ""
         self._busy = LoadMeter(LOAD_PERIOD_S, time.monotonic())
         self._metrics_server: MetricsServer | None = None
@@ -193,7 +202,10 @@ class Service(MessageLoop):
             )
         self._warn_if_open_to_others()
         self._send_heartbeat()
-        LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
+        if self.control is None:
+            self._log_ready()
+        else:
+            LOG.info("waiting for control at %s", self.config.control)
 
     def main_loop(self) -> None:
         """Handle messages until the service should exit."""
@@ -327,6 +339,7 @@ class Service(MessageLoop):
                 state="draining" if self._exit_requested else "ready",
                 sent_ns=self._sent_ns,
                 endpoints=self.endpoints,
+                build=_BUILD,
                 load=load,
                 metrics={
                     **self.metrics.snapshot(now_s),
@@ -354,18 +367,25 @@ class Service(MessageLoop):
             if not self.control.can_send:  # another program was at the address, or other keys
                 self.unregister(self.control)
                 self.control = self._connect_to_control()
-            threading.Thread(target=self._warn_if_refused, daemon=True).start()
+            threading.Thread(target=self._warn_about_control, daemon=True).start()
 
-    def _warn_if_refused(self) -> None:
-        """Log what to do if control does not accept the key; runs on a thread, as it waits."""
+    def _warn_about_control(self) -> None:
+        """Log why control does not answer, and what to do; runs on a thread, as it waits."""
         with contextlib.suppress(UserError), Bus(self.key) as bus:
-            if bus.is_refused(self.control_endpoint):
+            if bus.probe(self.control_endpoint) is Reach.REFUSED:
                 LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))
+            elif reason := reach_error(*split_endpoint(self.config.control, "control")):
+                LOG.warning("waiting for control at %s: %s", self.config.control, reason)
+
+    def _log_ready(self) -> None:
+        LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
 
     def _on_heartbeat_reply(self, reply: HeartbeatReply, _sender: Peer) -> None:
         self._reply_s = time.monotonic()
         self._replied_ns = reply.sent_ns
         self.clock_offset.update(reply.sent_ns, reply.received_ns, reply.replied_ns, now_ns())
+        if not self._control_instance:
+            self._log_ready()
         has_restarted = self._control_instance not in ("", reply.control)
         self._control_instance = reply.control
         if reply.keys is not None:

@@ -235,6 +235,22 @@ def status(control: Control = "", json_file: JsonFile = None) -> None:
     write_json(json_file, asdict(report))
 
 
+def doctor(control: Control = "") -> None:
+    """Check keys, addresses, clocks and versions from this machine, and print what to do."""
+    from kouxing.services.cli.doctor import examine
+
+    num_checks = num_failed = 0
+    for finding in examine(control):
+        num_checks += 1
+        num_failed += bool(finding.fix)
+        typer.echo(f"{'FAIL' if finding.fix else 'ok  '} {finding.subject}: {finding.result}")
+        for line in finding.fix.splitlines():
+            typer.echo(f"     {line}")
+    typer.echo(f"{num_failed} of {num_checks} checks failed")
+    if num_failed:
+        raise typer.Exit(1)
+
+
 def _session_name(name: str) -> str:
     """Return a session name after checking it. An empty name is allowed."""
     if not re.fullmatch("[A-Za-z0-9_-]{0,64}", name):
@@ -253,8 +269,13 @@ def control_address(given: str) -> str:
 
     Without ``given`` and without a setting, it is that of the user's newest system.
     """
+    running, config = find_system(given)
+    return running or control_endpoint(config.control, insecure=config.insecure)
+
+
+def find_system(given: str) -> tuple[str, ServiceConfig]:
+    """Return control's endpoint in the user's newest system, if it applies, and the settings."""
     settings, overrides = read_settings(), {"control": given} if given else {}
     keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
     running = find_control() if keys["control"].is_default else ""
-    config = settings.load(ServiceConfig, overrides)
-    return running or control_endpoint(config.control, insecure=config.insecure)
+    return running, settings.load(ServiceConfig, overrides)

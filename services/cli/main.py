@@ -111,7 +111,7 @@ def _service_command(kind: ServiceKind) -> Callable[..., None]:
 
 for command in (
     run.run, clients.speak, offline.render, offline.lips, clients.listen, clients.send,
-    clients.express, offline.phones, offline.align, clients.devices, clients.status,
+    clients.express, offline.phones, offline.align, clients.devices, clients.status, clients.doctor,
     cluster.cluster, configuration.config,
 ):  # fmt: skip
     app.command()(command)

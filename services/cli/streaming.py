@@ -88,13 +88,13 @@ class _Streaming:
             paced=paced,
             **options,
         )
-        self._events = self._session.events()
-        self._frames = self._session.frames()
-        self._results = self._session.results(Phone, keep_all=True)
         self._phones: set[int] = set()  # indices of those that are not silence
-        language = self._session.info["facts"]["language"] or DEFAULT_LANGUAGE
-        self._silence = load_inventory(language).silence
         try:
+            self._events = self._session.events()
+            self._frames = self._session.frames()
+            self._results = self._session.results(Phone, keep_all=True)
+            language = self._session.info["facts"]["language"] or DEFAULT_LANGUAGE
+            self._silence = load_inventory(language).silence
             with self._progress() as progress:
                 task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
                 self._show_time = functools.partial(progress.update, task)

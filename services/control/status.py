@@ -82,4 +82,5 @@ class Status:
             clock_offset_ms=record.metrics.get("clock_offset_ms", 0.0),
             endpoints=endpoints,
             metrics=dict(record.metrics),
+            build=heartbeat.build,
         )

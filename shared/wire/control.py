@@ -72,6 +72,7 @@ class Heartbeat(Message):
         default_factory=list
     )  # names of the endpoints that it connects to
     facts: SessionFacts = field(default_factory=SessionFacts)
+    build: Text = ""  # version of kouxing
     load: Probability = 0.0  # share of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
     sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(

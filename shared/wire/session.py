@@ -143,6 +143,7 @@ class ServiceState:
     clock_offset_ms: float  # its clock minus control's
     endpoints: EndpointMap
     metrics: MetricMap
+    build: Text = ""  # version of kouxing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

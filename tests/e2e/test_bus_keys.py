@@ -17,7 +17,7 @@ from kouxing_client import Client, KouxingError
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.kinds import KINDS
 from kouxing.shared import connections, kernel_sockets
-from kouxing.shared.bus import Bus
+from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
@@ -105,7 +105,7 @@ def test_a_socket_accepts_only_keys_of_its_role(
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
         assert router.wait(5.0 if gets_in else 0.5) == gets_in
-        assert bus.is_refused(endpoint) != gets_in
+        assert (bus.probe(endpoint) is Reach.ACCEPTED) == gets_in
 
 
 def test_rejects_a_key_of_another_system(
@@ -118,8 +118,8 @@ def test_rejects_a_key_of_another_system(
     with Bus(key) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
         assert not router.wait(0.5)
-        assert bus.is_refused(endpoint)
-        assert bus.is_refused(with_key(router.endpoint, control.public))
+        assert bus.probe(endpoint) is Reach.REFUSED
+        assert bus.probe(with_key(router.endpoint, control.public)) is Reach.REFUSED
 
 
 def test_one_key_cannot_use_all_connections(
@@ -147,7 +147,7 @@ def test_one_key_cannot_use_all_connections(
 
 def test_an_unused_port_does_not_refuse(server: Server) -> None:
     with Bus(server.key) as bus:
-        assert not bus.is_refused(with_key("tcp://127.0.0.1:1", server.key.public))
+        assert bus.probe(with_key("tcp://127.0.0.1:1", server.key.public)) is not Reach.REFUSED
 
 
 def test_a_hung_control_does_not_refuse() -> None:
@@ -232,7 +232,7 @@ def test_allows_and_revokes_a_key_while_running(
         server.bus.zap.refresh()
         dealer.send(StatusRequest(request="2"))
         assert messages_of(router) == []
-        assert bus.is_refused(endpoint)
+        assert bus.probe(endpoint) is Reach.REFUSED
 
 
 class Recognizer(Service):
@@ -257,22 +257,22 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     with service.bus, Bus(key) as bus:
         router = service.bus.bind_router(LOCAL, "recognizer.audio")
         endpoint = with_key(router.endpoint, service.key.public if service.key else "")
-        assert bus.is_refused(endpoint)
+        assert bus.probe(endpoint) is Reach.REFUSED
         key_folder().chmod(0o755)  # nothing is written there
         allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
         service._allow_keys(allowed)
         assert "until this process ends: other users can read" in caplog.text
-        assert not bus.is_refused(endpoint)
+        assert bus.probe(endpoint) is not Reach.REFUSED
         service._allow_keys({})
-        assert bus.is_refused(endpoint)
+        assert bus.probe(endpoint) is Reach.REFUSED
 
 
 def test_ignores_a_broken_list(server: Server) -> None:
     router, endpoint = server.router("control.commands")
     with Bus(key_of("laptop", "client")) as bus:
-        assert not bus.is_refused(endpoint)
+        assert bus.probe(endpoint) is not Reach.REFUSED
         (key_folder() / "allowed").write_text("nonsense\n", encoding="ascii")
-        assert not bus.is_refused(endpoint)
+        assert bus.probe(endpoint) is not Reach.REFUSED
         assert router.endpoint
 
 

@@ -13,7 +13,7 @@ import pytest
 from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, find_key
 
 from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
-from kouxing.shared.bus import Bus
+from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
 from kouxing.shared.sockets import Socket
@@ -142,7 +142,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
         assert max(frame.media_time for frame in frames) <= 16000
         assert not stranger.wait(0.1), "it is told no sequence number"
     with Bus(user_key()) as bus:
-        assert bus.is_refused(endpoint), "a client does not even get in"
+        assert bus.probe(endpoint) is Reach.REFUSED, "a client does not even get in"
 
 
 @pytest.fixture

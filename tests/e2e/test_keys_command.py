@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +16,7 @@ import pytest
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import key_folder, read_grants
 from tests.e2e.following import stream
-from tests.system import System, kouxing, own_addresses
+from tests.system import ONE_THREAD, ROOT, System, kouxing, own_addresses
 
 pytestmark = pytest.mark.e2e
 WORKERS = ("recognizer", "synthesizer")
@@ -52,6 +57,10 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         laptop = machine(tmp_path, "laptop", "client", "client")
         monkeypatch.setenv("XDG_STATE_HOME", str(laptop))
         assert stream(system.control, np.zeros(3200, np.float32)).frames
+        checked = kouxing("doctor", control=system.control)
+        assert checked.returncode == 0, checked.stdout
+        assert "key client: control accepts it" in checked.stdout
+        assert "0 of 5 checks failed" in checked.stdout
         refused = kouxing("keys", "add", "friend")
         assert refused.returncode == 2
         assert "on control's machine" in refused.stderr
@@ -66,3 +75,46 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         while "kouxing keys add NAME --role service:recognizer" not in system.log("recognizer"):
             system.assert_all_alive()
             time.sleep(0.1)
+
+
+def test_a_service_waits_for_control_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert kouxing("keys", "init").returncode == 0
+    addresses = own_addresses(["control", "synthesizer"])
+    with started("synthesizer", tmp_path, addresses) as synthesizer:
+        log = read_until("nothing listens there; start the service", synthesizer)
+        assert "waiting for control at tcp://127.0.0.1" in log
+        assert '"ready' not in log
+        checked = kouxing("doctor", environment=addresses)
+        assert checked.returncode == 1
+        assert "FAIL control at tcp://127.0.0.1" in checked.stdout
+        with started("control", tmp_path, addresses):
+            read_until('"message": "ready ', synthesizer)
+
+
+@contextmanager
+def started(
+    service: str, folder: Path, settings: dict[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"kouxing.services.{service}"],
+        env={**os.environ, **ONE_THREAD, **settings},
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def read_until(text: str, process: subprocess.Popen[bytes]) -> str:
+    log = ""
+    while text not in log:
+        line = process.stderr.readline().decode() if process.stderr else ""
+        assert line, f"it ended: {log}"
+        log += line
+    return log

@@ -124,6 +124,22 @@ def test_an_added_key_works_on_another_machine(
     assert read_grants() == {public: Grant("laptop", ("client",))}
 
 
+def test_creates_no_key_for_control_on_another_machine() -> None:
+    with pytest.raises(UserError, match=r"lamp\.key is missing.*kouxing keys add NAME --role"):
+        load_key("lamp", ("service:lamp",), control="tcp://192.0.2.1:5550")
+    assert not list(key_folder().glob("*"))
+    assert load_key("lamp", ("service:lamp",), control="tcp://127.0.0.1:5550")
+
+
+def test_names_the_key_of_another_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    add_key("host", ["service:lamp"], tmp_path / "host.key")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    load_key("lamp", ("service:lamp",))  # started before its key was copied
+    (tmp_path / "host.key").replace(key_folder() / "lamp.key")
+    with pytest.raises(UserError, match=r"belongs to another system.*rm .*control\.key .*allowed"):
+        load_key("lamp", ("service:lamp",), control="tcp://192.0.2.1:5550")
+
+
 @pytest.mark.parametrize(
     ("control", "hint"),
     [("tcp://host:5550 key", "driver.key"), ("tcp://host:5550", "set only here")],

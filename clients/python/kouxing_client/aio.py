@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
     LAST_ANSWER_S,
-    NOT_JOINED,
     BaseClient,
     BaseResults,
     BaseSession,
     FaceSettings,
     open_fields,
 )
-from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.errors import Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
 
 if TYPE_CHECKING:
@@ -166,7 +165,7 @@ class AsyncSession(BaseSession):
         try:
             await asyncio.wait_for(asyncio.wrap_future(joined), self._thread.timeout_s)
         except TimeoutError:
-            raise KouxingError(NOT_JOINED) from None
+            raise self._not_joined() from None
         if added := self._add_shapes(shape_set):
             await asyncio.wrap_future(added)
         return AsyncResults(inbox, close)

@@ -20,7 +20,6 @@ CHUNK_BYTES = 32_000  # largest chunk in one message
 MAX_LIVE = 100  # unread results of a live session
 MAX_EVENTS = 1000  # unread events of a session
 MAX_UNACKNOWLEDGED = 500  # messages; then the sender waits
-NOT_JOINED = "a publisher did not confirm the subscription; do all services run?"
 LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before a session closes
 
 
@@ -231,6 +230,15 @@ class BaseSession:
         subscription = Subscription(core, classes, shape_set, inbox, on_joined, on_result)
         thread.call(lambda: core.subscribe(subscription))
         return inbox, lambda: thread.call(lambda: core.unsubscribe(subscription)), joined
+
+    def _not_joined(self) -> KouxingError:
+        """Return the error of a subscription that is not confirmed."""
+        endpoints = [self._core.endpoints.get(name, "") for name in ("phones", "faps")]
+        addresses = sorted({endpoint.partition(" ")[0] for endpoint in endpoints if endpoint})
+        return KouxingError(
+            f"{' or '.join(addresses)} does not confirm the subscription; run 'kouxing doctor' on"
+            " this machine to find out why"
+        )
 
     def _add_shapes(self, name: str) -> Future[Fields] | None:
         """Request a set of blend shapes, unless the session has it already."""

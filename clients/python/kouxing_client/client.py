@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
     LAST_ANSWER_S,
-    NOT_JOINED,
     BaseClient,
     BaseResults,
     BaseSession,
@@ -221,7 +220,7 @@ class Session(BaseSession):
         try:
             joined.result(self._thread.timeout_s)
         except FutureTimeout:
-            raise KouxingError(NOT_JOINED) from None
+            raise self._not_joined() from None
         if added := self._add_shapes(shape_set):
             added.result()
         return Results(inbox, close)

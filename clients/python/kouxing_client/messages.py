@@ -170,6 +170,8 @@ class ServiceState:
     """its clock minus control's"""
     endpoints: dict[str, str]
     metrics: dict[str, float]
+    build: str = ""
+    """version of kouxing; empty if unknown"""
 
 
 @dataclass(frozen=True, kw_only=True)
