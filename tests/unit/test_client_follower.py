@@ -117,12 +117,6 @@ def test_a_new_epoch_of_one_publisher_drops_nothing_of_another() -> None:
     assert scene.follower.epoch == 2
 
 
-def test_takes_a_frame_that_a_new_epoch_repeats_once() -> None:
-    scene = Scene().complete()
-    scene.publish(frame(1), frame(2), frame(2, epoch=2), frame(3, epoch=2))
-    assert [(one.sequence, one.epoch) for one in scene.received] == [(1, 1), (2, 1), (3, 2)]
-
-
 def test_a_publisher_may_report_a_new_epoch_before_control_does() -> None:
     scene = Scene().complete()
     scene.publish(frame(5), frame(8), EndOfFaps(epoch=1), frame(9, epoch=2))

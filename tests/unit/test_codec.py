@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import msgpack
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from kouxing.shared.clock import to_seconds
-from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import (
-    EndOfSound,
-    LipPositions,
-    Phone,
-    Progress,
-    SoundEvent,
-    SpeechChange,
-)
 from kouxing.shared.wire.codec import BadMessage, decode, encode
-from kouxing.shared.wire.events import event_of, message_of
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import OpenSession
 from tests.samples import SAMPLES
@@ -109,41 +95,3 @@ def test_rejects_a_damaged_message_or_reads_it_the_same_twice(
             except BadMessage:
                 continue
             assert encode(decode(read)) == read
-
-
-TIMES = st.integers(0, 2**40).map(to_seconds)  # two years
-NUMBERS = st.integers(0, 2**53)
-SYMBOLS = st.from_regex("[a-z]{1,4}", fullmatch=True)
-EVENTS: st.SearchStrategy[SoundEvent] = st.one_of(
-    st.builds(Phone, index=NUMBERS, symbol=SYMBOLS, onset_s=TIMES, duration_s=TIMES,
-              confidence=st.floats(0, 1), final=st.booleans()),
-    st.builds(SpeechChange, active=st.booleans(), time_s=TIMES),
-    st.builds(Progress, time_s=TIMES, level_db=st.floats(-200, 20)),
-    st.builds(EndOfSound, time_s=TIMES),
-)  # fmt: skip
-
-
-@given(EVENTS)
-def test_converts_an_event_to_a_message_and_back(event: SoundEvent) -> None:
-    message = message_of(event)
-    assert decode(encode(message)) == message
-    assert event_of(message) == event
-
-
-@given(
-    st.builds(
-        LipPositions,
-        time_s=TIMES,
-        delay_s=st.integers(-16_000, 16_000).map(to_seconds),
-        faps=arrays(np.float32, len(MOUTH_FAPS), elements=st.floats(width=32, allow_nan=False)),
-        closure=st.floats(0, 1),
-        lip_to_teeth=st.floats(0, 1),
-    )
-)
-def test_converts_a_lip_frame_to_a_message_and_back(frame: LipPositions) -> None:
-    message = message_of(frame)
-    assert decode(encode(message)) == message
-    read = event_of(message)
-    assert isinstance(read, LipPositions)
-    np.testing.assert_array_equal(read.faps, frame.faps)
-    assert replace(read, faps=frame.faps) == frame

@@ -63,22 +63,6 @@ class Page:
         return self._registry.get_sample_value(name, {"service": "tester", **labels})
 
 
-def test_the_page_has_counters_gauges_and_values_of_the_process() -> None:
-    page = Page()
-    page.metrics.count("in_audio_chunk", 3)
-    page.metrics.count("dropped_bad-audio")
-    page.metrics.count("dropped_old_epoch", 2)
-    page.metrics.count("video_ms", 1500)
-    page.metrics.set("sessions", 4)
-    page.metrics.set("sessions", 7)
-    assert page.value("kouxing_messages_received_total", kind="audio-chunk") == 3
-    assert page.value("kouxing_messages_dropped_total", reason="bad-audio") == 1
-    assert page.value("kouxing_messages_dropped_total", reason="old-epoch") == 2
-    assert page.value("kouxing_video_seconds_total") == 1.5
-    assert page.value("kouxing_sessions") == 7 == page.metrics.snapshot(0.0)["sessions"]
-    assert (page.value("process_resident_memory_bytes") or 0) > 2**20
-
-
 def test_the_page_has_histograms_of_latencies_in_seconds() -> None:
     page = Page()
     for value_ms in (0.4, 5.0, 5.1, 60_000.0):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 from typing import Any, cast
 
 from kouxing.shared.keys import Peer
@@ -80,14 +79,3 @@ def test_a_new_epoch_starts_again_and_old_ones_are_ignored() -> None:
     link.send(1)
     link.deliver()
     assert link.received == [1, 2, 3, 1]
-
-
-def test_every_acknowledgement_carries_the_newest_frame() -> None:
-    link = Link()
-    link.receiver.acknowledge()
-    assert not link.router.sent, "no sender is known yet"
-    link.send(1)
-    link.deliver()
-    link.receiver.acknowledge()
-    expected = Acknowledge(session="s", epoch=1, sequence=1)
-    assert [*link.router.sent] == [replace(expected, newest_frame=FRAME)]
