@@ -62,7 +62,7 @@ def recognizer(
     curve: Annotated[Path | None, typer.Option(help="Plot errors against delay (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Compare phone and viseme errors, delays and CPU cost of acoustic models."""
+    """Compare phone and viseme errors and delays of acoustic models."""
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
     from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
 

@@ -1,4 +1,4 @@
-"""Error rates, delays and CPU cost of the recognizer.
+"""Error rates and delays of the recognizer.
 
 Measured for offline decoding and for the live output rule (Li et al. 2011, eq. 4) with several
 parameters:
@@ -7,8 +7,7 @@ parameters:
   speaker, with a bootstrap interval over speakers;
 - viseme error rate: the same for mouth shapes (Li 2011, table 1). Compound vowels are split. Equal
   neighbors count once, because the mouth does not move between them;
-- emission delay: media time when a phone is first emitted, minus its onset by forced alignment;
-- CPU seconds per second of audio, by stage.
+- emission delay: media time when a phone is first emitted, minus its onset by forced alignment.
 
 A live recognizer has two hypotheses. The first hypothesis holds each phone as first emitted, by the
 rule or, unlike in the paper, along with the next phone. The final hypothesis holds the corrected
@@ -17,8 +16,7 @@ phones. Every recording is a separate session, so the live mean starts from the 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -36,15 +34,12 @@ from kouxing.corpora.scoring import (
     matched_pairs,
 )
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
-from kouxing.evaluation.recognizer.confusions import Confusions
+from kouxing.evaluation.recognizer.labials import Labials
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.offline import decode_offline
-from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.errors import UserError
@@ -142,7 +137,7 @@ def evaluate_recognizer(
     rules = [*(rule for rule in rules if rule != default_rule), default_rule]
     offline = Score(name="offline decoding")
     live = [Score(name=_rule_name(rule)) for rule in rules]
-    confusions = {output: Confusions(inventory) for output in ("offline", "first", "final")}
+    labials = {output: Labials(inventory) for output in ("offline", "first", "final")}
     used: list[Utterance] = []
     seconds = 0.0
     for utterance in track(utterances, description=f"recognizing {split}"):
@@ -169,7 +164,7 @@ def evaluate_recognizer(
             score.delays_s += reference.delays_s(output)
         hypotheses = {"offline": recognized, "first": output.first, "final": output.final}
         for name, phones in hypotheses.items():
-            confusions[name].add(reference.phones, [phone.symbol for phone in phones])
+            labials[name].add(reference.phones, [phone.symbol for phone in phones])
     if not used:
         raise UserError(
             f"{corpus} has no usable recordings in the split {split!r}; choose another split"
@@ -183,8 +178,7 @@ def evaluate_recognizer(
         "seconds": seconds,
         "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (offline, *live)],
-        "labials": {output: counted.labials() for output, counted in confusions.items()},
-        "cpu_per_audio_second": cpu_by_stage(model, read_audio(used[0].path)),
+        "labials": {output: counts.rates() for output, counts in labials.items()},
     }
 
 
@@ -263,34 +257,3 @@ class _Reference:
             for i, j in matched_pairs(self.phones, symbols)
             if i is not None and j is not None and self.phones[i] == symbols[j]
         ]
-
-
-def cpu_by_stage(model: AcousticModel, samples: Samples) -> dict[str, float]:
-    """Return CPU seconds per second of audio by stage, with chunks of 10 ms."""
-    chunks = [samples[at : at + CHUNK_SAMPLES] for at in range(0, len(samples), CHUNK_SAMPLES)]
-    blocks = [
-        samples[at : at + BLOCK_SAMPLES]
-        for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
-    ]
-    front_end, stream = model.create_front_end(), model.create_stream()
-    decoder = Decoder(model.topology)
-    detector, resampler = VoiceActivityDetector(), Resampler(48_000)
-    frames = model.create_front_end().accept_waveform(samples)
-    scores = model.create_stream().score(frames)  # compiles before the clock starts
-    decoder.advance(scores[:1])
-    decoder.reset()
-
-    def run(stage: Callable[[Samples], object], pieces: Iterable[Samples]) -> float:
-        start = time.process_time()
-        for piece in pieces:
-            stage(piece)
-        return (time.process_time() - start) * SAMPLE_RATE_HZ / len(samples)
-
-    at_48_khz = np.array_split(np.repeat(samples, 3), len(chunks))
-    return {
-        "resampler_from_48_khz": run(resampler.accept_waveform, at_48_khz),
-        "voice_activity": run(detector.detect, blocks),
-        "front_end": run(front_end.accept_waveform, chunks),
-        "acoustic_model": run(stream.score, np.split(frames, len(frames))),
-        "decoder": run(decoder.advance, np.split(scores, len(scores))),
-    }

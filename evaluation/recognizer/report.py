@@ -41,15 +41,12 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
         print_table(
             console,
             "p, b, m and f, %",
-            ("output", "recall", "precision", "recognized as d t n g k h", "d t n g k h spoken"),
+            ("output", "recall", "precision"),
             (
                 (output, *map(percent, fractions.values()))
                 for output, fractions in figures["labials"].items()
             ),
         )
-        cost = figures["cpu_per_audio_second"]
-        parts = ", ".join(f"{stage} {seconds:.4f}" for stage, seconds in cost.items())
-        console.print(f"CPU seconds per second of audio: {parts}; total {sum(cost.values()):.4f}")
     if len(results) > 1:
         print_table(
             console,

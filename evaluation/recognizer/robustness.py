@@ -12,7 +12,6 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.scoring import ErrorCounts, count_errors, final_hypothesis, first_hypothesis
 from kouxing.corpora.speech_corpus import RowErrors, audio_files, read_corpus
-from kouxing.evaluation.recognizer.confusions import Confusions
 from kouxing.evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
@@ -21,6 +20,7 @@ from kouxing.evaluation.recognizer.disturbances import (
     babble,
 )
 from kouxing.evaluation.recognizer.error_rates import mouth_shapes
+from kouxing.evaluation.recognizer.labials import Labials
 from kouxing.evaluation.tables import percent, print_table
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
@@ -53,7 +53,7 @@ def evaluate_robustness(
     """Measure a model on disturbed speech and on sounds without its language.
 
     ``other_language`` is a folder of recordings, of which forty are used. In the result,
-    ``speech`` has the error rates and ``labials`` (:class:`Confusions`) by condition and output,
+    ``speech`` has the error rates and ``labials`` (:class:`Labials`) by condition and output,
     and ``sounds`` the phones per minute by sound. Raises UserError if a folder does not exist or
     has no usable recording.
     """
@@ -90,20 +90,20 @@ class _Tally:
     def __init__(self, inventory: PhoneInventory) -> None:
         self._inventory = inventory
         self._phones, self._visemes = ErrorCounts(), ErrorCounts()
-        self._confusions = Confusions(inventory)
+        self._labials = Labials(inventory)
 
     def add(self, reference: Sequence[str], recognized: Sequence[str]) -> None:
         self._phones += count_errors(reference, recognized)
         self._visemes += count_errors(
             mouth_shapes(reference, self._inventory), mouth_shapes(recognized, self._inventory)
         )
-        self._confusions.add(reference, recognized)
+        self._labials.add(reference, recognized)
 
     def rates(self) -> dict[str, Any]:
         return {
             "phone_error_rate": self._phones.rate,
             "viseme_error_rate": self._visemes.rate,
-            "labials": self._confusions.labials(),
+            "labials": self._labials.rates(),
         }
 
 

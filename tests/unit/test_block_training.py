@@ -113,9 +113,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_readout_learns_tones_and_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_readout_learns_tones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def as_it_is(recording: Recording, _rng: np.random.Generator) -> tuple[np.ndarray, Targets]:
         return WhisperMel().accept_waveform(as_floats(recording.samples)), recording.targets
 
@@ -137,21 +135,6 @@ def test_the_readout_learns_tones_and_resumes(
         found = whole(encode_windows(encoder, frames[None]))[0, : len(frames)]
     assert np.mean(found.argmax(dim=-1).numpy() == unseen.targets.states[:, 0]) > 0.93
     assert lines[-1].startswith("step 120: ")
-
-    def interrupted(line: str) -> None:
-        if line.startswith("step 6:"):
-            raise KeyboardInterrupt
-
-    first = train(12, "first").state_dict()
-    with pytest.raises(KeyboardInterrupt):
-        train_readout(
-            encoder, recordings, 6, seed=0, num_steps=12, checkpoint=tmp_path / "second",
-            report=interrupted,
-        )  # fmt: skip
-    second = train(12, "second").state_dict()
-    assert "resuming after step 4" in lines
-    for name, weights in first.items():
-        torch.testing.assert_close(second[name], weights, rtol=0, atol=0)
 
 
 @pytest.mark.usefixtures("quick")

@@ -104,10 +104,3 @@ def test_counts_phones_repeated_by_a_new_recognizer_once() -> None:
     broken.speech.append(Speech(session="s", epoch=2, sequence=1, media_time=1600, active=True))
     face = compare(broken, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert (face.phones_lost, face.phones_doubled, face.phones_changed) == (0, 0, 0)
-
-
-def test_lateness_ends_with_a_second_without_late_frames() -> None:
-    late = seen(*in_time(*range(10)), *((0.9, frame(number)) for number in range(10, 42)))
-    face = compare(late, UNDISTURBED, "sil", 0.06, fault_s=0.2)
-    assert face.late_s == pytest.approx(0.7)
-    assert compare(late, UNDISTURBED, "sil", 0.06, fault_s=-2.0).late_s == 0.0, "it was no fault"

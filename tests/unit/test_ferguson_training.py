@@ -16,7 +16,6 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.ferguson.recipe import (
     AlignedSpeech,
     fit_openings,
-    influence_levels,
     phone_table,
     relative_openings,
     travel_of,
@@ -73,10 +72,3 @@ def test_computes_durations_crossings_and_influence() -> None:
     assert usual.crossings["s"] > usual.crossings["m"]
     assert usual.influence["a"] > usual.influence["ei"] > usual.influence["i"]
     assert usual.level["a"] == 1
-
-
-def test_groups_finals_with_similar_shares() -> None:
-    share = {"a": 0.6, "o": 0.58, "e": 0.4, "i": 0.3, "u": 0.29, "v": 0.1}
-    level, influence = influence_levels(share, dict.fromkeys(share, 1.0))
-    assert level == {"a": 1, "o": 1, "e": 2, "i": 3, "u": 3, "v": 4}
-    assert influence["u"] == pytest.approx(0.295)

@@ -19,8 +19,6 @@ from kouxing.evaluation.lips.four_schemes import (
     load_recognizers,
     without_corrections,
 )
-from kouxing.evaluation.lips.measures import rms_jerk
-from kouxing.evaluation.lips.scheme_scores import first_hypotheses
 from kouxing.evaluation.lips.schemes import drop_first_hypotheses
 from kouxing.evaluation.mos.commands import app as mos
 from kouxing.services.driver.video import film
@@ -36,30 +34,6 @@ from tests.videos import write_video
 pytestmark = pytest.mark.unit
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
-
-
-def test_jerk_is_the_third_derivative() -> None:
-    time_s = np.arange(50) / 50.0
-    assert rms_jerk([time_s**3, -(time_s**3)], 50.0) == pytest.approx(6.0)
-    assert rms_jerk([time_s**2], 50.0) == pytest.approx(0.0, abs=1e-6)
-    assert rms_jerk([np.zeros(3)], 50.0) is None
-
-
-def test_times_the_first_hypothesis_of_each_phone() -> None:
-    told = first_hypotheses(
-        [
-            Progress(time_s=0.02, level_db=-20.0),
-            phone(0, "b", 0.0, final=False),
-            Progress(time_s=0.04, level_db=-20.0),
-            Progress(time_s=0.06, level_db=-20.0),
-            phone(0, "p", 0.0),
-            phone(1, "a", 0.03, final=False),
-            phone(2, "d", 0.04, final=False),
-            Progress(time_s=0.08, level_db=-20.0),
-        ]
-    )
-    received = [(phone.symbol, time_s) for phone, time_s in told]
-    assert received == [("b", 0.04), ("a", 0.08), ("d", 0.08)]
 
 
 # The rule emits b, then a, then t instead of a, then i; the search makes d of t, and puts an h

@@ -78,22 +78,6 @@ def test_counts_missed_and_false_closures() -> None:
     assert hits + hits == Detections(6, 4, 8, 4)
 
 
-def test_a_resting_mouth_has_no_closures() -> None:
-    rests = mouth((0.0, 0.5), (1.0, 2.0))
-
-    def closures_at(moment_s: float, opening: NDArray[np.float64]) -> Detections:
-        return closures(np.array([moment_s]), np.array([moment_s]), TIME_S, opening)
-
-    # the rest at the start is no closure; the other is one, where it touches the open mouth
-    assert closures_at(1.5, rests) == Detections(1, 0, 1, 0)
-    assert closures_at(1.02, rests) == Detections(1, 1, 1, 1)
-    assert closures_at(0.25, np.zeros(len(TIME_S))) == Detections(1, 0, 0, 0)
-    never = closures(np.zeros(0), np.zeros(0), TIME_S, mouth())
-    assert never.recall is never.precision is never.f1 is None
-    # between 20 and 100 units lips neither meet nor open
-    assert closures_at(1.0, np.minimum(mouth((1.0, 1.0)), 99.0)).made == 0
-
-
 def test_finds_openings_in_any_range() -> None:
     curve = mouth((0.5, 1.0), (2.0, 2.2))
     # three tenths of the way from the last shut frame to the first open one

@@ -8,45 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-import torch
 from numpy.typing import NDArray
 
-from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.corpora.feature_cache import as_integers
 from kouxing.services.mouth_profiles.positions import POSITION_S
-from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lip_predictor import CLOSURE, LIP_FAPS, NUM_OUTPUTS
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS, NUM_OUTPUTS
 from kouxing.training.lips import teacher
-from kouxing.training.lips.positions import Speech, speech_of
+from kouxing.training.lips.positions import Speech
 from kouxing.training.lips.recipe import DELAYS_S
-from kouxing.training.lips.recurrent import UNITS, Example, LipNetwork
+from kouxing.training.lips.recurrent import Example
 from kouxing.training.lips.teacher import (
     TAUGHT_DELAY_S,
-    Projection,
-    Teacher,
     draw_recordings,
-    label_recordings,
     train_teacher,
 )
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import WholeEncoder
 from tests.lips import clip_of
-from tests.system import VOWELS_FILE
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
 LOWER_LIP = LIP_FAPS.index(5)
 CLIP = clip_of(np.empty(0), np.empty((0, 28)))
-
-
-class Clock(WholeEncoder):
-    """An encoder whose feature is the time."""
-
-    def __init__(self) -> None:
-        super().__init__(Shape(num_states=0, look_aheads=(), width=32, heads=2, inner=48))
-
-    def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
-        return POSITION_S * np.arange(1, len(samples) // 320, dtype=np.float16)[:, None]
 
 
 class Loudness(WholeEncoder):
@@ -59,45 +42,6 @@ class Loudness(WholeEncoder):
         loud = np.abs(samples.astype(np.float32)).reshape(-1, 320)
         level: NDArray[np.float16] = loud.mean(axis=1, keepdims=True).astype(np.float16)
         return level
-
-
-def network_of(gain: np.ndarray) -> LipNetwork:
-    """Make a network whose lower lip is a weighted sum of its inputs, as long as it is positive."""
-    network = LipNetwork(len(gain), 1, 1, both_ways=True).eval()
-    for weights in network.parameters():
-        torch.nn.init.zeros_(weights)
-    network.entry.weight.data[0] = torch.from_numpy(gain)
-    network.output.weight.data[LOWER_LIP, 2 * UNITS] = 1.0
-    return network
-
-
-def test_labels_have_the_time_of_the_mouth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    model = load_model()
-    assert isinstance(model, NeuralModel)
-    one = np.ones(1, np.float32)
-    known = 0.25  # is added to the time
-    projection = Projection(0 * one, one, one[:, None])
-    recording = replace(CLIP, name="vowels", samples=read_audio(VOWELS_FILE))
-    labelled = label_recordings(
-        Teacher(Clock(), projection, network_of(np.ones(2, np.float32))),
-        model,
-        [replace(CLIP, name="silent", samples=np.zeros(16_000, np.float32)), recording],
-        lambda speech: np.full((len(speech.known_s), 1), known, np.float32),
-        DELAYS_S,
-        speaker=7,
-    )
-    (stretches,) = speech_of(model, [recording], copy=1)
-    assert len(labelled) == len(stretches) > 0
-    now, later = DELAYS_S.index(TAUGHT_DELAY_S), DELAYS_S.index(0.055)
-    for example, speech in zip(labelled, stretches, strict=True):
-        mouth_s = speech.speed * (speech.known_s - TAUGHT_DELAY_S)
-        label = example.targets[:, :, LOWER_LIP]
-        np.testing.assert_allclose(label[:, now], mouth_s + known, atol=0.02)
-        assert example.speaker == 7
-        assert np.isnan(label[:2, later]).all()
-        np.testing.assert_allclose(label[2:, later], label[:-2, now], atol=0.005)
-        assert (example.targets[:, now, CLOSURE] == 0.5).all()  # log odds of 0
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -35,7 +35,7 @@ from kouxing.training.lips.recipe import (
     train_lips,
 )
 from kouxing.training.lips.recurrent import LipNetwork
-from kouxing.training.lips.targets import closed_below, targets_at
+from kouxing.training.lips.targets import closed_below
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import WholeEncoder
 from tests.e2e.following import samples_of_file
@@ -59,20 +59,6 @@ def clip_with(height: np.ndarray) -> LipClip:
     faps[:, MOUTH_FAPS.index(3)] = height
     faps[:, MOUTH_FAPS.index(6)], faps[:, MOUTH_FAPS.index(7)] = 10.0, 30.0
     return clip_of(time_s, faps)
-
-
-def test_targets_are_the_delayed_lips() -> None:
-    clip = clip_with(np.linspace(0.0, 500.0, 51))  # 250 a second, for 2 s
-    known_s = np.array([0.1, 1.0])
-    targets = targets_at(clip, None, CLOSED_AT, known_s, [0.0, 0.2])
-    lower, corner = LIP_FAPS.index(5), LIP_FAPS.index(6)
-    np.testing.assert_allclose(targets[1, :, lower], [-250.0, -200.0], atol=1e-3)
-    np.testing.assert_allclose(targets[1, :, corner], 20.0)  # the mean of left and right
-    assert np.isnan(targets[0, 1]).all()  # before the clip
-    assert np.isnan(targets[1, :, LIP_FAPS.index(16)]).all()  # not tracked
-    assert targets[1, 0, CLOSURE] == 0
-    early = targets_at(clip, None, CLOSED_AT, np.array([0.05]), [0.0])
-    assert early[0, 0, CLOSURE] == 1
 
 
 def test_lips_touch_in_the_lowest_tenth_of_the_range() -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from array import array
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, cast
 
 import pytest
-from kouxing_client import FapFrame, Session
+from kouxing_client import Session
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import bench_app
@@ -36,17 +35,6 @@ def test_missing_frames_count_as_late() -> None:
     assert list(_spoken({0: 100.065}).delays_s(0.06, 100.07, 100.2)) == pytest.approx(
         [0.12, 0.10, 0.08, 0.06, 0.04, 0.02], abs=1e-6
     )
-
-
-def test_ignores_frames_at_rest() -> None:
-    spoken = _spoken({})
-    first, second = (FapFrame(media_time=at, values=array("f", bytes(272))) for at in (0, 320))
-    for frame in (first, first, second):
-        spoken.record(frame)
-    assert spoken.num_rest == 0  # the speaker has not started
-    arrived_s = dict(spoken.arrived_s)
-    spoken.record(second)
-    assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
 
 
 def _step(number: int, worst_p95_ms: float) -> Step:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import soundfile
 
-from kouxing.corpora import feature_cache
 from kouxing.corpora.speech_corpus import (
     CONVERSATION,
     RowErrors,
@@ -185,21 +184,6 @@ def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
         read_corpus(tmp_path, RowErrors(), MANDARIN)
 
 
-def test_pinyin_takes_precedence_over_the_text(tmp_path: Path) -> None:
-    """Polyphones, er-hua, ü and syllables without an initial; the text is not asked."""
-    write_corpus(
-        tmp_path,
-        [
-            "a\t0.wav\tA\tx\tMIT\ttrain\t9\t银行行长\tyin2 hang2 hang2 zhang3",
-            "b\t1.wav\tA\tx\tMIT\ttrain\t9\t行\txing2",
-            "c\t2.wav\tA\tx\tMIT\ttrain\t9\t女儿花儿玩\tnv3 er2 huar1 hua1 er5 wan2 lü4",
-        ],
-    )
-    rows = read_corpus(tmp_path, RowErrors(), MANDARIN)
-    phones = [" ".join(MANDARIN.phones[phone] for phone in row.phones) for row in rows]
-    assert phones == ["in h ang h ang zh ang", "x ing", "n v er h ua er h ua er uan l v"]
-
-
 def test_licenses_that_allow_distribution() -> None:
     for free in (
         "Apache-2.0 (AISHELL-1/OpenSLR33)", "MIT", "CC0-1.0 (Common Voice)", "CC-BY-SA (shtooka)",
@@ -232,26 +216,6 @@ def test_weights_and_license_filter(tmp_path: Path) -> None:
     write_corpus(tmp_path, ["b\t1.wav\tB\tx\tCC BY-NC\ttrain\t1.25\t你好\tni3 hao3"])
     with pytest.raises(UserError, match=r"last of them: b: its license \(CC BY-NC\)"):
         load_examples([tmp_path], RowErrors(), MANDARIN)
-
-
-def test_uses_the_cache_and_reports_unreadable_audio(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_corpus(
-        tmp_path,
-        [f"{n}\t{n}.wav\tA\tx\tCC0\ttrain\t1.25\t你好\tni3 hao3" for n in range(3)],
-    )
-    (tmp_path / "1.wav").write_bytes(b"no sound")
-    rows = read_corpus(tmp_path, RowErrors(), MANDARIN)
-    errors = RowErrors()
-    first = feature_cache.log_mel_of(rows, errors)
-    assert [block is None for block in first] == [False, True, False]
-    assert len(errors.messages) == 1
-    monkeypatch.setattr(feature_cache, "read_audio", lambda _: pytest.fail("computed again"))
-    again = feature_cache.log_mel_of(rows, RowErrors())
-    assert first[0] is not None
-    assert again[0] is not None
-    np.testing.assert_array_equal(first[0], again[0])
 
 
 # --- paths

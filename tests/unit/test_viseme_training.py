@@ -59,25 +59,6 @@ def test_estimates_the_parameters_behind_curves() -> None:
     assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
 
 
-def test_learns_from_short_clips_with_few_faps() -> None:
-    phones = utterance(0, 2)
-    time_s = np.arange(0.0, 1.5, 0.04)
-    curve = blend(
-        replace(START, target=0.5 * START.target), build_timeline(phones, INVENTORY), time_s
-    )
-    faps = np.full_like(curve, np.nan)
-    faps[:, LOWER_LIP] = curve[:, LOWER_LIP]
-    clip = clip_of(time_s, faps)
-    frames = frames_of([clip, clip], [phones, []], INVENTORY)  # one of them has no speech
-    assert len(frames.faps) == len(time_s)
-    found = estimate(frames)
-    vowel = VISEME_INDEX[phones[1].symbol]
-    assert abs(found.target[vowel, LOWER_LIP]) < 0.8 * abs(START.target[vowel, LOWER_LIP])
-    np.testing.assert_array_equal(found.target[:, JAW], START.target[:, JAW])
-    with pytest.raises(UserError, match="contain no speech"):
-        frames_of([clip], [[]], INVENTORY)
-
-
 def test_closures_last_as_long_as_in_the_clips() -> None:
     phones = utterance(3, 80)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.02)

@@ -20,9 +20,8 @@ arrays          name, rank, sizes, kind, number of bytes, the bytes         stri
                                                                             1 byte, 4 bytes
 =============== =========================================================== ==================
 
-A string is its length in 2 bytes, then its bytes and a zero. An array of integers is divided by the
-array ``..._scale``, which has a value for each row. The file is not trusted, so every size in it is
-checked.
+A string is its length in 2 bytes, then its bytes and a zero. Quantized models cannot be read. The
+file is not trusted, so every size in it is checked.
 """
 
 from __future__ import annotations
@@ -43,10 +42,7 @@ from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
 _FILE_NAME = "model.bin"
 _MIN_VERSION = 4
 _MAX_RANK = 4
-_BRAIN_FLOAT = 5
-_KINDS: dict[int, type[np.generic]] = {
-    0: np.float32, 1: np.int8, 2: np.int16, 3: np.int32, 4: np.float16, _BRAIN_FLOAT: np.uint16,
-}  # fmt: skip
+_KINDS = {0: "<f4", 1: "<i1", 2: "<i2", 3: "<i4", 4: "<f2"}  # elements of an array
 _OF_LAYER = {
     "attention_norm": "self_attention/layer_norm",
     "query_key_value": "self_attention/linear_0",
@@ -109,13 +105,9 @@ def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.flo
     """Return an array as 32-bit floats; ValueError if it cannot be used."""
     if name not in arrays:
         raise ValueError(f"it lacks {name}")
+    if arrays[name].dtype.kind != "f":
+        raise ValueError(f"{name} is quantized, so the model must be one of floats")
     array = arrays[name].astype(np.float32)
-    scale = arrays.get(f"{name}_scale")
-    if scale is not None:
-        if scale.size not in (1, *array.shape[:1]):
-            raise ValueError(f"{name}_scale has {scale.size} values")
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            array /= scale.astype(np.float32).reshape(-1, *[1] * (array.ndim - 1))
     if not np.isfinite(array).all():
         raise ValueError(f"{name} contains values that are not finite")
     return array
@@ -160,13 +152,11 @@ def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
     kind = _number(content, "<B")
     if kind not in _KINDS:
         raise ValueError(f"{name[:80]!r} is of the kind {kind}")
-    element = np.dtype(_KINDS[kind]).newbyteorder("<")
+    element = np.dtype(_KINDS[kind])
     num_bytes = _number(content, "<I")
     if num_bytes != math.prod(shape) * element.itemsize:
         raise ValueError(f"{name[:80]!r} has {num_bytes} bytes for the sizes {shape}")
     array = np.frombuffer(content.read(num_bytes), element, math.prod(shape)).reshape(shape)
-    if kind == _BRAIN_FLOAT:  # the upper half of a 32-bit float
-        array = (array.astype(np.uint32) << 16).view(np.float32)
     return name, array
 
 
