@@ -79,11 +79,8 @@ def open_audio(
     The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
     is read as raw samples; ``raw`` is their format. ``is_raw``: the content is raw samples.
 
-    Raises
-    ------
-    UserError
-        If the file is missing, empty, not audio, or below 8 kHz, or ``raw`` is given and another
-        format fits; while reading, if samples are not finite.
+    Raises ``UserError`` if the file is missing, empty, not audio, or below 8 kHz, or ``raw`` is
+    given and another format fits; while reading, if samples are not finite.
     """
     try:
         if path.is_dir():

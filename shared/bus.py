@@ -13,12 +13,12 @@ from enum import Enum
 from typing import Self
 
 import zmq
+from kouxing_client.keys import Key
 from zmq.utils.monitor import recv_monitor_message
 
 from kouxing.shared.connections import KIB, ConnectionLimiter, Limits
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 from kouxing.shared.zap import Zap, answer_handshakes

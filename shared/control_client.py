@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Iterator
 
 from kouxing_client import Client, KouxingError
+from kouxing_client.keys import Key
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Key
 
 
 @contextlib.contextmanager

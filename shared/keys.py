@@ -25,6 +25,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from kouxing_client.keys import Key
+
 from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 
@@ -39,15 +41,6 @@ _SUBSCRIBER = "subscriber:"
 _PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _ROLE = re.compile(r"client|operator|service:[a-z-]{1,64}|subscriber:([A-Za-z0-9_-]{1,64}|\*)")
-
-
-@dataclass(frozen=True, slots=True)
-class Key:
-    """A key pair and control's public key, each as 40 characters of Z85."""
-
-    public: str
-    secret: str
-    control: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,11 +53,8 @@ class MediaSound:
     messages. ``blocks`` yields the sample rate and samples, (n, channels); the rate may change.
     ``remarks`` is complete after the last block.
 
-    Raises
-    ------
-    UserError
-        If FFmpeg cannot read the file, or it has no such track; while reading, if nothing can be
-        decoded.
+    Raises ``UserError`` if FFmpeg cannot read the file, or it has no such track; while reading, if
+    nothing can be decoded.
     """
 
     def __init__(

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import zmq
+from kouxing_client.keys import Key
 
 from kouxing.shared.connections import KIB, LONG_PENALTY_S, PENALTY_S, Connection, LimitedSocket
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import NO_PEER, Grant, Key, Peer, may_follow
+from kouxing.shared.keys import NO_PEER, Grant, Peer, may_follow
 from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, Joined

@@ -50,10 +50,7 @@ def sound_devices() -> list[SoundDevice]:
 def microphone(name: str = "") -> AudioSource:
     """Read the default microphone, or the one whose name contains ``name``, until interrupted.
 
-    Raises
-    ------
-    UserError
-        If the sound library or the microphone is missing.
+    Raises ``UserError`` if the sound library or the microphone is missing.
     """
     sounddevice = _sound_library()
     if name:
@@ -84,10 +81,7 @@ def monitor(name: str = "") -> AudioSource:
 
     ``name`` is a part of the name of an output or a program; empty: the default output.
 
-    Raises
-    ------
-    UserError
-        If the sound server, the output or the program is missing.
+    Raises ``UserError`` if the sound server, the output or the program is missing.
     """
     devices = _monitors()
     device = _choose(name, devices) if name else None

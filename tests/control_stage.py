@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable
 
 import zmq
+from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.endpoints import key_of, with_key
-from kouxing.shared.keys import Key, load_key
+from kouxing.shared.keys import load_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession

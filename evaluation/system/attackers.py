@@ -16,10 +16,11 @@ from random import Random
 
 import zmq
 from kouxing_client import Refused
+from kouxing_client.keys import Key
 
 from kouxing.shared import control_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.keys import Key, user_key
+from kouxing.shared.keys import user_key
 
 # The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and the flags of its frames.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Self
 
 from kouxing_client import Status
+from kouxing_client.keys import Key
 from rich.console import Console
 
 from kouxing.evaluation.system.network import Network
@@ -25,7 +26,7 @@ from kouxing.services.kinds import (
 from kouxing.shared.config import variable
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT, Key, control_endpoint, read_key, user_key
+from kouxing.shared.keys import CLIENT, control_endpoint, read_key, user_key
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 60.0

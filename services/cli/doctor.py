@@ -8,6 +8,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from kouxing_client import ServiceState
+from kouxing_client.keys import Key
 
 from kouxing.services.cli.clients import find_system
 from kouxing.services.kinds import KINDS
@@ -15,7 +16,7 @@ from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.control_client import connect
 from kouxing.shared.endpoints import reach_error, split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT, CLIENT_ROLES, Key, local_keys, rejection_hint, user_key
+from kouxing.shared.keys import CLIENT, CLIENT_ROLES, local_keys, rejection_hint, user_key
 
 MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # of the newest heartbeat

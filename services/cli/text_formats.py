@@ -81,10 +81,7 @@ class SpokenText(NamedTuple):
 def decode_text(content: bytes) -> SpokenText:
     """Decode a text file. ``form`` is its encoding, unless it is UTF-8.
 
-    Raises
-    ------
-    UserError
-        If the file is not a text; the message names its format.
+    Raises ``UserError`` if the file is not a text; the message names its format.
     """
     for beginning, name in _BINARY.items():
         if content.startswith(beginning):
@@ -114,10 +111,8 @@ def _is_common(text: str) -> bool:
 def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
     """Extract the spoken text from a text of any format.
 
-    Raises
-    ------
-    UserError
-        If the text has a format whose spoken text cannot be extracted; the message names it.
+    Raises ``UserError`` if the text has a format whose spoken text cannot be extracted; the message
+    names it.
     """
     text = text.lstrip("\ufeff \t\r\n").replace("\r\n", "\n").replace("\r", "\n")
     for beginning, name in _TEXTUAL.items():

@@ -11,10 +11,10 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 
 from kouxing_client import AsyncClient, AsyncSession, KouxingError, Refused
+from kouxing_client.keys import Key
 
 from kouxing.services.gateway import wire
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Key
 
 LAST_FRAME_TIMEOUT_S = 1.5  # after the end of the audio
 LAST_PHONES_S = 0.2  # the last phones take another way than the last frame

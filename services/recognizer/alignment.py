@@ -56,10 +56,8 @@ def align_text(
     ``samples`` have the shape (n,) or (n, channels). The text is in a spelling that the model's
     language can read.
 
-    Raises
-    ------
-    UserError
-        If the text is empty or unreadable, or the recording is too short for the text.
+    Raises ``UserError`` if the text is empty or unreadable, or the recording is too short for the
+    text.
     """
     syllables = model.inventory.pronounce(text)
     if not syllables:

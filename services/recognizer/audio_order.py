@@ -14,16 +14,10 @@ _MESSAGE_BYTES = 500  # memory of a message without its PCM
 
 
 class AudioOrder:
-    """Orders the messages of one client, starting with the first that arrives.
-
-    Attributes
-    ----------
-    last : int
-        Number of the newest message that was returned, 0 before the first.
-    """
+    """Orders the messages of one client, starting with the first that arrives."""
 
     def __init__(self) -> None:
-        self.last = 0
+        self.last = 0  # number of the newest message that was returned
         self._held: dict[int, AudioChunk] = {}  # messages behind a gap
         self._held_bytes = 0
         self._gap_since_s = 0.0

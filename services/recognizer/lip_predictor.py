@@ -159,13 +159,7 @@ class LipPredictor:
 
 
 class LipPredictorStream:
-    """The lip frames of one session, one segment of speech after the other.
-
-    Attributes
-    ----------
-    inner : NDArray
-        [h, u] at the last position, shape (2 units,).
-    """
+    """The lip frames of one session, one segment of speech after the other."""
 
     def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
         self._model = model
@@ -180,6 +174,7 @@ class LipPredictorStream:
         nothing = np.zeros(components, np.float32)
         self._history = deque([nothing] * history, maxlen=history)
         self._state = np.zeros(len(self._model.state_weights), np.float32)
+        # [h, u] at the last position
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
     def process_position(

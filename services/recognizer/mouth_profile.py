@@ -65,10 +65,8 @@ def parse_mouth_profile(
 
     ``shape`` is that of the residual with this model.
 
-    Raises
-    ------
-    UserError
-        If it is not a profile, fits another model, or its values are out of bounds.
+    Raises ``UserError`` if it is not a profile, fits another model, or its values are out of
+    bounds.
     """
     values_at = len(_MAGIC) + _DIGEST_BYTES
     if content[: len(_MAGIC)] != _MAGIC:

@@ -65,10 +65,7 @@ class Recognizer:
             Media time at which current speech started, samples at 16 kHz, if another recognizer
             processed its start. The networks' blocks then align with those of the other one.
 
-        Raises
-        ------
-        UserError
-            If the rate or the channels are out of range.
+        Raises ``UserError`` if the rate or the channels are out of range.
         """
         return SpeechStream(
             self.model,

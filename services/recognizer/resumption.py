@@ -38,16 +38,10 @@ Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, c
 
 
 class ReplayWindow:
-    """The audio messages that another recognizer would need to continue the session.
-
-    Attributes
-    ----------
-    last_droppable_sequence : int
-        Number of the newest message that no other recognizer would need.
-    """
+    """The audio messages that another recognizer would need to continue the session."""
 
     def __init__(self) -> None:
-        self.last_droppable_sequence = 0
+        self.last_droppable_sequence = 0  # newest message that no other recognizer would need
         self._final = FinalTime()  # of the events that the synthesizer has
         self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED)  # sequence, end
 

@@ -126,10 +126,7 @@ class RecognizerSession:
     def read_chunk(self, chunk: AudioChunk, now_s: float) -> Chunk | None:
         """Return the audio of a message in order; None if all of it is to be skipped.
 
-        Raises
-        ------
-        AudioRejected
-            If the audio is not valid, or too early.
+        Raises ``AudioRejected`` if the audio is not valid, or too early.
         """
         rate_hz, media_time = self.start.sample_rate_hz, chunk.media_time
         try:

@@ -40,11 +40,6 @@ class SpeechStream:
     A chunk carries the media time of its first sample. If a chunk starts more than ``MAX_JITTER``
     after the end of the previous one, there is a gap: the speech before it ends, and recognition
     starts again after it.
-
-    Attributes
-    ----------
-    num_gaps : int
-        Number of gaps so far.
     """
 
     def __init__(
@@ -58,7 +53,7 @@ class SpeechStream:
         face_delay_s: float,
         speech_time: int,
     ) -> None:
-        self.num_gaps = 0
+        self.num_gaps = 0  # so far
         self._model = model
         self._rule = rule
         self._rate_hz = sample_rate_hz
@@ -95,10 +90,7 @@ class SpeechStream:
 
         ``media_time`` is that of the first sample, samples at 16 kHz. None: there is no gap.
 
-        Raises
-        ------
-        UserError
-            If the samples have another shape or are not finite.
+        Raises ``UserError`` if the samples have another shape or are not finite.
         """
         if media_time is None:
             media_time = self.next_media_time

@@ -55,12 +55,13 @@ class SynthesizerLink:
             self._sender.send(message, now_s)
 
     def acknowledge(self, ack: Acknowledge, now_s: float) -> list[Message]:
-        """Return the messages that the synthesizer has newly acknowledged."""
+        """Return the results that the synthesizer has newly acknowledged."""
         if self._sender is None or ack.epoch != self._sender.epoch:
             return []
         self._newest_frame = ack.newest_frame or self._newest_frame
-        messages = self._sender.acknowledge(ack.sequence, now_s)
-        self._kept.extend(message for message in messages if not _is_resumption(message))
+        acknowledged = self._sender.acknowledge(ack.sequence, now_s)
+        messages = [message for message in acknowledged if not _is_resumption(message)]
+        self._kept.extend(messages)
         while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
             oldest = self._kept.popleft()
             if isinstance(oldest, Speech):

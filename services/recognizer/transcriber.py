@@ -33,10 +33,8 @@ class SherpaTranscriber:
         joiner (a transducer), or one model in a folder whose name contains ``paraformer`` or
         ``sense-voice``. Of several files, the smallest is used, which has 8-bit weights.
 
-    Raises
-    ------
-    UserError
-        If sherpa-onnx is not installed, or the folder does not contain a valid model.
+    Raises ``UserError`` if sherpa-onnx is not installed, or the folder does not contain a valid
+    model.
     """
 
     def __init__(self, folder: Path) -> None:

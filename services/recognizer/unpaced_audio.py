@@ -13,17 +13,11 @@ _MIN_CHUNK_S = 0.001  # a shorter chunk counts as much
 
 
 class UnpacedAudio:
-    """A queue of chunks, in the order in which they arrived.
-
-    Attributes
-    ----------
-    duration_s : float
-        Duration of the queued audio, seconds.
-    """
+    """A queue of chunks, in the order in which they arrived."""
 
     def __init__(self) -> None:
         self._items: deque[tuple[RecognizerSession, Chunk | None]] = deque()
-        self.duration_s = 0.0
+        self.duration_s = 0.0  # of the queued audio
 
     def __len__(self) -> int:
         return len(self._items)

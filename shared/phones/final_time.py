@@ -8,16 +8,10 @@ QUIET_S = 0.5  # the start of speech is reported sooner after its first phone's 
 
 
 class FinalTime:
-    """Follows a session's events; no later phone starts before ``time_s``.
-
-    Attributes
-    ----------
-    time_s : float
-        End of the last final phone or time of the last speech change, seconds of media time.
-        During silence, it follows the audio.
-    """
+    """Follows a session's events; no later phone starts before ``time_s``."""
 
     def __init__(self) -> None:
+        # End of the last final phone, or last speech change; during silence, it follows the audio
         self.time_s = 0.0
         self._is_speaking = False
 

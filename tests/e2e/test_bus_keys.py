@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import zmq
 from kouxing_client import Client, KouxingError
+from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.kinds import KINDS
@@ -21,7 +22,7 @@ from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Key, add_key, key_folder, load_key, revoke_key
+from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode

@@ -13,9 +13,10 @@ from typing import Any
 import msgpack
 import pytest
 import zmq
+from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.keys import Key, key_folder, load_key, user_key
+from kouxing.shared.keys import key_folder, load_key, user_key
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System

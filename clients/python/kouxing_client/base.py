@@ -10,7 +10,7 @@ from typing import Any, TypedDict
 from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
 from kouxing_client.core import ClientCore, new_future
 from kouxing_client.errors import KouxingError, Refused
-from kouxing_client.keys import KeyPair, find_key
+from kouxing_client.keys import Key, find_key
 from kouxing_client.messages import Fields, Result
 from kouxing_client.session_core import Inbox, SessionCore, Signal, Subscription
 from kouxing_client.thread import ClientThread
@@ -65,7 +65,7 @@ class BaseClient:
         self,
         control: str | None = None,
         *,
-        key: KeyPair | None = None,
+        key: Key | None = None,
         insecure: bool = False,
         timeout_s: float = 10.0,
     ) -> None:

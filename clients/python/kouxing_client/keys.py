@@ -6,27 +6,10 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from kouxing_client.errors import KouxingError
 
 _FILE = "client.key"
-
-
-class KeyPair(Protocol):
-    """A key pair and the public key of control; Z85, 40 characters each."""
-
-    @property
-    def public(self) -> str:
-        """The public key."""
-
-    @property
-    def secret(self) -> str:
-        """The secret key."""
-
-    @property
-    def control(self) -> str:
-        """The public key of control."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from kouxing_client.errors import KouxingError
-from kouxing_client.keys import KeyPair
+from kouxing_client.keys import Key
 from kouxing_client.messages import Decoders, Joined, Message, topic
 
 QUEUE = 20_000  # messages
@@ -37,7 +37,7 @@ class Sockets:
     The key is this program's; None if nothing is encrypted.
     """
 
-    def __init__(self, key: KeyPair | None) -> None:
+    def __init__(self, key: Key | None) -> None:
         self.connect_ms = CONNECT_MS  # limit for one attempt, of sockets opened from now on
         self.resumed_at_s = -math.inf  # when this process last resumed after a suspension
         self._key = key

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from kouxing_client.core import ClientCore, forward, new_future
 from kouxing_client.errors import KouxingError
-from kouxing_client.keys import KeyPair
+from kouxing_client.keys import Key
 from kouxing_client.session_core import SessionCore, Signal
 from kouxing_client.sockets import Sockets
 
@@ -39,7 +39,7 @@ class ClientThread:
     """
 
     def __init__(
-        self, control: str, key: KeyPair | None, timeout_s: float, make_signal: Callable[[], Signal]
+        self, control: str, key: Key | None, timeout_s: float, make_signal: Callable[[], Signal]
     ) -> None:
         if key is not None and " " not in control:
             control = f"{control} {key.control}"

@@ -39,11 +39,8 @@ def load_model(path: Path = NEURAL_PATH, *, look_ahead_ms: float | None = None) 
         A look-ahead that the neural model was trained for; None: the model's default. Other models
         ignore it.
 
-    Raises
-    ------
-    UserError
-        If the file is missing, broken or of another format, its language is not installed, or the
-        neural model does not offer the look-ahead.
+    Raises ``UserError`` if the file is missing, broken or of another format, its language is not
+    installed, or the neural model does not offer the look-ahead.
     """
     archive = read_archive(path)
     try:

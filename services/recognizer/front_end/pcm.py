@@ -24,10 +24,8 @@ class BadAudio(ValueError):
 def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
     """Convert bytes to samples, shape (n, channels), clipped to [-1, 1].
 
-    Raises
-    ------
-    BadAudio
-        If the bytes are not a whole number of sample frames, or a sample is not finite.
+    Raises ``BadAudio`` if the bytes are not a whole number of sample frames, or a sample is not
+    finite.
     """
     frame_bytes = SAMPLE_BYTES[encoding] * num_channels
     if len(pcm) % frame_bytes:

@@ -43,10 +43,8 @@ _KAISER_BETA = 8.0
 class Resampler:
     """Streaming resampler to 16 kHz mono; averages the channels.
 
-    Raises
-    ------
-    UserError
-        If the rate (8000 to 48000 Hz) or the number of channels (1 to 8) is out of range.
+    Raises ``UserError`` if the rate (8000 to 48000 Hz) or the number of channels (1 to 8) is out of
+    range.
     """
 
     def __init__(self, sample_rate_hz: int, num_channels: int = 1) -> None:
@@ -69,10 +67,7 @@ class Resampler:
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take samples, (n,) or (n, channels); return those ready at 16 kHz, (m,).
 
-        Raises
-        ------
-        UserError
-            If the shape does not match the channels, or a sample is not finite.
+        Raises ``UserError`` if the shape does not match the channels, or a sample is not finite.
         """
         mono = self._mono(samples)
         self._num_in += len(mono)

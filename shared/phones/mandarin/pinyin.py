@@ -84,10 +84,7 @@ def phones_of_syllable(syllable: str) -> tuple[str, ...]:
         One syllable, with or without a tone digit (1-5, 0) or a tone mark. ü may be written ``ü``,
         ``v`` or ``u:``. Case is ignored.
 
-    Raises
-    ------
-    UserError
-        If the syllable does not exist in Mandarin.
+    Raises ``UserError`` if the syllable does not exist in Mandarin.
 
     Examples
     --------
