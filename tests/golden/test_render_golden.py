@@ -16,8 +16,6 @@ from kouxing.services.driver.render.renderer import Renderer
 from tests import heads
 from tests.heads import neutral_faps
 
-pytestmark = pytest.mark.golden
-
 SHAPES = {
     "rest": neutral_faps(),
     "a": neutral_faps(

@@ -22,8 +22,6 @@ from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChan
 from tests.live_streams import recognize_live
 from tests.system import DEMO
 
-pytestmark = pytest.mark.property
-
 KEPT_S = 3.0  # events repeated for a new synthesizer
 LARGEST_STEP = 1.2  # relative to the largest undisturbed step
 UNSEEN = 1.0  # FAP units; smaller steps are invisible

@@ -9,8 +9,6 @@ import pytest
 from kouxing.services.recognizer.audio_order import MAX_HELD_BYTES, WAIT_S, AudioOrder
 from kouxing.shared.wire.audio import AudioChunk
 
-pytestmark = pytest.mark.unit
-
 
 def chunk(sequence: int, num_bytes: int = 2) -> AudioChunk:
     return AudioChunk(

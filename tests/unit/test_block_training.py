@@ -26,7 +26,7 @@ from tests.unit.test_block_model import HELLO, SMALL
 from tests.unit.test_neural_training import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 
-pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 RECORDINGS = [tones(seed) for seed in range(12)]
 SMALL_READOUT = ReadoutShape(inner=48, gru=24, dropout=0.2, noise=0.15)

@@ -10,7 +10,6 @@ from kouxing_client import FapFrame, Phone, Speech
 from kouxing.evaluation.system.continuity import compare
 from kouxing.evaluation.system.live import Seen
 
-pytestmark = pytest.mark.unit
 JAW = 2  # index of FAP 3
 
 

@@ -16,7 +16,6 @@ from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.events import Phone
 
-pytestmark = pytest.mark.unit
 RATE_HZ = 50.0
 JAW = FAP_NUMBER["open_jaw"] - 1
 HEAD_YAW = FAP_NUMBER["head_yaw"] - 1

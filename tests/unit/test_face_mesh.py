@@ -11,7 +11,6 @@ from PIL import Image
 
 from kouxing.corpora.face_mesh import FaceMesh
 
-pytestmark = pytest.mark.unit
 PICTURES = Path(__file__).parents[1] / "golden"
 # x and y of landmarks as MediaPipe 0.10.14 finds them in the stored pictures
 MEDIAPIPE = {

@@ -22,8 +22,6 @@ from kouxing.training.ferguson.recipe import (
 )
 from tests.lips import clip_of, phone, utterance
 
-pytestmark = pytest.mark.unit
-
 INVENTORY = load_inventory()
 TABLE = load_table(INVENTORY)
 

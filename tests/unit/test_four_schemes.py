@@ -31,8 +31,6 @@ from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChan
 from tests.lips import phone
 from tests.videos import write_video
 
-pytestmark = pytest.mark.unit
-
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from kouxing.services.driver.head import surface
 from kouxing.training.heads import people, subdivision, zones
 
-pytestmark = pytest.mark.unit
-
 CUBE = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
      [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], float

@@ -16,8 +16,6 @@ from kouxing.evaluation.lips.measures import (
     real_closures,
 )
 
-pytestmark = pytest.mark.unit
-
 TIME_S = np.arange(0.0, 4.0, 0.02)
 
 

@@ -13,8 +13,6 @@ from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LIP_MODEL_NAME
 
-pytestmark = pytest.mark.unit
-
 PACKAGE = """
 from kouxing.services.lip_models import LipModelInfo
 

@@ -41,8 +41,6 @@ from kouxing.training.visemes.recipe import save_parameters
 from tests.lips import INVENTORY, clip_of, utterance
 from tests.system import VOWELS_FILE
 
-pytestmark = pytest.mark.unit
-
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 START = initial_parameters()
 MOUTH = np.array(MOUTH_FAPS) - 1

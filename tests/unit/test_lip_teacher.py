@@ -26,7 +26,7 @@ from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import WholeEncoder
 from tests.lips import clip_of
 
-pytestmark = [pytest.mark.unit, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 LOWER_LIP = LIP_FAPS.index(5)
 CLIP = clip_of(np.empty(0), np.empty((0, 28)))

@@ -42,7 +42,7 @@ from tests.e2e.following import samples_of_file
 from tests.lips import clip_of
 from tests.system import VOWELS_FILE
 
-pytestmark = [pytest.mark.unit, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 NUM_FEATURES = 160 + 8
 FRAME_S = 0.04

@@ -14,8 +14,6 @@ from kouxing.evaluation.commands import bench_app
 from kouxing.evaluation.system import latency
 from kouxing.evaluation.system.load import Load, Spoken, Step
 
-pytestmark = pytest.mark.unit
-
 
 class _Session:
     info: ClassVar = {"facts": {"frame_rate_hz": 50.0}}

@@ -7,8 +7,6 @@ import pytest
 
 from kouxing.services.driver.head.meshopt import decode_view
 
-pytestmark = pytest.mark.unit
-
 ATTRIBUTES = (
     "a007004ade8d069ad13d56ea8112a6c53162ff000000f6751eb20a0002224444666888a8ac0000000000000a"
     "0eeeeeeeeeeeeeeeeeee00000000000000000000000000000000000000000000000000000000000000000000"

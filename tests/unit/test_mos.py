@@ -34,8 +34,6 @@ from kouxing.evaluation.mos.study import (
 from kouxing.shared.errors import UserError
 from tests.videos import write_video
 
-pytestmark = pytest.mark.unit
-
 CONDITIONS = ("real", "live", "late", "still")
 SENTENCES = tuple("abcdefgh")
 

@@ -7,8 +7,6 @@ import pytest
 
 from kouxing.services.driver.render.renderer import mouth_light
 
-pytestmark = pytest.mark.unit
-
 
 # same values as in tests/page/mouth-light.test.mjs
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from kouxing.training.training_set import load_untranscribed
 from tests.tones import burst, tones
 from tests.whisper_folder import encoder_arrays, write_whisper
 
-pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]

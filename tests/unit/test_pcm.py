@@ -10,8 +10,6 @@ from kouxing.services.recognizer.front_end.pcm import (
     samples_of,
 )
 
-pytestmark = pytest.mark.unit
-
 
 def test_scales_int16_to_one() -> None:
     pcm = np.array([[-32768, 16384], [0, 32767]], "<i2").tobytes()

@@ -18,7 +18,6 @@ from tests import heads
 from tests.lips import phone
 from tests.receivers import SENT, received
 
-pytestmark = pytest.mark.unit
 Values = NDArray[np.float32]
 PHONE_S, FRAME_RATE_HZ = 0.2, 50
 VISIBLE = 0.1  # of a whole shape

@@ -40,8 +40,6 @@ from tests.languages import (
     step,
 )
 
-pytestmark = pytest.mark.unit
-
 INDEX = MANDARIN.index
 # the corpus's sentence of split train
 SENTENCE = [

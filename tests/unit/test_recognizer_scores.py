@@ -19,8 +19,6 @@ from kouxing.shared.errors import UserError
 from tests.languages import MANDARIN
 from tests.system import VOWELS_FILE
 
-pytestmark = pytest.mark.unit
-
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
 

@@ -19,8 +19,6 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 
-pytestmark = pytest.mark.unit
-
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 RATE_HZ = 16_000
 

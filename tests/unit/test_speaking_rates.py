@@ -15,8 +15,6 @@ from kouxing.evaluation.lips.speaking_rates import (
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.shared.face.faps import MOUTH_FAPS
 
-pytestmark = pytest.mark.unit
-
 OPENINGS = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0])
 
 

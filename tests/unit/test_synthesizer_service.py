@@ -18,7 +18,6 @@ from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port
 
-pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"
 RATE_HZ = 50
 START = replace(cast(StartSession, SAMPLES["start-session"]), epoch=1, endpoints={})

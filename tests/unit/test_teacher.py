@@ -18,7 +18,7 @@ from kouxing.training.neural.teacher import (
 )
 from tests.tones import tones
 
-pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 SHAPE = Shape(num_states=6, look_aheads=(), width=32, heads=2, layers=4, inner=48)
 

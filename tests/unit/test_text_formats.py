@@ -12,8 +12,6 @@ from kouxing.services.cli.text_formats import decode_text, extract_text
 from kouxing.shared.errors import UserError
 from tests.languages import MANDARIN
 
-pytestmark = pytest.mark.unit
-
 ONE, TWO = "大家好，我是人。", "请看我的嘴唇。"
 SAID = "大家好我是人请看我的嘴唇"
 

@@ -15,8 +15,6 @@ from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
 from tests.heads import neutral_faps
 
-pytestmark = pytest.mark.unit
-
 
 class Device:
     """Replaces the library's camera."""

@@ -20,8 +20,6 @@ from kouxing.training.visemes.fit import estimate, frames_of
 from kouxing.training.visemes.recipe import closure_reach, train_visemes
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
 
-pytestmark = pytest.mark.unit
-
 INVENTORY = load_inventory()
 
 START = initial_parameters()

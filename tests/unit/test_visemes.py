@@ -11,8 +11,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 from kouxing.shared.errors import UserError
 from tests.lips import INVENTORY
 
-pytestmark = pytest.mark.unit
-
 
 def visemes(symbol: str, next_symbol: str | None) -> tuple[tuple[str, float], ...]:
     return visemes_of(symbol, next_symbol, INVENTORY)
