@@ -191,22 +191,6 @@ def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served
     assert means == {"sync good": 4.5, "sync bad": 2, "realism good": 3.5, "realism bad": 1}
 
 
-def test_the_page_retries_until_the_server_answers(browser: Chromium, served: Served) -> None:
-    page = Page(browser, served, "zh-CN")
-    page.open()
-    browser.command("Network.setBlockedURLs", urls=["*/state*"])
-    browser.command("Page.reload")
-    browser.wait_for("document.getElementById('notice')?.checkVisibility()")
-    assert "未能送达" in browser.evaluate("document.getElementById('notice').textContent")
-    assert browser.evaluate(f"!({IS_WELCOME})")
-    browser.command("Network.setBlockedURLs", urls=[])
-    browser.wait_for(IS_WELCOME)
-    assert browser.evaluate("document.getElementById('notice').hidden")
-    browser.complaints.clear()
-    page.open("#judge=nobody")
-    browser.wait_for(f"{IS_WELCOME} && document.getElementById('notice').checkVisibility()")
-
-
 IS_WELCOME = "document.getElementById('welcome')?.checkVisibility()"
 
 

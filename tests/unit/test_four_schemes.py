@@ -16,7 +16,6 @@ from kouxing.evaluation.lips.four_schemes import (
     RecognizerOutput,
     delay_by_one_phone,
     face_input,
-    load_recognizers,
     without_corrections,
 )
 from kouxing.evaluation.lips.schemes import drop_first_hypotheses
@@ -85,13 +84,6 @@ def test_scheme_4_delays_each_phone_by_one() -> None:
         Progress(time_s=0.1, level_db=-20.0),
     ]
     assert isinstance(told[-1], SpeechChange)
-
-
-def test_the_papers_rule_uses_three_frames_of_any_confidence() -> None:
-    (listener,) = load_recognizers(["gmm"], has_paper_rule=True)
-    assert listener.name == "gmm-paper"
-    config = listener.config
-    assert (config.acoustic, config.num_stable_frames, config.min_confidence) == ("gmm", 3, 0.0)
 
 
 def test_live_schemes_use_the_recognizers_rule() -> None:

@@ -11,7 +11,6 @@ from kouxing.evaluation.lips.measures import (
     closures,
     is_closed_at,
     moments,
-    openings,
     real_closed,
     real_closures,
 )
@@ -74,14 +73,3 @@ def test_counts_missed_and_false_closures() -> None:
     np.testing.assert_array_equal(is_closed_at(real_s, TIME_S, made), [True, False, True])
     assert (hits + hits).f1 == hits.f1
     assert hits + hits == Detections(6, 4, 8, 4)
-
-
-def test_finds_openings_in_any_range() -> None:
-    curve = mouth((0.5, 1.0), (2.0, 2.2))
-    # three tenths of the way from the last shut frame to the first open one
-    np.testing.assert_allclose(openings(TIME_S, curve), [1.006, 2.206])
-    np.testing.assert_allclose(openings(TIME_S, 0.1 * curve - 7.0), [1.006, 2.206])
-    assert not len(openings(TIME_S, np.zeros(len(TIME_S))))
-    gap = curve.copy()
-    gap[TIME_S < 1.5] = np.nan
-    np.testing.assert_allclose(openings(TIME_S, gap), [2.206])
