@@ -28,6 +28,7 @@ from kouxing.services.gateway.microphone import Microphones
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
 from kouxing.services.gateway.sample import SAMPLE_TEXT, Sample
 from kouxing.services.gateway.senders_api import SendersApi
+from kouxing.services.gateway.sound_upload import SoundUpload
 from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.services.gateway.viewers import Viewers
 from kouxing.services.gateway.web_server import WebServer, bind_port
@@ -103,6 +104,7 @@ class GatewayService(Service):
             [] if ipaddress.ip_address(host).is_unspecified else [host],
         )
         self._mouth_learner = MouthLearner()
+        self._sound_upload = SoundUpload()
         self._senders = SendersApi(config.senders, config.idle_motion_seed)
         self._routes = (
             web.get("/viewer", self._viewers.serve),
@@ -110,6 +112,7 @@ class GatewayService(Service):
             web.post("/whip", self._whip_clients.serve_post),
             web.delete("/whip/{name}", self._whip_clients.serve_delete),
             web.post("/learn-mouth", self._mouth_learner.serve),
+            web.post("/sound", self._sound_upload.serve),
             web.get("/senders", self._senders.serve_get),
             web.post("/senders", self._senders.serve_post),
         )
@@ -171,9 +174,11 @@ class GatewayService(Service):
             self._closing = self._create_task(self._web_sockets.close_all())
             self._create_task(self._whip_clients.close_all())
             self._mouth_learner.close()
+            self._sound_upload.close()
             if self._sample is not None:
                 self._sample[1].cancel()
-        is_busy = self._mouth_learner.is_learning or self._sample is not None
+        is_decoding = self._sound_upload.is_decoding
+        is_busy = self._mouth_learner.is_learning or is_decoding or self._sample is not None
         is_connected = self._web_sockets or self._whip_clients
         return self._closing.done() and not is_busy and not is_connected
 

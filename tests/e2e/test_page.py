@@ -515,7 +515,7 @@ def test_a_file_without_sound_is_refused(page: Browser, tmp_path: Path) -> None:
     (tmp_path / "not.wav").write_text("no sound")
     choose_file(page, tmp_path / "not.wav")
     notice = "document.getElementById('notice').textContent"
-    page.wait_for(f"{notice}.includes('cannot decode the sound of not.wav')")
+    page.wait_for(f"{notice}.includes('not.wav: cannot read audio: this is text, not sound')")
     assert not page.evaluate("window.kouxing.state.microphone")
 
 

@@ -1,10 +1,10 @@
 // Captures the audio of a microphone or a file in chunks, with an audio worklet.
 
+import { pathOf } from "./address.js";
 import { UserError, say } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
 const MAX_FILE_BYTES = 200 << 20;
-const MAX_FILE_S = 3600;
 
 /** Return an audio context with a sample rate of at most 48 kHz. */
 export async function openCaptureContext() {
@@ -36,24 +36,31 @@ export function capture(context, stream, onChunk) {
 }
 
 /**
- * Return { stream, play(onEnded) } for a sound file or the sound of a video.
+ * Return { stream, remarks, play(onEnded) } for a sound file or the sound of a video. The gateway
+ * decodes it, as browsers ignore gaps in timestamps and read fewer formats.
  *
  * @throws {UserError} if the file is too large, too long or cannot be decoded
  */
 export async function openFileSpeech(context, file) {
   if (file.size > MAX_FILE_BYTES) throw new UserError(say("fileTooLarge"));
-  let buffer;
+  let response;
   try {
-    buffer = await context.decodeAudioData(await file.arrayBuffer());
+    response = await fetch(pathOf("sound", { name: file.name }), { method: "POST", body: file });
   } catch {
-    throw new UserError(say("fileUnreadable", { file: file.name }));
+    throw new UserError(say("gatewaySilent"));
   }
-  if (buffer.duration > MAX_FILE_S) throw new UserError(say("fileTooLong"));
+  if (!response.ok) {
+    const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
+    const reason = isJson ? (await response.json()).error : await response.text();
+    throw new UserError(say("fileUnreadable", { reason }));
+  }
+  const buffer = await context.decodeAudioData(await response.arrayBuffer());
   const source = new AudioBufferSourceNode(context, { buffer });
   const destination = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });
   source.connect(destination);
   return {
     stream: destination.stream,
+    remarks: decodeURIComponent(response.headers.get("Kouxing-Remarks") ?? ""),
     play(onEnded) {
       source.onended = onEnded;
       source.start();

@@ -68,6 +68,8 @@ export class Microphone {
       source.context = await openCaptureContext();
       source.fileSpeech = await openFileSpeech(source.context, file);
       source.stream = source.fileSpeech.stream;
+      const { remarks } = source.fileSpeech;
+      if (remarks !== "") this.#handlers.error({ code: "file", text: remarks });
     });
   }
 

@@ -80,11 +80,7 @@ export const TEXTS = {
     zh: "网关关闭了连接。请再按“麦克风”重试。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
-  fileTooLong: { en: "The file is longer than an hour. Use a shorter file.", zh: "文件超过一小时，请用较短的文件。" },
-  fileUnreadable: {
-    en: "This browser cannot decode the sound of {file}. “kouxing speak” reads more formats.",
-    zh: "浏览器无法解码 {file}。kouxing speak 支持更多格式。",
-  },
+  fileUnreadable: { en: "{reason}", zh: "无法读取文件（{reason}）" },
   "error.bad-audio": { en: "{text}", zh: "音频有误（{text}）" },
   "error.busy": { en: "{text}", zh: "人太多了：请稍后再试（{text}）" },
   "error.bad-mouth-profile": {

@@ -1,0 +1,49 @@
+"""The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import wave
+from pathlib import Path
+
+import numpy as np
+
+from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
+from kouxing.shared.errors import UserError
+
+REJECTED = 2  # exit status after an error of the user
+MAX_DURATION_S = 3600
+MAX_CPU_S = 60
+MAX_MEMORY_BYTES = 4 << 30
+
+
+def decode(path: Path) -> None:
+    """Write the sound, mono, and print the remarks of a file to standard error.
+
+    Raises ``UserError`` if the file cannot be read or is too long.
+    """
+    source = open_audio(path, block_s=1.0)
+    num_samples = clipped = 0
+    with wave.open(sys.stdout.buffer, "wb") as output:
+        output.setparams((1, 2, source.sample_rate_hz, 0, "NONE", ""))
+        for block in source.blocks:
+            num_samples += len(block)
+            clipped += num_clipped(block)
+            if num_samples > MAX_DURATION_S * source.sample_rate_hz:
+                raise UserError(f"{path}: the sound is longer than an hour; use a shorter file")
+            mono = np.rint(block.mean(axis=1) * 32768).clip(-32768, 32767)
+            output.writeframes(mono.astype("<i2").tobytes())
+    share = clipped / max(1, num_samples * source.num_channels)
+    for remark in (*source.notices, *source.remarks, *clipping_remarks(str(path), share)):
+        print(remark, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S))
+    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
+    try:
+        decode(Path(sys.argv[1]))
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(REJECTED)
