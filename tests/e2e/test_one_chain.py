@@ -18,6 +18,7 @@ from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import delay_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -28,11 +29,12 @@ from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.lips import LIPS, clip_of
-from tests.made_up_lips import JAW, LoudLips
 from tests.system import DEMO, VOWELS_FILE, System
 
 pytestmark = pytest.mark.e2e
 MOUTH = np.array(MOUTH_FAPS) - 1
+JAW = 2  # column of FAP 3
+LIP_PREDICTOR = load_lip_predictor()
 
 
 def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
@@ -103,7 +105,7 @@ def test_services_send_the_frames_of_the_chain_with_chosen_lips(
     )
     frames = chain.accept_waveform(samples) + chain.input_finished()
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
-    assert sent.faps[:, MOUTH[JAW]].max() > 50.0
+    assert sent.faps[:, JAW].max() > 50.0
 
 
 def lips_of(sent: Collected) -> list[speech.LipPositions]:
@@ -126,7 +128,7 @@ def recognizer_with_lips(control: str) -> Iterator[None]:
     local = "tcp://127.0.0.1:*"
     address = control.partition(" ")[0]
     config = RecognizerConfig(control=address, audio=local, phones=local, unpaced_audio=local)
-    service = RecognizerService(config, LoudLips())
+    service = RecognizerService(config, LIP_PREDICTOR)
     stop = threading.Event()
 
     def serve() -> None:
@@ -162,7 +164,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
         load_live_model(),
         load_lip_model(name="learnt"),
         synthesizer=SynthesizerConfig(delay_ms=delay_ms),
-        lip_predictor=LoudLips(),
+        lip_predictor=LIP_PREDICTOR,
     )
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
@@ -170,13 +172,13 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
     lips = [message_of(event) for event in chain.events if isinstance(event, LipPositions)]
     assert lips_of(sent) == lips
     (delay,) = {each.delay for each in sent.lips}
-    assert delay == round(delay_for(LoudLips().delays_s, delay_ms / 1e3) * 16000)
-    assert sent.faps[:, MOUTH[JAW]].max() > 50.0
+    assert delay == round(delay_for(LIP_PREDICTOR.delays_s, delay_ms / 1e3) * 16000)
+    assert sent.faps[:, JAW].max() > 50.0
 
 
 def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "bilabials-female.wav")
-    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"), lip_predictor=LoudLips())
+    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"), lip_predictor=LIP_PREDICTOR)
     frames = chain.accept_waveform(samples) + chain.input_finished()
     settings = {
         "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",
@@ -197,7 +199,7 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
             session.close()
     # the choice may overtake the sound's beginning or not; both are at rest there
     np.testing.assert_allclose(sent.faps, np.array([faps for _, faps in frames]), atol=0.5)
-    assert sent.faps[:, MOUTH[JAW]].max() > 50.0
+    assert sent.faps[:, JAW].max() > 50.0
 
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:

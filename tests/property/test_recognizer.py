@@ -120,26 +120,6 @@ def test_frames_with_low_confidence_do_not_count() -> None:
     assert [frame for frame, scored in enumerate(frames) if rule.update(*scored)] == [3, 6]
 
 
-@settings(max_examples=25)
-@given(seed=st.integers(0, 2**31), num_frames=st.integers(1, 400))
-def test_the_search_covers_each_frame_once(seed: int, num_frames: int) -> None:
-    topology = the_model().topology
-    rng = np.random.default_rng(seed)
-    decoder = Decoder(topology)
-    for row in rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32):
-        phone, start, confidence = last_phone_after(decoder, row)
-        assert 0 <= phone < len(topology.inventory)
-        assert start < num_frames
-        assert 0 < confidence <= 1
-    segments = decoder.final_path()
-    assert segments[0].start == 0
-    assert segments[-1].end == num_frames
-    shortest = np.diff(topology.first_state)
-    for one, two in pairwise(segments):
-        assert one.end == two.start
-        assert one.end - one.start >= shortest[one.phone]
-
-
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31), num_frames=st.integers(2, 300), data=st.data())
 def test_a_search_continues_from_the_state_of_another(

@@ -44,11 +44,8 @@ def run(app: object, *arguments: object) -> None:
 
 
 def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
-    shut, wide, nobody = (
-        picture("woman_rest"),
-        picture("woman_a"),
-        np.zeros((144, 192, 3), np.uint8),
-    )
+    nobody = np.zeros((144, 192, 3), np.uint8)
+    shut, wide = picture("woman_rest"), picture("woman_a")
     write_video(tmp_path / "me.mp4", [*[shut] * 30, *[wide] * 25, *[nobody] * 3])
     run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me")
     clip = read_clip(tmp_path / "me.json")
@@ -65,16 +62,16 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
 def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
     video = tmp_path / "me.mp4"
     write_video(video, [np.zeros((144, 192, 3), np.uint8)] * 3)
-    with pytest.raises(UserError, match="a face was found in only 0 images"):
-        run(track_app, video, "-o", tmp_path / "me")
-    write_video(video, [picture("woman_rest")] * 3, sound=False)
-    with pytest.raises(UserError, match="must have images and audio"):
-        run(track_app, video, "-o", tmp_path / "me")
-    video.write_bytes(b"no video")
-    with pytest.raises(UserError, match="cannot read the video"):
-        run(track_app, video, "-o", tmp_path / "me")
-    with pytest.raises(UserError, match="No such file"):
-        run(track_app, tmp_path / "nobody.mp4", "-o", tmp_path / "me")
+    (tmp_path / "text.mp4").write_bytes(b"no video")
+    write_video(tmp_path / "silent.mp4", [picture("woman_rest")] * 3, sound=False)
+    for name, message in (
+        ("me", "a face was found in only 0 images"),
+        ("silent", "must have images and audio"),
+        ("text", "cannot read the video"),
+        ("nobody", "No such file"),
+    ):
+        with pytest.raises(UserError, match=message):
+            run(track_app, tmp_path / f"{name}.mp4", "-o", tmp_path / "out")
 
 
 def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:

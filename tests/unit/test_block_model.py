@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from kouxing.services.recognizer.acoustic import blocks as blocks_module
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import MODELS, load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
@@ -122,6 +123,19 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
             np.testing.assert_array_equal(streams[n].provisional, provisional[at[n]])
     for stream, parts in zip(streams, rows, strict=True):
         np.testing.assert_array_equal(np.concatenate([*parts, stream.score(None)]), whole)
+
+
+def test_long_speech_restarts_the_table_with_an_empty_past(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = scores_of(blocks(), FRAMES)
+    monkeypatch.setattr(blocks_module, "MAX_POSITIONS", 40)
+    short = scores_of(blocks(), FRAMES)
+    np.testing.assert_array_equal(short[:56], whole[:56])  # with a complete right context
+    assert not np.array_equal(short[80:160], whole[80:160])
+    later = FRAMES.copy()
+    later[:78] = later[later[:78].max(axis=1).argmax()]  # frames that only precede the restart
+    np.testing.assert_array_equal(scores_of(blocks(), later)[80:], short[80:])
 
 
 def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, FAPS
 from kouxing.shared.face.shapes import ARKIT, VRM
 from tests import heads
@@ -64,6 +65,14 @@ def test_arkit_shapes_move_all_parts(document: dict[str, Any]) -> None:
         wanted = (head.deform(faps) - head.vertices)[vertex]
         shift = moved(document, part, shape)[vertex - head.part(part).vertices.start]
         np.testing.assert_allclose(shift, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("no/head.glb", "cannot write"), ("head.png", r"ends in \.glb")]
+)
+def test_rejects_a_path_that_cannot_be_written(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        export_glb(heads.load("woman", "coarse"), tmp_path / name)
 
 
 def read(document: dict[str, Any], binary: bytearray, accessor: int) -> np.ndarray:

@@ -63,9 +63,10 @@ def test_each_delay_has_separate_outputs_and_times() -> None:
     alone = MODEL.create_stream([0.155]).process_position(1.0, frames, values)
     assert [(lip.time_s, lip.delay_s) for lip in both] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
-    assert 0 < both[0].closure < 1
     outputs = MODEL.create_stream([0.155]).step(features_at(frames, values))
     assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
+    with pytest.raises(UserError, match="no delay of 70 ms; choose -5, 55, 155"):
+        MODEL.create_stream([0.07])
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,16 @@ def test_expressions_ease_in_stay_and_fade(name: ExpressionName) -> None:
     assert np.abs(np.diff(curve, n=2)).max() < 0.02 * full  # no corners
 
 
+def test_the_newest_request_replaces_the_strengths() -> None:
+    face = make_face()
+    face.set_expressions({"joy": 0.4, "brow_up": 1.0}, 10.0)
+    both = shown(face, 2.0)[-1]
+    face.set_expressions({"joy": 0.4}, 10.0)
+    joy = shown(face, 6.0)[-1]
+    assert both[BROW] > 40.0 > abs(joy[BROW])
+    assert both[CORNER] == pytest.approx(joy[CORNER], rel=0.01)
+
+
 def test_surprise_opens_the_mouth_only_without_speech() -> None:
     face = make_face()
     face.set_expressions({"surprise": 1.0}, 60.0)

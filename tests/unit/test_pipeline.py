@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from kouxing.corpora.scoring import count_errors
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.offline import recognize
@@ -28,11 +29,6 @@ def hello_events() -> list[StreamOutput]:
     return recognize_live(load_model(), HELLO, 320)
 
 
-@cache
-def hello_offline() -> list[str]:
-    return [phone.symbol for phone in recognize(load_model(), HELLO, 16_000)]
-
-
 def phones_of(outputs: Sequence[StreamOutput]) -> list[Phone]:
     return [output for output in outputs if isinstance(output, Phone)]
 
@@ -41,22 +37,13 @@ def finals(outputs: Sequence[StreamOutput]) -> list[Phone]:
     return [phone for phone in phones_of(outputs) if phone.final]
 
 
-def share_recognized(expected: list[str], recognized: list[str]) -> float:
-    """Longest common subsequence over what was expected."""
-    table = np.zeros((len(expected) + 1, len(recognized) + 1), int)
-    for i, a in enumerate(expected):
-        for j, b in enumerate(recognized):
-            table[i + 1, j + 1] = max(table[i, j + 1], table[i + 1, j], table[i, j] + (a == b))
-    return float(table[-1, -1] / len(expected))
-
-
 def test_recognizes_most_of_a_clear_sentence() -> None:
     text = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
     expected = [phone for syllable in MANDARIN.pronounce(text) for phone in syllable]
+    offline = [phone.symbol for phone in recognize(load_model(), HELLO, 16_000)]
     live = [phone.symbol for phone in finals(hello_events())]
-    assert share_recognized(expected, hello_offline()) > 0.6
-    assert share_recognized(expected, live) > 0.6
-    assert len(hello_offline()) < 1.3 * len(expected)
+    for heard in (offline, live):
+        assert count_errors(expected, [phone for phone in heard if phone != "sil"]).rate < 0.4
 
 
 def test_silence_and_noise_have_no_phones() -> None:

@@ -45,6 +45,13 @@ def test_switching_wraps_around_and_holds_until_the_session_closes() -> None:
     assert poses.shown == "d"
 
 
+def test_waits_for_a_named_session() -> None:
+    poses = poses_of("a", configured="b")
+    assert (poses.shown, poses.caption(0.0)) == ("", "waiting for b")
+    poses.add("b", 0.0)
+    assert poses.shown == "b"
+
+
 def test_a_stalled_face_fades_to_rest_and_returns() -> None:
     poses = poses_of("a")
     assert poses.faps(1.9)[0] == 1
@@ -64,12 +71,12 @@ def test_resting_face_moves_and_does_not_jump() -> None:
     poses, session = Poses(idle_motion_seed=3), IdleMotion(8)
     shown = []
     for number in range(60 * 30):
-        now_s = 100.0 + number / 60.0
+        now_s = number / 60.0
         if number == 60 * 12:
             poses.add("a", now_s)
         if 60 * 13 < number < 60 * 18:
             frame = np.zeros(NUM_FAPS, np.float32)
-            session.apply(frame, now_s - 100.0)
+            session.apply(frame, now_s)
             poses.update("a", frame, now_s)
         if number == 60 * 18:
             poses.remove("a")

@@ -23,20 +23,6 @@ def head() -> Head:
     return Head.load(detail="coarse")
 
 
-def test_drawing_into_a_window(head: Head, monkeypatch: pytest.MonkeyPatch) -> None:
-    context = render.standalone_context()
-    screen = context.simple_framebuffer((160, 120), components=3)  # replaces the window
-    monkeypatch.setattr(moderngl.Context, "screen", property(lambda _: screen))
-    renderer = Renderer(head, 160, 120, context=context, on_screen=True)
-    renderer.draw_on_screen(neutral_faps())
-    shown = np.frombuffer(screen.read(components=3), np.uint8).reshape(120, 160, 3)[::-1]
-    other = Renderer(head, 160, 120, samples=0)
-    np.testing.assert_allclose(shown.astype(int), other.draw(neutral_faps()).astype(int), atol=2)
-    other.close()
-    renderer.close()
-    context.release()
-
-
 def test_error_names_missing_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(**_: Any) -> None:
         raise Exception("libEGL.so not loaded")
