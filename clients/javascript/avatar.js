@@ -2,13 +2,17 @@
 
 import { VRMLoaderPlugin, VRMUtils } from "@pixiv/three-vrm";
 import * as THREE from "three";
+import { MeshoptDecoder } from "three/addons/libs/meshopt_decoder.module.js";
+import { DRACOLoader } from "three/addons/loaders/DRACOLoader.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { FaceRegion } from "./face-region.js";
 import { findJoints, rotateJoints } from "./page/joints.js";
 import { MorphedMesh } from "./page/morph.js";
+import { chooseSet, findShapes } from "./shape-names.js";
 
+const UNREADABLE = { DRACOLoader: "KHR_draco_mesh_compression", KTX2: "KHR_texture_basisu" }; // by words of three.js
 const VIEW_HEIGHT = 1.6; // of the camera's view, relative to the face
 const VRM_FACE_M = 0.24;
-const READY_PLAYER_ME = { viseme_i: "ih", viseme_o: "oh", viseme_u: "ou" }; // as in glb_head.py
 
 /**
  * Load a model.
@@ -16,26 +20,44 @@ const READY_PLAYER_ME = { viseme_i: "ih", viseme_o: "oh", viseme_u: "ou" }; // a
  * @param url of a GLB or VRM file
  * @returns a promise of { scene, set: values that move it ("faps", "arkit", "oculus" or "vrm"),
  *   pose(values, names), update(seconds), view: { target, height } of the face, meters }; it is
- *   rejected if the model has no shapes that can be moved
+ *   rejected if the model cannot be read or cannot speak
  */
 export async function loadAvatar(url) {
+  try {
+    return await readAvatar(url);
+  } catch (error) {
+    const word = Object.keys(UNREADABLE).find((key) => error.message.includes(key));
+    const text = word ? `it needs ${UNREADABLE[word]}, which kouxing cannot read; export it without` : error.message;
+    throw new Error(`${url}: ${text}`, { cause: error });
+  }
+}
+
+async function readAvatar(url) {
   const loader = new GLTFLoader().register((parser) => new VRMLoaderPlugin(parser));
-  const gltf = await loader.loadAsync(url);
-  const kouxing = gltf.scene.getObjectByName("kouxing")?.userData.kouxing;
-  if (gltf.userData.vrm) return vrmAvatar(gltf.userData.vrm);
+  loader.setMeshoptDecoder(MeshoptDecoder).setDRACOLoader(globalThis.Worker ? new DRACOLoader() : null);
+  const { scene, parser, userData } = await loader.loadAsync(url);
+  const kouxing = scene.getObjectByName("kouxing")?.userData.kouxing;
+  scene.updateMatrixWorld(true);
   const meshes = [];
-  gltf.scene.traverse((node) => {
-    if (!node.morphTargetDictionary) return;
+  scene.traverse((node) => {
     node.frustumCulled = false; // its bounds do not follow the face
-    meshes.push(node);
+    if (node.morphTargetInfluences) meshes.push({ mesh: node, names: targetNames(node, parser) });
   });
-  const target = meshes[0]?.morphTargetDictionary ?? {};
-  if (kouxing?.faps.some(({ name }) => name in target)) return kouxingHead(gltf.scene, meshes, kouxing);
-  return morphAvatar(gltf.scene, meshes, url);
+  if (userData.vrm) return vrmAvatar(userData.vrm, meshes);
+  const isHead = kouxing?.faps.some(({ name }) => meshes[0]?.names.includes(name));
+  return isHead ? kouxingHead(scene, meshes, kouxing) : morphAvatar(scene, meshes);
+}
+
+/** Return the names of a mesh's morph targets. Programs write them in different places. */
+function targetNames(mesh, { json, associations }) {
+  const { meshes, primitives = 0 } = associations.get(mesh);
+  const { targets, extras } = json.meshes[meshes].primitives[primitives];
+  const names = extras?.targetNames ?? json.meshes[meshes].extras?.targetNames;
+  return targets.map(({ POSITION }, i) => names?.[i] ?? json.accessors[POSITION]?.name ?? String(i));
 }
 
 function kouxingHead(scene, meshes, { faps, camera }) {
-  const moved = meshes.map((mesh) => new MorphedMesh(mesh, faps));
+  const moved = meshes.map(({ mesh }) => new MorphedMesh(mesh, faps));
   const joints = findJoints(scene, faps);
   const [position, target] = [camera.position, camera.target].map((at) => new THREE.Vector3(...at));
   const half = Math.tan(THREE.MathUtils.degToRad(camera.fovYDegrees / 2));
@@ -51,67 +73,62 @@ function kouxingHead(scene, meshes, { faps, camera }) {
   };
 }
 
-function morphAvatar(scene, meshes, url) {
-  const targets = new Map(); // [mesh, index] of every shape, by its normalized name
-  for (const mesh of meshes) {
-    for (const [name, index] of Object.entries(mesh.morphTargetDictionary)) {
-      const key = normalizedName(name);
-      targets.set(key, [...(targets.get(key) ?? []), [mesh, index]]);
-    }
-  }
-  const set = targets.has("jawopen") ? "arkit" : "oculus";
-  if (set === "oculus" && !targets.has("aa")) {
-    throw new Error(
-      `${url}: the model cannot speak; use a VRM, or a GLB with the morph targets of ARKit (jawOpen) ` +
-        "or Oculus (viseme_aa)",
-    );
-  }
-  const moving = [...targets].filter(([name]) => name === "jawopen" || name === "aa");
-  const box = new THREE.Box3();
-  for (const [[mesh]] of moving.map(([, moved]) => moved)) box.expandByObject(mesh);
+function morphAvatar(scene, meshes) {
+  const set = chooseSet(meshes.flatMap(({ names }) => names));
+  const targets = meshes.flatMap(({ mesh, names }) => {
+    const shapes = findShapes(set, names);
+    return names.map((name, index) => ({ mesh, index, shape: shapes.get(name) })).filter(({ shape }) => shape);
+  });
+  const region = new FaceRegion(targets);
+  const upright = new THREE.Group().add(scene);
+  upright.quaternion.copy(region.upright);
+  upright.updateMatrixWorld(true);
+  const { center, height } = new FaceRegion(targets).bounds;
   return {
-    scene,
+    scene: upright,
     set,
-    view: { target: box.getCenter(new THREE.Vector3()), height: VIEW_HEIGHT * (box.max.y - box.min.y) },
+    view: { target: center, height: VIEW_HEIGHT * height },
     pose(weights, names) {
-      names.forEach((name, i) => {
-        for (const [mesh, index] of targets.get(normalizedName(name)) ?? []) {
-          mesh.morphTargetInfluences[index] = weights[i];
-        }
-      });
+      const weightOf = new Map(names.map((name, i) => [name, weights[i]]));
+      for (const { mesh, index, shape } of targets) {
+        mesh.morphTargetInfluences[index] = weightOf.get(shape) ?? 0;
+      }
     },
     update() {},
   };
 }
 
-function vrmAvatar(vrm) {
+function vrmAvatar(vrm, meshes) {
   VRMUtils.rotateVRM0(vrm); // version 0 faces the other way
-  vrm.scene.traverse((node) => (node.frustumCulled = false));
-  const expressions = new Map(
-    vrm.expressionManager.expressions.map(({ expressionName: name }) => [normalizedName(name), name]),
-  );
+  const names = vrm.expressionManager?.expressions.map(({ expressionName }) => expressionName) ?? [];
+  let speaking = null; // by morph targets, if the expressions do not suffice
+  let set;
+  try {
+    set = chooseSet(names);
+  } catch (error) {
+    try {
+      speaking = morphAvatar(vrm.scene, meshes);
+    } catch {
+      throw error;
+    }
+    ({ set } = speaking);
+  }
+  const shapes = findShapes(set, names);
   const head = vrm.humanoid.getRawBoneNode("head");
   vrm.scene.updateMatrixWorld(true);
   const target = head.getWorldPosition(new THREE.Vector3());
   target.y += VRM_FACE_M / 4; // the bone is at the end of the neck
   return {
     scene: vrm.scene,
-    set: expressions.has("jawopen") ? "arkit" : "vrm", // models with "Perfect Sync"
+    set,
     view: { target, height: VIEW_HEIGHT * VRM_FACE_M },
-    pose(weights, names) {
-      names.forEach((name, i) => {
-        const expression = expressions.get(normalizedName(name));
-        if (expression !== undefined) vrm.expressionManager.setValue(expression, weights[i]);
-      });
+    pose(weights, shapeNames) {
+      speaking?.pose(weights, shapeNames);
+      const weightOf = new Map(shapeNames.map((name, i) => [name, weights[i]]));
+      for (const [name, shape] of shapes) vrm.expressionManager.setValue(name, weightOf.get(shape) ?? 0);
     },
     update(seconds) {
       vrm.update(seconds);
     },
   };
-}
-
-/** Return one name for the spellings of programs: mouthSmile_L, Face.mouthSmileLeft, viseme_aa. */
-function normalizedName(name) {
-  const base = name.replace(/^.*\./, "").replace(/_L$/, "Left").replace(/_R$/, "Right").toLowerCase();
-  return READY_PLAYER_ME[base] ?? base.replace(/^viseme_/, "");
 }

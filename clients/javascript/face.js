@@ -7,8 +7,10 @@ import { FapTrack } from "./page/playout.js";
 import { Sound } from "./page/sound.js";
 import { loadAvatar } from "./avatar.js";
 import { readRecording } from "./recording.js";
+import { chooseSet } from "./shape-names.js";
 import { Viewer } from "./viewer.js";
 
+const NO_WEBGL = "this browser has no WebGL; turn on hardware acceleration";
 const FOV_DEGREES = 20;
 const RATE_HZ = 16000;
 const MAX_STEP_S = 0.1; // of the physics of hair
@@ -17,6 +19,7 @@ const MAX_STEP_S = 0.1; // of the physics of hair
 export class KouxingFace extends HTMLElement {
   static observedAttributes = ["src", "gateway", "session", "token", "recording"];
   #renderer = null;
+  #note = document.createElement("p"); // the last error
   #drawRate = null;
   #images = null;
   #scene = new THREE.Scene();
@@ -36,10 +39,10 @@ export class KouxingFace extends HTMLElement {
   constructor() {
     super();
     const canvas = document.createElement("canvas");
-    canvas.style.cssText = "display: block; width: 100%; height: 100%";
     const style = document.createElement("style");
-    style.textContent = ":host { display: block; aspect-ratio: 1; contain: strict }";
-    this.attachShadow({ mode: "open" }).append(style, canvas);
+    style.textContent =
+      ":host { display: block; aspect-ratio: 1; contain: strict } p { position: absolute; margin: 1em } canvas { display: block; width: 100%; height: 100% }";
+    this.attachShadow({ mode: "open" }).append(style, this.#note, canvas);
     this.#scene.add(new THREE.HemisphereLight(0xffffff, 0x8d8d99, 2));
     const key = new THREE.DirectionalLight(0xfff4ea, 2);
     key.position.set(-1, 1, 2);
@@ -48,7 +51,12 @@ export class KouxingFace extends HTMLElement {
 
   connectedCallback() {
     const canvas = this.shadowRoot.querySelector("canvas");
-    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    try {
+      this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    } catch (error) {
+      this.#fail(error, NO_WEBGL);
+      return;
+    }
     const gl = this.#renderer.getContext();
     const ratio = Math.min(2, devicePixelRatio);
     this.#drawRate = new DrawRate(ratio, ratio, drawsInSoftware(gl));
@@ -63,7 +71,7 @@ export class KouxingFace extends HTMLElement {
     this.#loadId++;
     this.#resizeObserver.disconnect();
     this.#disconnect();
-    this.#renderer.dispose();
+    this.#renderer?.dispose();
     this.#renderer = null;
   }
 
@@ -102,6 +110,8 @@ export class KouxingFace extends HTMLElement {
    */
   async play(audio = null) {
     const { names, frames } = readRecording(await (await fetch(this.getAttribute("recording"))).text());
+    const set = names === null ? "faps" : chooseSet(names);
+    if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
     const startMs = performance.now();
     await audio?.play();
     await new Promise((onEnded) => {
@@ -122,16 +132,24 @@ export class KouxingFace extends HTMLElement {
       if (loadId !== this.#loadId) return; // another load has started
       this.#avatar = avatar;
     } catch (error) {
-      this.dispatchEvent(new ErrorEvent("error", { error, message: error.message }));
+      if (loadId === this.#loadId) this.#fail(error, error.message);
       return;
     }
+    this.#note.textContent = "";
     const { scene, view } = this.#avatar;
     this.#scene.add(scene);
     const distance = view.height / 2 / Math.tan(THREE.MathUtils.degToRad(FOV_DEGREES / 2));
+    [this.#camera.near, this.#camera.far] = [distance / 100, distance * 100];
+    this.#camera.updateProjectionMatrix();
     this.#camera.position.copy(view.target).add(new THREE.Vector3(0, 0, distance));
     this.#camera.lookAt(view.target);
     this.dispatchEvent(new Event("load"));
     this.#connect();
+  }
+
+  #fail(error, message) {
+    this.#note.textContent = message;
+    this.dispatchEvent(new ErrorEvent("error", { error, message }));
   }
 
   #connect() {

@@ -9,6 +9,7 @@ a file of `kouxing render my.wav my.csv --as arkit`, or a .jsonl file; for a tak
 
 import csv
 import json
+import re
 import socket
 import struct
 from collections import defaultdict
@@ -23,7 +24,7 @@ bl_info = {
     "version": (1, 0, 0),
     "blender": (4, 2, 0),
     "location": "3D View > Sidebar > kouxing",
-    "description": "Speech moves a face with ARKit shape keys",
+    "description": "Speech moves a face with shape keys",
     "category": "Animation",
 }
 
@@ -47,13 +48,117 @@ LIVE_LINK_ORDER = (
 # fmt: on
 
 
-def shape_keys():
-    """Return the scene's shape keys: lists by name."""
+# shared/face/shape_names.txt, explained in shared/face/shape_names.py
+SHAPE_NAMES = """
+arkit *jawOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
+ *mouthPucker=Mouth_Pucker_Up_L+Mouth_Pucker_Up_R+Mouth_Pucker_Down_L+Mouth_Pucker_Down_R
+ mouthFunnel=Mouth_Funnel_Up_L+Mouth_Funnel_Up_R+Mouth_Funnel_Down_L+Mouth_Funnel_Down_R
+ mouthRollLower=Mouth_Roll_In_Lower_L+Mouth_Roll_In_Lower_R mouthShrugLower mouthShrugUpper
+ mouthRollUpper=Mouth_Roll_In_Upper_L+Mouth_Roll_In_Upper_R mouthPressLeft mouthPressRight
+ mouthLowerDownLeft=Mouth_Down_Lower_L mouthLowerDownRight=Mouth_Down_Lower_R
+ mouthUpperUpLeft=Mouth_Up_Upper_L mouthUpperUpRight=Mouth_Up_Upper_R
+ mouthSmileLeft mouthSmileRight mouthFrownLeft mouthFrownRight mouthDimpleLeft
+ mouthDimpleRight mouthStretchLeft mouthStretchRight noseSneerLeft noseSneerRight
+ browInnerUp=Brow_Raise_Inner_L+Brow_Raise_Inner_R cheekPuff=Cheek_Puff_L+Cheek_Puff_R
+ browOuterUpLeft=Brow_Raise_Outer_L browOuterUpRight=Brow_Raise_Outer_R
+ browDownLeft=Brow_Drop_L browDownRight=Brow_Drop_R
+ cheekSquintLeft=Cheek_Raise_L cheekSquintRight=Cheek_Raise_R
+ eyeBlinkLeft=Eyes_Closed_L eyeBlinkRight=Eyes_Closed_R
+ eyeSquintLeft eyeSquintRight eyeWideLeft eyeWideRight
+ eyeLookUpLeft=Eye_L_Look_Up eyeLookUpRight=Eye_R_Look_Up
+ eyeLookDownLeft=Eye_L_Look_Down eyeLookDownRight=Eye_R_Look_Down
+ eyeLookInLeft=Eye_L_Look_R eyeLookInRight=Eye_R_Look_L
+ eyeLookOutLeft=Eye_L_Look_L eyeLookOutRight=Eye_R_Look_R
+oculus *aa=V_Open=vAA *PP=V_Explosive=vM FF=V_Dental_Lip=vF TH=vTH DD=V_Tongue_Up=vT kk=vK
+ CH=V_Affricate=vSH SS=vS nn=vL RR=vER sil E=viseme_E=v_E=vEH
+ *ih=viseme_I=V_Wide=vIH *oh=viseme_O=V_Tight_O=vOW *ou=viseme_U=V_Tight=vUW
+vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
+ *ee=E=MTH_E=Mouth_E=え *oh=O=MTH_O=Mouth_O=お blink=EYE_Close=まばたき
+ blinkLeft=EYE_Close_L blinkRight=EYE_Close_R lookUp lookDown lookLeft lookRight
+"""
+TITLES = {"arkit": "ARKit", "oculus": "Oculus", "vrm": "VRM"}
+SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL")
+
+
+def sided(name):
+    """Write the side at the end of a name as a word."""
+    name = re.sub(r"_div\d$", "", name)  # of Daz
+    name = re.sub(r"([._\- ][Ll]|(?<=[a-z])L)$", "Left", name)
+    return re.sub(r"([._\- ][Rr]|(?<=[a-z])R)$", "Right", name)
+
+
+def to_key(name):
+    """Return a name without separators and case."""
+    return SEPARATOR.sub("", name).lower()
+
+
+def candidates(name):
+    """Return the keys of a name without none, one, two, ... words at its beginning."""
+    name = sided(name)
+    rests = [(found[0], to_key(name[found.end() :])) for found in SEPARATOR.finditer(name)]
+    return [to_key(name), *(key for mark, key in rests if len(key) > 1 or mark in ".:|/")]
+
+
+def read_table():
+    """Return the entries of each set: shape, its names as lists of parts, whether it is needed."""
+    sets = {}
+    for line in SHAPE_NAMES.strip().splitlines():
+        words = line.split()
+        if not line.startswith(" "):
+            entries = sets[words.pop(0)] = []
+        for word in words:
+            choices = [choice.split("+") for choice in word.lstrip("*").split("=")]
+            keys = [[to_key(sided(part)) for part in parts] for parts in choices]
+            entries.append((choices[0][0], keys, word.startswith("*")))
+    return sets
+
+
+SETS = read_table()
+
+
+def find_shapes(set_name, names):
+    """Return the shapes of the recognized names of a mesh, by name."""
+    known = {key for _, choices, _ in SETS[set_name] for parts in choices for key in parts}
+    by_key = {}
+    for name in names:
+        by_key.setdefault(next((key for key in candidates(name) if key in known), ""), name)
+    shapes = {}
+    for shape, choices, _ in SETS[set_name]:
+        parts = next((parts for parts in choices if any(key in by_key for key in parts)), [])
+        shapes.update({by_key[key]: shape for key in parts if key in by_key})
+    return shapes
+
+
+def shape_keys(set_name):
+    """Return the shape keys of the scene that form a shape of the set: lists by shape."""
     keys = defaultdict(list)
     for shapes in bpy.data.shape_keys:
-        for key in shapes.key_blocks[1:]:  # the first is the face at rest
-            keys[key.name].append(key)
+        blocks = {key.name: key for key in shapes.key_blocks[1:]}  # the first is the face at rest
+        for name, shape in find_shapes(set_name, blocks).items():
+            keys[shape].append(blocks[name])
     return keys
+
+
+def problem(set_name):
+    """Return why weights of a set cannot move the scene, or an empty text."""
+    missing, share, speaking = {}, {}, []
+    for name, entries in SETS.items():
+        keys = shape_keys(name)
+        needed = [shape for shape, _, is_needed in entries if is_needed]
+        missing[name] = [shape for shape in needed if shape not in keys]
+        share[name] = len(missing[name]) / len(needed)
+        if needed[0] in keys:
+            speaking.append(name)
+    if set_name in speaking:
+        return ""
+    if speaking:
+        name = min(reversed(speaking), key=share.get)
+        return f"the avatar has shapes of {TITLES[name]}; insert a recording made with --as {name}"
+    nearest = min(share, key=share.get)
+    return (
+        f"the avatar cannot speak: it has no shape {', '.join(missing[nearest])} of"
+        f" {TITLES[nearest]}; use an avatar with the shapes of ARKit, Oculus or VRM"
+    )
 
 
 def read_live_link(packet):
@@ -66,19 +171,19 @@ def read_live_link(packet):
 
 
 def read_recording(path):
-    """Return the times in seconds and the weights by name of a .csv or .jsonl file."""
+    """Return the times in seconds, the set and the weights by name of a .csv or .jsonl file."""
     with Path(path).open(encoding="utf-8") as file:
         if path.endswith(".csv"):
-            rows = [
-                {name: float(value) for name, value in row.items() if name != "phone"}
-                for row in csv.DictReader(file)
-            ]
-            times_s = [row.pop("time_s") for row in rows]
+            rows = frames = list(csv.DictReader(file))
         else:
             frames = [json.loads(line) for line in file]
-            times_s = [frame["time_s"] for frame in frames]
-            rows = [frame["arkit"] for frame in frames]
-    return times_s, {name: [row[name] for row in rows] for name in rows[0]}
+            rows = [next(frame[name] for name in SETS if name in frame) for frame in frames]
+    for set_name, entries in SETS.items():
+        names = [shape for shape, _, _ in entries]
+        if rows[0].keys() >= set(names):
+            times_s = [float(frame["time_s"]) for frame in frames]
+            return times_s, set_name, {name: [float(row[name]) for row in rows] for name in names}
+    raise ValueError("its columns are not the shapes of ARKit, Oculus or VRM")
 
 
 class Receiver:
@@ -112,7 +217,7 @@ class Receiver:
             except BlockingIOError:
                 break
             self.num_packets += 1
-        keys = shape_keys() if packet else {}
+        keys = shape_keys("arkit") if packet else {}
         for name, weight in read_live_link(packet).items():
             for key in keys.get(name, ()):
                 key.value = weight
@@ -133,6 +238,9 @@ class KOUXING_OT_follow(bpy.types.Operator):
         if RECEIVER.socket is not None:
             RECEIVER.close()
             return {"FINISHED"}
+        if text := problem("arkit"):
+            self.report({"ERROR"}, text)
+            return {"CANCELLED"}
         try:
             RECEIVER.open(context.scene.kouxing_port)
         except OSError as error:
@@ -155,15 +263,15 @@ class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
     def execute(self, context):
         """Set a key frame for every frame of the file."""
         try:
-            times_s, weights = read_recording(self.filepath)
-        except (OSError, KeyError, ValueError, IndexError) as error:
-            self.report({"ERROR"}, f"{self.filepath} is not a file of ARKit weights: {error}")
+            times_s, set_name, weights = read_recording(self.filepath)
+        except (OSError, KeyError, ValueError, IndexError, StopIteration) as error:
+            self.report({"ERROR"}, f"{self.filepath} is not a file of weights: {error}")
             return {"CANCELLED"}
-        keys = shape_keys()
+        if text := problem(set_name):
+            self.report({"ERROR"}, text)
+            return {"CANCELLED"}
+        keys = shape_keys(set_name)
         names = [name for name in weights if name in keys]
-        if not names:
-            self.report({"ERROR"}, "no shape key in the scene has an ARKit name (such as jawOpen)")
-            return {"CANCELLED"}
         scene = context.scene
         rate_hz = scene.render.fps / scene.render.fps_base
         frames = [scene.frame_current + time_s * rate_hz for time_s in times_s]

@@ -4,6 +4,7 @@
 
 import { VRMLoaderPlugin, VRMUtils } from "@pixiv/three-vrm";
 import * as THREE from "three";
+import { MeshoptDecoder } from "three/addons/libs/meshopt_decoder.module.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
 const FAP_FRAME = 1; // types of binary messages, proto/GATEWAY.md
@@ -13,23 +14,21 @@ const HEADER_BYTES = 16;
 const HEAD_ROTATION = [47, 48, 49]; // indices of FAPs 48 to 50: pitch, yaw, roll
 const RADIANS_PER_UNIT = 1e-5;
 const RETRY_MS = 1000;
+const ARKIT_NEEDED = ["jawOpen", "mouthPucker"]; // as in shared/face/shape_names.txt
+const VRM_NEEDED = ["aa", "ih", "ou", "ee", "oh"];
 
 const query = new URLSearchParams(location.search);
 const note = document.getElementById("note");
-const renderer = new THREE.WebGLRenderer({
-  canvas: document.querySelector("canvas"),
-  antialias: true,
-  alpha: true,
+const { vrm, renderer } = await start().catch((error) => {
+  note.textContent = error.message;
+  throw error;
 });
+const expressions = vrm.expressionManager;
+const nameOf = new Map((expressions?.expressions ?? []).map(({ expressionName }) => [plain(expressionName), expressionName]));
+const head = vrm.humanoid.getNormalizedBoneNode("head");
+const forward = vrm.meta.metaVersion === "0" ? -1 : 1; // the bones of version 0 look along -z
 const scene = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(22, 1, 0.05, 20);
-
-const loader = new GLTFLoader();
-loader.register((parser) => new VRMLoaderPlugin(parser));
-const { vrm } = (await loader.loadAsync(query.get("avatar") ?? "avatar.vrm")).userData;
-VRMUtils.rotateVRM0(vrm); // models of version 0 face the other way
-const expressions = vrm.expressionManager;
-const head = vrm.humanoid.getNormalizedBoneNode("head");
 scene.add(vrm.scene, new THREE.HemisphereLight(0xffffff, 0xa0a4b0, 2.2));
 const light = new THREE.DirectionalLight(0xffffff, 2.4);
 light.position.set(-0.5, 2.2, 1.5);
@@ -39,12 +38,44 @@ const face = head.getWorldPosition(new THREE.Vector3()).add(new THREE.Vector3(0,
 camera.position.copy(face).add(new THREE.Vector3(0.1, 0.03, 1.1));
 camera.lookAt(face);
 
+/** Load the avatar and start WebGL. */
+async function start() {
+  const loader = new GLTFLoader().setMeshoptDecoder(MeshoptDecoder);
+  loader.register((parser) => new VRMLoaderPlugin(parser));
+  const file = query.get("avatar") ?? "avatar.vrm";
+  const avatar = (await loader.loadAsync(file)).userData.vrm;
+  if (!avatar) throw new Error(`${file} is not a VRM avatar`);
+  VRMUtils.rotateVRM0(avatar); // models of version 0 face the other way
+  const canvas = document.querySelector("canvas");
+  try {
+    return { vrm: avatar, renderer: new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true }) };
+  } catch {
+    throw new Error("this browser has no WebGL; turn on hardware acceleration");
+  }
+}
+
+/** Return one name for JawOpen and jawOpen, mouthSmile_L and mouthSmileLeft. */
+function plain(name) {
+  return name.replace(/_L$/i, "Left").replace(/_R$/i, "Right").toLowerCase();
+}
+
+/** Return the names of a set that no expression has. */
+function missing(names) {
+  return names.filter((name) => !nameOf.has(plain(name)));
+}
+
 /** Follow the session; reconnect while the page is open. */
 function connect() {
   const url = new URL("/viewer", query.get("gateway") ?? "ws://127.0.0.1:8080");
   url.searchParams.set("session", query.get("session") ?? "");
   // Avatars with "Perfect Sync" have ARKit's 52 shapes, others have only VRM's shapes.
-  url.searchParams.set("shapes", expressions.getExpression("jawOpen") ? "arkit" : "vrm");
+  const isPerfect = missing(ARKIT_NEEDED).length === 0;
+  const unknown = missing(VRM_NEEDED);
+  if (!isPerfect && unknown[0] === "aa") {
+    note.textContent = `the avatar cannot speak: it has no shape ${unknown.join(", ")} of VRM; use an avatar with the shapes of ARKit, Oculus or VRM`;
+    return;
+  }
+  url.searchParams.set("shapes", isPerfect ? "arkit" : "vrm");
   const socket = new WebSocket(url);
   socket.binaryType = "arraybuffer";
   let names = [];
@@ -67,12 +98,12 @@ function connect() {
 }
 
 function show(names, weights) {
-  names.forEach((name, index) => expressions.setValue(name, weights[index]));
+  names.forEach((name, index) => expressions.setValue(nameOf.get(plain(name)), weights[index]));
 }
 
 function rotateHead(faps) {
   const [pitch, yaw, roll] = HEAD_ROTATION.map((index) => faps[index] * RADIANS_PER_UNIT);
-  head.rotation.set(pitch, yaw, roll, "YXZ");
+  head.rotation.set(forward * pitch, yaw, forward * roll, "YXZ");
 }
 
 const clock = new THREE.Clock();

@@ -1,5 +1,6 @@
 ## Moves a face with a live session. Godot 4: add this script to a node and choose the face in the
-## inspector. It moves every mesh below the face that has blend shapes with ARKit's names.
+## inspector. It moves every mesh below the face that has blend shapes of ARKit, Oculus or VRM, also
+## under the names of other programs.
 extends Node
 
 const RETRY_MS := 1000
@@ -11,11 +12,31 @@ const RETRY_MS := 1000
 
 var _socket := WebSocketPeer.new()
 var _retry_at_ms := 0
-var _meshes: Array[Node] = []
+var _set := ""
+var _targets := {}  # [mesh, index] of the blend shapes, lists by shape
 
 
 func _ready() -> void:
-	_meshes = face.find_children("*", "MeshInstance3D", true, false)
+	var names_of := {}
+	for mesh: MeshInstance3D in face.find_children("*", "MeshInstance3D", true, false):
+		names_of[mesh] = range(mesh.get_blend_shape_count()).map(
+			func(index: int) -> String: return mesh.mesh.get_blend_shape_name(index)
+		)
+	var all_names := []
+	for names: Array in names_of.values():
+		all_names.append_array(names)
+	var chosen := KouxingShapeNames.choose_set(all_names)
+	_set = chosen[0]
+	if _set == "":
+		push_error("kouxing: " + chosen[1])
+		set_process(false)
+		return
+	for mesh: MeshInstance3D in names_of:
+		var shapes := KouxingShapeNames.find_shapes(_set, names_of[mesh])
+		for target: String in shapes:
+			var targets: Array = _targets.get(shapes[target], [])
+			targets.append([mesh, names_of[mesh].find(target)])
+			_targets[shapes[target]] = targets
 
 
 func _process(_delta: float) -> void:
@@ -29,7 +50,7 @@ func _process(_delta: float) -> void:
 		WebSocketPeer.STATE_CLOSED:
 			if Time.get_ticks_msec() >= _retry_at_ms:
 				_retry_at_ms = Time.get_ticks_msec() + RETRY_MS
-				var query := "?shapes=arkit&format=json&session=" + session.uri_encode()
+				var query := "?shapes=%s&format=json&session=%s" % [_set, session.uri_encode()]
 				_socket.connect_to_url(gateway + "/viewer" + query)
 
 
@@ -39,8 +60,6 @@ func _receive(message: Dictionary) -> void:
 		push_warning("kouxing: " + message["text"])
 	if message["type"] not in ["weights", "rest"]:
 		return
-	for mesh: MeshInstance3D in _meshes:
-		for shape: String in message["weights"]:
-			var index := mesh.find_blend_shape_by_name(shape)
-			if index >= 0:
-				mesh.set_blend_shape_value(index, message["weights"][shape])
+	for shape: String in message["weights"]:
+		for target: Array in _targets.get(shape, []):
+			target[0].set_blend_shape_value(target[1], message["weights"][shape])

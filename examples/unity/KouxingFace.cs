@@ -1,7 +1,9 @@
 // Unity 2021 or newer: add this component to an avatar. It moves every SkinnedMeshRenderer below the
-// avatar that has blend shapes with ARKit's names.
+// avatar that has blend shapes of ARKit, Oculus or VRM, also under the names of other programs.
 
+using System;
 using System.Collections.Generic;
+using System.Linq;
 using UnityEngine;
 
 public sealed class KouxingFace : MonoBehaviour
@@ -17,20 +19,33 @@ public sealed class KouxingFace : MonoBehaviour
     void OnEnable()
     {
         _shapes.Clear();
+        var names = new List<(SkinnedMeshRenderer mesh, List<string> names)>();
         foreach (var mesh in GetComponentsInChildren<SkinnedMeshRenderer>())
-            for (int shape = 0; shape < mesh.sharedMesh.blendShapeCount; shape++)
-            {
-                // "Face.jawOpen" and "blendShape1.jawOpen" also mean jawOpen
-                string name = mesh.sharedMesh.GetBlendShapeName(shape);
-                _shapes.Add((mesh, shape, name.Substring(name.LastIndexOf('.') + 1)));
-            }
-        _stream = new KouxingStream(gateway, session);
+            names.Add((mesh, Enumerable.Range(0, mesh.sharedMesh.blendShapeCount)
+                .Select(mesh.sharedMesh.GetBlendShapeName).ToList()));
+        string set;
+        try { set = KouxingShapeNames.ChooseSet(names.SelectMany(pair => pair.names).ToList()); }
+        catch (InvalidOperationException error)
+        {
+            Debug.LogError($"kouxing: {error.Message}", this);
+            enabled = false;
+            return;
+        }
+        foreach (var (mesh, meshNames) in names)
+            foreach (var pair in KouxingShapeNames.FindShapes(set, meshNames))
+                _shapes.Add((mesh, meshNames.IndexOf(pair.Key), pair.Value));
+        _stream = new KouxingStream(gateway, session, set);
     }
 
-    void OnDisable() => _stream.Dispose();
+    void OnDisable()
+    {
+        _stream?.Dispose();
+        _stream = null;
+    }
 
     void LateUpdate() // after the Animator
     {
+        if (_stream == null) return;
         var (names, weights) = (_stream.Names, _stream.Weights);
         if (weights.Length != names.Count) return;
         var face = new Dictionary<string, float>();

@@ -1,4 +1,4 @@
-// Follows a live session over the gateway's WebSocket: the weights of ARKit's 52 shapes, in plain C#
+// Follows a live session over the gateway's WebSocket: weights of shapes, in plain C#
 // (.NET Standard 2.1: Unity 2021 or newer, .NET 5 or newer) without dependencies.
 
 using System;
@@ -27,10 +27,10 @@ public sealed class KouxingStream : IDisposable
     /// <summary>Weights of the newest face. The array is replaced, never changed, so any thread may read it.</summary>
     public float[] Weights { get; private set; } = Array.Empty<float>();
 
-    /// <summary>Follow a session until disposed; an empty name means the newest.</summary>
-    public KouxingStream(string gateway = "ws://127.0.0.1:8080", string session = "")
+    /// <summary>Follow a session until disposed; an empty name means the newest. Shapes: arkit, oculus or vrm.</summary>
+    public KouxingStream(string gateway = "ws://127.0.0.1:8080", string session = "", string shapes = "arkit")
     {
-        _url = new Uri(gateway + "/viewer?shapes=arkit&session=" + Uri.EscapeDataString(session));
+        _url = new Uri(gateway + "/viewer?shapes=" + shapes + "&session=" + Uri.EscapeDataString(session));
         _ = Task.Run(RunAsync);
     }
 

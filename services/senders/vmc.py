@@ -24,10 +24,9 @@ from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnecti
 from kouxing.services.senders.face_frame import Angles, FaceFrame
 from kouxing.services.senders.osc import bundles, message
 
-_VRM_0 = {
+_VRM_0 = {  # where it is not only the capital of VRM 1
     "aa": "A", "ih": "I", "ou": "U", "ee": "E", "oh": "O",
-    "blink": "Blink", "blinkLeft": "Blink_L", "blinkRight": "Blink_R",
-    "lookUp": "LookUp", "lookDown": "LookDown", "lookLeft": "LookLeft", "lookRight": "LookRight",
+    "blinkLeft": "Blink_L", "blinkRight": "Blink_R",
 }  # fmt: skip
 
 

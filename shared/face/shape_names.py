@@ -3,7 +3,7 @@
 ``shape_names.txt`` is the only table of names. The JavaScript client, Blender, Unity and Godot
 contain the same table. Each line or continuation belongs to a set. An entry is a shape and its
 other names, ``shape=OTHER=PART+PART``; a sum of parts also forms the shape. An avatar can speak if
-it has all shapes with ``*`` of a set. ARKit's shapes without other names are not listed.
+it has the first shape of a set, and speaks well if it has all shapes with ``*``.
 
 Names match in any case, after any prefix, and with ``_L``, ``.L`` or ``Left`` at the end. A name of
 one letter matches only without a prefix or after ``.``, ``:``, ``|`` or ``/``.
@@ -35,13 +35,12 @@ _SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL")
 _SIDES = {"L": "Left", "R": "Right"}
 
 
-def find_shapes(set_name: str, names: Iterable[str], listed: Iterable[str] = ()) -> dict[str, str]:
+def find_shapes(set_name: str, names: Iterable[str]) -> dict[str, str]:
     """Return the shapes of the recognized names of a mesh, by name.
 
-    ``listed`` are shapes of the set that the table need not contain. If a mesh has a shape under
-    several names, only the first name of the table counts.
+    If a mesh has a shape under several names, only the first name of the table counts.
     """
-    entries = {shape: [[_key(shape)]] for shape in listed} | _TABLE[set_name]
+    entries = _TABLE[set_name]
     keys = {key for choices in entries.values() for parts in choices for key in parts}
     by_key: dict[str, str] = {}
     for name in names:
@@ -55,7 +54,7 @@ def find_shapes(set_name: str, names: Iterable[str], listed: Iterable[str] = ())
 
 
 def choose_set(names: Iterable[str]) -> ShapeSetName:
-    """Return the first set whose necessary shapes an avatar has.
+    """Return the set that moves an avatar: the first that is complete, or the nearest to that.
 
     Raises ``UserError`` if the avatar cannot speak; the text names what the nearest set lacks.
     """
@@ -64,9 +63,15 @@ def choose_set(names: Iterable[str]) -> ShapeSetName:
     for set_name, needed in _NEEDED.items():
         found = find_shapes(set_name, names).values()
         missing[set_name] = [shape for shape in needed if shape not in found]
-        if not missing[set_name]:
-            return ShapeSetName(set_name)
-    nearest = min(missing, key=lambda name: len(missing[name]) / len(_NEEDED[name]))
+
+    def share(set_name: str) -> float:
+        return len(missing[set_name]) / len(_NEEDED[set_name])
+
+    speaking = [name for name in missing if _NEEDED[name][0] not in missing[name]]
+    if speaking:
+        complete = [name for name in speaking if not missing[name]]
+        return ShapeSetName((complete or [min(reversed(speaking), key=share)])[0])
+    nearest = min(missing, key=share)
     raise UserError(
         f"the avatar cannot speak: it has no shape {', '.join(missing[nearest])} of"
         f" {_TITLES[nearest]}; use an avatar with the shapes of ARKit, Oculus or VRM"

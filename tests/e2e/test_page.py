@@ -535,12 +535,13 @@ def test_the_language_can_be_changed(page: Browser) -> None:
     assert page.evaluate(label) == "level"
 
 
-def test_reports_a_browser_without_webgl(browser: Browser, gateway: Gateway) -> None:
+@pytest.mark.parametrize("view", ["", "?view=bare&background=transparent"])
+def test_reports_a_browser_without_webgl(browser: Browser, gateway: Gateway, view: str) -> None:
     blind = "HTMLCanvasElement.prototype.getContext = () => null"
     browser.command("Page.enable")
     script = browser.command("Page.addScriptToEvaluateOnNewDocument", source=blind)
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('no-head')?.textContent.includes('WebGL')")
+    browser.command("Page.navigate", url=gateway.page + view)
+    browser.wait_for("document.getElementById('no-head')?.innerText.includes('WebGL')")
     assert "WebGL" in browser.evaluate("document.getElementById('notice').textContent")
     browser.command("Page.removeScriptToEvaluateOnNewDocument", **script)
     browser.command("Page.disable")

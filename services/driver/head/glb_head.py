@@ -100,7 +100,7 @@ def _recognize(pieces: list[Primitive]) -> Names:
         shape_of = faps or {
             name: shape
             for kind in {set_name: 0, **_SETS}
-            for name, shape in find_shapes(kind, piece.shapes, _SETS[kind].names).items()
+            for name, shape in find_shapes(kind, piece.shapes).items()
         }
         shapes, piece.shapes = piece.shapes, {}
         for name, shift in shapes.items():

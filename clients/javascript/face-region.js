@@ -1,0 +1,86 @@
+// Where the face of an avatar is: the region that its shapes move.
+
+import * as THREE from "three";
+
+const MIN_SHARE = 0.1; // of the largest displacement; vertices that move less are not in the region
+const MAX_HEAD = 3; // height of a head, relative to the region from chin to brows
+const MAX_APART = 2; // distance of the parts of one face, in sizes of a part
+const STEEPER = 1.5; // how much farther the mouth is below the eyes along an axis that replaces y
+
+export class FaceRegion {
+  #parts; // { shape, mesh, box: moved vertices }
+
+  /**
+   * Throws an error if there are several faces.
+   *
+   * @param targets entries { mesh, index, shape } of the morph targets
+   */
+  constructor(targets) {
+    this.#parts = targets.map(({ mesh, index, shape }) => ({ shape, mesh, box: movedBox(mesh, index) }));
+    this.#parts = this.#parts.filter(({ box }) => !box.isEmpty());
+    const mouths = this.#parts.filter(({ shape }) => shape === "jawOpen" || shape === "aa");
+    const size = Math.max(0, ...mouths.map(({ box }) => sizeOf(box).length()));
+    const centers = new THREE.Box3().setFromPoints(mouths.map(({ box }) => centerOf(box)));
+    if (sizeOf(centers).length() > MAX_APART * size) {
+      throw new Error("it has several faces; export only one avatar");
+    }
+  }
+
+  /** The rotation after which y is up and the face looks along z. */
+  get upright() {
+    const [left, right, mouth] = [/^eyeBlinkLeft|^blinkLeft/, /^eyeBlinkRight|^blinkRight/, /^jawOpen|^aa/].map((name) =>
+      centerOf(this.#union(({ shape }) => name.test(shape))),
+    );
+    const side = left.clone().sub(right);
+    const up = left.add(right).divideScalar(2).sub(mouth);
+    if (![...side, ...up].every(Number.isFinite) || side.length() === 0) return new THREE.Quaternion();
+    const largest = (vector) => [0, 1, 2].reduce((a, b) => (Math.abs(vector.getComponent(b)) > Math.abs(vector.getComponent(a)) ? b : a));
+    const x = largest(side);
+    const y = x === 1 ? 2 : 1;
+    const other = 3 - x - y;
+    const isOther = Math.abs(up.getComponent(other)) > STEEPER * Math.abs(up.getComponent(y));
+    const xAxis = new THREE.Vector3().setComponent(x, Math.sign(side.getComponent(x)));
+    const yAxis = new THREE.Vector3().setComponent(isOther ? other : y, isOther ? Math.sign(up.getComponent(other)) : 1);
+    const basis = new THREE.Matrix4().makeBasis(xAxis, yAxis, xAxis.clone().cross(yAxis));
+    return new THREE.Quaternion().setFromRotationMatrix(basis).invert();
+  }
+
+  /** The head: { center, height }. A mesh that also has a body counts only where the face moves. */
+  get bounds() {
+    const moved = this.#union(() => true);
+    const whole = new THREE.Box3();
+    for (const mesh of new Set(this.#parts.map((part) => part.mesh))) whole.expandByObject(mesh);
+    const height = sizeOf(moved).y;
+    const isHead = height === 0 || sizeOf(whole).y <= MAX_HEAD * height;
+    return isHead
+      ? { center: centerOf(whole), height: sizeOf(whole).y }
+      : { center: centerOf(moved), height: (MAX_HEAD / 2) * height };
+  }
+
+  #union(isWanted) {
+    return this.#parts.filter(isWanted).reduce((union, { box }) => union.union(box), new THREE.Box3());
+  }
+}
+
+function centerOf(box) {
+  return box.getCenter(new THREE.Vector3());
+}
+
+function sizeOf(box) {
+  return box.getSize(new THREE.Vector3());
+}
+
+/** Return the box of the vertices that a morph target moves, in the scene's axes. */
+function movedBox(mesh, index) {
+  const shift = mesh.geometry.morphAttributes.position[index];
+  const squares = Float32Array.from({ length: shift.count }, (_, v) => shift.getX(v) ** 2 + shift.getY(v) ** 2 + shift.getZ(v) ** 2);
+  const largest = squares.reduce((a, b) => Math.max(a, b), 0);
+  const box = new THREE.Box3();
+  const point = new THREE.Vector3();
+  squares.forEach((square, v) => {
+    if (square > 0 && square >= MIN_SHARE ** 2 * largest) {
+      box.expandByPoint(mesh.getVertexPosition(v, point).applyMatrix4(mesh.matrixWorld));
+    }
+  });
+  return box;
+}

@@ -1,0 +1,158 @@
+"""What the JavaScript client makes of avatars: which shapes move them, and where their face is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
+from tests.system import ROOT
+
+pytestmark = pytest.mark.process
+
+CLIENT = ROOT / "clients" / "javascript"
+ARKIT = ["jawOpen", "mouthPucker", "eyeBlinkLeft", "eyeBlinkRight"]
+VRCHAT = [f"vrc.v_{viseme}" for viseme in ("sil", "pp", "aa", "ih", "oh", "ou")]
+VOWELS = ["A", "I", "U", "E", "O"]
+CANNOT = "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit; use an avatar"
+LOOK = """
+import { readFileSync } from "node:fs";
+globalThis.self = globalThis;
+globalThis.ProgressEvent = Event;
+console.warn = console.error = () => {};
+const { loadAvatar } = await import("./avatar.js");
+for (const file of process.argv.slice(2)) {
+  try {
+    const url = "data:;base64," + readFileSync(file).toString("base64");
+    const { set, view } = await loadAvatar(url);
+    console.log(JSON.stringify({ set, target: view.target.toArray(), height: view.height }));
+  } catch (error) {
+    console.log(JSON.stringify({ error: error.message.replace(/^data:[^:]*: /, "") }));
+  }
+}
+process.exit(0);
+"""
+
+
+def box(name: str, center: tuple[float, float, float], size: float, shapes: list[str]) -> Mesh:
+    """Make a box whose lower half each shape lowers; blinks move the upper left or right edge."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    triangles = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [2, 3, 7]])
+    targets = {}
+    for shape in shapes:
+        side = 1 if "Left" in shape else -1
+        moved = corners[:, 1] < 0
+        if "Blink" in shape:
+            moved = (corners[:, 1] > 0) & (corners[:, 0] * side > 0)
+        targets[shape] = np.outer(moved, [0, -size / 4, 0])
+    return Mesh(name, corners * size + center, triangles, targets)
+
+
+def face(shapes: list[str]) -> list[Mesh]:
+    """Make a head behind its eyes, which have all shapes too, as in Ready Player Me's avatars."""
+    eyes = [
+        box(f"Eye{side}", (x, 1.7, 0.09), 0.024, shapes)
+        for side, x in (("L", 0.032), ("R", -0.032))
+    ]
+    return [*eyes, box("Head", (0, 1.65, 0), 0.2, shapes)]
+
+
+def change(path: Path, kind: str) -> None:
+    document, binary = read_chunks(path)
+    nodes = document["scenes"][0]["nodes"]
+    if kind == "z up":
+        turn = {"rotation": [2**-0.5, 0, 0, 2**-0.5], "scale": [100, 100, 100]}
+        document["nodes"].append(turn | {"children": nodes})
+        document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+    elif kind == "twice":
+        document["nodes"].append(document["nodes"][2] | {"translation": [1, 0, 0]})
+        nodes.append(len(document["nodes"]) - 1)
+    elif kind in ("primitives", "unnamed"):
+        for mesh in document["meshes"]:
+            extras = mesh.pop("extras")
+            if kind == "primitives":
+                mesh["primitives"][0]["extras"] = extras
+    else:
+        document["extensionsUsed"] = document["extensionsRequired"] = [kind]
+        extension = {kind: {"bufferView": 0, "attributes": {"POSITION": 0}}}
+        document["meshes"][0]["primitives"][0]["extensions"] = extension
+    write_chunks(path, document, binary)
+
+
+FILES: dict[str, tuple[list[Mesh], str]] = {
+    "rpm": (face(ARKIT), ""),
+    "head first": (face(ARKIT)[::-1], ""),
+    "primitives": (face(ARKIT), "primitives"),
+    "vrchat": (face(VRCHAT), ""),
+    "vowels": (face(VOWELS), ""),
+    "z up": (face(ARKIT), "z up"),
+    "twice": (face(ARKIT), "twice"),
+    "unnamed": (face(ARKIT), "unnamed"),
+    "no face": ([box("Box", (0, 0, 0), 1, [])], ""),
+    "blink": (face(ARKIT[2:]), ""),
+    "draco": (face(ARKIT), "KHR_draco_mesh_compression"),
+}
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("client")
+    for file in CLIENT.glob("*.js"):
+        shutil.copy(file, folder)
+    (folder / "package.json").write_text('{"type": "module"}', encoding="utf-8")
+    (folder / "node_modules").symlink_to(CLIENT / "node_modules")
+    (folder / "page").symlink_to(ROOT / "services" / "gateway" / "page")
+    (folder / "look.js").write_text(LOOK, encoding="utf-8")
+    paths = []
+    for name, (meshes, kind) in FILES.items():
+        paths.append(write_glb(folder / f"{name}.glb", meshes))
+        if kind:
+            change(paths[-1], kind)
+    result = subprocess.run(
+        ["node", "look.js", *paths], cwd=folder, capture_output=True, text=True, check=True
+    )
+    return dict(zip(FILES, map(json.loads, result.stdout.splitlines()), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "shapes"),
+    [
+        ("rpm", "arkit"),
+        ("head first", "arkit"),
+        ("primitives", "arkit"),
+        ("vrchat", "oculus"),
+        ("vowels", "vrm"),
+    ],
+)
+def test_frames_the_head_and_not_an_eye(
+    found: dict[str, dict[str, Any]], name: str, shapes: str
+) -> None:
+    assert found[name]["set"] == shapes
+    assert found[name]["target"] == pytest.approx([0, 1.65, 0], abs=0.01)
+    assert found[name]["height"] == pytest.approx(0.48, abs=0.05)
+
+
+def test_turns_a_face_upright(found: dict[str, dict[str, Any]]) -> None:
+    assert found["z up"]["target"] == pytest.approx([0, 165, 0], abs=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("unnamed", CANNOT),
+        ("no face", CANNOT),
+        ("blink", CANNOT),
+        ("twice", "it has several faces; export only one avatar"),
+        ("draco", "it needs KHR_draco_mesh_compression, which kouxing cannot read"),
+    ],
+)
+def test_says_why_an_avatar_cannot_be_shown(
+    found: dict[str, dict[str, Any]], name: str, said: str
+) -> None:
+    assert said in found[name]["error"]

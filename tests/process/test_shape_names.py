@@ -1,0 +1,125 @@
+"""The Python, JavaScript, C# and Blender code finds the same shapes; Godot's code is not run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.shape_names import choose_set, find_shapes
+from tests.system import ROOT
+
+pytestmark = pytest.mark.process
+
+MESHES = [
+    "Face.jawOpen mouthPucker mouthSmile.L mouthSmileR BROWINNERUP eyeLookOut_L head_A",
+    "CC_Base.Jaw_Open Mouth_Pucker_Up_L Mouth_Pucker_Down_R Eye_L_Look_L Brow_Raise_Inner_L",
+    "G8__facs_bs_MouthSmileLeft_div2 eCTRLEyesClosedL eCTRLvAA facs_ctrl_vM eCTRLvUW",
+    "vrc.v_aa vrc.v_E vrc.v_pp viseme_ih viseme_O viseme_U viseme_aa",
+    "A I U E O Blink_L Fcl_MTH_A Fcl_EYE_Close Face.M_F00_000_Fcl_MTH_I \u3042",
+    "A I happy",
+    "I U E O",
+    "jawOpen",
+    "0 1 2",
+]
+SETS = ("arkit", "oculus", "vrm")
+
+JAVASCRIPT = """
+import { readFileSync } from "node:fs";
+import { chooseSet, findShapes } from "./shape-names.js";
+const chosen = (names) => {
+  try { return chooseSet(names); } catch (error) { return error.message; }
+};
+const meshes = JSON.parse(readFileSync(0, "utf8"));
+console.log(JSON.stringify(meshes.map((names) => [
+  chosen(names),
+  ...["arkit", "oculus", "vrm"].map((set) => Object.fromEntries(findShapes(set, names))),
+])));
+"""
+BLENDER = """
+import json, sys, types
+from unittest.mock import MagicMock
+class Thing: pass
+bpy = MagicMock()
+bpy.types = types.SimpleNamespace(Operator=Thing, Panel=Thing)
+helper = types.SimpleNamespace(ImportHelper=type("Helper", (), {}))
+sys.modules |= {"bpy": bpy, "bpy_extras": types.SimpleNamespace(), "bpy_extras.io_utils": helper}
+import kouxing_face as face
+def chosen(names):
+    bpy.data.shape_keys = [MagicMock(key_blocks=Blocks(names))]
+    problems = {name: face.problem(name) for name in face.SETS}
+    return next((name for name, text in problems.items() if not text), problems["arkit"])
+class Blocks(list):
+    def __init__(self, names):
+        super().__init__([None, *(types.SimpleNamespace(name=name) for name in names)])
+def row(names):
+    return [chosen(names), *(face.find_shapes(name, names) for name in face.SETS)]
+print(json.dumps([row(names) for names in json.load(sys.stdin)]))
+"""
+C_SHARP = """
+using System;
+using System.Linq;
+static class Program
+{
+    static string Quote(string text) => "\\"" + text + "\\"";
+    static void Main()
+    {
+        Console.InputEncoding = Console.OutputEncoding = new System.Text.UTF8Encoding(false);
+        var lines = Console.In.ReadToEnd().Trim().Split('\\n').Select(line =>
+        {
+            var names = line.Split(' ');
+            string chosen;
+            try { chosen = KouxingShapeNames.ChooseSet(names); }
+            catch (InvalidOperationException error) { chosen = error.Message; }
+            var sets = new[] { "arkit", "oculus", "vrm" }.Select(set => "{" + string.Join(",",
+                KouxingShapeNames.FindShapes(set, names)
+                    .Select(pair => Quote(pair.Key) + ":" + Quote(pair.Value))) + "}");
+            return "[" + Quote(chosen) + "," + string.Join(",", sets) + "]";
+        });
+        Console.WriteLine("[" + string.Join(",", lines) + "]");
+    }
+}
+"""
+
+
+def output(command: list[str | Path], text: str, folder: Path) -> list[list[object]]:
+    result = subprocess.run(
+        command, input=text, capture_output=True, encoding="utf-8", cwd=folder, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    shapes: list[list[object]] = json.loads(result.stdout)
+    return shapes
+
+
+def expected() -> list[list[object]]:
+    rows: list[list[object]] = []
+    for names in map(str.split, MESHES):
+        try:
+            chosen: str = choose_set(names)
+        except UserError as error:
+            chosen = str(error)
+        rows.append([chosen, *(find_shapes(set_name, names) for set_name in SETS)])
+    return rows
+
+
+def test_javascript_finds_the_same_shapes() -> None:
+    command: list[str | Path] = ["node", "--input-type=module", "-e", JAVASCRIPT]
+    meshes = json.dumps([mesh.split() for mesh in MESHES])
+    assert output(command, meshes, ROOT / "clients" / "javascript") == expected()
+
+
+def test_blender_finds_the_same_shapes() -> None:
+    meshes = json.dumps([mesh.split() for mesh in MESHES])
+    command: list[str | Path] = [sys.executable, "-c", BLENDER]
+    assert output(command, meshes, ROOT / "examples" / "blender") == expected()
+
+
+def test_unity_finds_the_same_shapes(tmp_path: Path) -> None:
+    (tmp_path / "Program.cs").write_text(C_SHARP, encoding="utf-8")
+    source = ROOT / "examples" / "unity" / "KouxingShapeNames.cs"
+    subprocess.run(["mcs", "-out:names.exe", "Program.cs", source], cwd=tmp_path, check=True)
+    assert output(["mono", "names.exe"], "\n".join(MESHES), tmp_path) == expected()
