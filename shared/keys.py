@@ -23,12 +23,13 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import NamedTuple
-
-from kouxing_client.keys import Key
+from typing import TYPE_CHECKING, NamedTuple
 
 from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
+
+if TYPE_CHECKING:
+    from kouxing_client.keys import Key
 
 CONTROL = "control"
 CLIENT = "client"
@@ -209,6 +210,7 @@ def may_follow(grant: Grant, topic: bytes) -> bool:
 
 def _new_key(control: str = "") -> str:
     import zmq  # noqa: PLC0415 (slow to import)
+    from kouxing_client.keys import Key  # noqa: PLC0415
 
     public, secret = (part.decode() for part in zmq.curve_keypair())
     return key_text(Key(public, secret, control or public))
@@ -238,6 +240,8 @@ def read_key(path: Path) -> Key:
 
     Raises ``UserError`` if it cannot be read, or other users can read it.
     """
+    from kouxing_client.keys import Key  # noqa: PLC0415 (slow to import)
+
     try:
         key = Key(**json.loads(_read(path)))
         if all(_PUBLIC.fullmatch(part) for part in (key.public, key.secret, key.control)):

@@ -44,13 +44,13 @@ def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, erro
 
 
 @pytest.mark.parametrize("is_ahead", [False, True])
-@pytest.mark.parametrize("chunk", [1, 999, 100_001])
+@pytest.mark.parametrize("chunk", [1, 999, 10_001])
 @pytest.mark.parametrize(
     ("pcm_format", "pcm"),
     [
         (PCM16, b"\0\1RIFF"),
         (FLOAT, np.array([1.5, -1.5] * 900, "<f4").tobytes()),
-        (PcmFormat(sample_rate_hz=48000, num_channels=2), bytes(range(250)) * 800),
+        (PcmFormat(sample_rate_hz=48000, num_channels=2), bytes(range(250)) * 80),
     ],
 )
 def test_accepts_pieces_of_any_length(
