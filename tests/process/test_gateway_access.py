@@ -138,7 +138,9 @@ def test_serves_the_modules_of_the_page(local: Site, name: str, content_type: st
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-@pytest.mark.parametrize("path", ["viewer", "microphone", "whip", "learn-mouth", "sound", "senders"])
+@pytest.mark.parametrize(
+    "path", ["viewer", "microphone", "whip", "learn-mouth", "sound", "senders"]
+)
 def test_sessions_and_uploads_require_the_token(public: Site, path: str) -> None:
     for query in ("", "?token=wrong"):
         assert public.ask(path + query, **UPGRADE).status == 403
