@@ -278,7 +278,7 @@ def test_registers_at_an_address_where_another_program_answered_before(
     monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
 ) -> None:
     monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.3)
-    monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
+    monkeypatch.setattr(Service, "_warn_about_control", lambda self: None)
     listener = socket.create_server(("127.0.0.1", 0))
     commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
     worker = Worker(commands)
@@ -299,7 +299,7 @@ def test_keeps_messages_for_a_control_that_hangs(
     monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
 ) -> None:
     monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.0)
-    monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
+    monkeypatch.setattr(Service, "_warn_about_control", lambda self: None)
     connected = worker.control
     for _ in range(3):
         worker._heartbeat_due_s = 0.0

@@ -27,7 +27,7 @@ const meter = new LevelMeter();
 const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {
   heads: (name) => stage.load(name),
-  lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLips(name)),
+  lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLipModel(name)),
   expressiveness: sendExpressiveness,
   express: (strengths) => socket.send({ express: strengths }),
 });
@@ -35,13 +35,13 @@ const caption = new Caption(preferences);
 const sound = new Sound(() => speech.showSound());
 const speech = new SpeechControls(sound, {
   mouthProfile: () => mouthProfiles.current?.profile ?? "",
-  lips: chosenLips,
+  lips: chosenLipModel,
   level: (value) => meter.raise(value),
   error: showError,
   news: (text) => notice.showNews(text, "hint"),
   session(name) {
     if (name !== null) {
-      showLips();
+      showLipModel();
       if (name === gateway.session) sendExpressiveness(); // the viewer was notified first
     }
     socket.follow(name ?? "");
@@ -87,7 +87,7 @@ function handleMessage(message) {
     error: showError,
     lips() {
       gateway.lips = message.lips;
-      showLips();
+      showLipModel();
     },
     status() {
       gateway.missing = message.missing;
@@ -108,7 +108,7 @@ function showSession(message) {
     meter.reset();
   }
   if (isOwnSession()) sendExpressiveness();
-  showLips();
+  showLipModel();
   statusBar.show();
 }
 
@@ -122,12 +122,12 @@ function isOwnSession() {
 }
 
 /** Return the lip model for new sessions, or null for the default. Only "learnt" uses a profile. */
-function chosenLips() {
+function chosenLipModel() {
   return preferences.get("lips") ?? (mouthProfiles.current === null ? null : "learnt");
 }
 
-function showLips() {
-  if (isOwnSession() && gateway.lips !== null) settings.showLips(gateway.lips);
+function showLipModel() {
+  if (isOwnSession() && gateway.lips !== null) settings.showLipModel(gateway.lips);
 }
 
 function sendExpressiveness() {
@@ -196,7 +196,7 @@ window.kouxing = {
 };
 
 element("sample").onclick = () => {
-  const lips = chosenLips();
+  const lips = chosenLipModel();
   socket.send(lips === null ? { play: "sample" } : { play: "sample", lips });
   speech.unblockSound();
 };

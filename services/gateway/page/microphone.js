@@ -45,7 +45,7 @@ export class Microphone {
   }
 
   /** Change the lip model of its session. */
-  chooseLips(name) {
+  chooseLipModel(name) {
     if (this.#uplink) this.#socket.send(JSON.stringify({ lips: name }));
   }
 
@@ -139,7 +139,7 @@ export class Microphone {
     this.#handlers.state("on");
     this.#fileSpeech?.play(() => setTimeout(() => this.stop(), TAIL_MS));
     const lips = this.#handlers.lips();
-    if (lips !== null) this.chooseLips(lips);
+    if (lips !== null) this.chooseLipModel(lips);
   }
 
   /** Reconnect if it has streamed: a service or the gateway is being restarted. */

@@ -36,7 +36,7 @@ export class Settings {
   }
 
   /** Select the lip model that is in use. */
-  showLips(name) {
+  showLipModel(name) {
     element("lips").value = name;
   }
 
