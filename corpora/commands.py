@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from kouxing.services.cli.options import AudioTrack
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
@@ -68,13 +69,14 @@ def track(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Clip to write: .flac, .csv and .json.")
     ],
+    audio_track: AudioTrack = None,
 ) -> None:
     """Track the lips in a video, for kouxing adapt."""
     from kouxing.corpora.lip_tracking import track_video
 
     check_output(*(output.with_suffix(suffix) for suffix in (".flac", ".csv", ".json")))
     with CONSOLE.status(f"tracking {video}"):
-        num_tracked, num_images = track_video(video, output)
+        num_tracked, num_images = track_video(video, output, audio_track)
     print_message(
         f"wrote {output.with_suffix('.json')}; a face was found in {num_tracked} of "
         f"{num_images} images"

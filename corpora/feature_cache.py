@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import soundfile
 from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared import audio_file
+from kouxing.shared.errors import UserError
 
 _FORMAT = "4"  # increase it when the front end's log-mel stage changes
 _FULL_SCALE = 32768.0
@@ -36,12 +37,11 @@ def cache_folder() -> Path:
 
 
 def read_audio(path: Path) -> NDArray[np.float32]:
-    """Read a recording as 16 kHz mono; ValueError if libsndfile cannot read it."""
+    """Read a recording as 16 kHz mono; ValueError if it cannot be read."""
     try:
-        samples, rate_hz = soundfile.read(path, dtype="float32", always_2d=True)
-    except (soundfile.LibsndfileError, OSError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
-    return to_16_khz(samples, rate_hz)
+        return to_16_khz(*audio_file.read_audio(path))
+    except UserError as error:
+        raise ValueError(str(error)) from error
 
 
 def log_mel_of(

@@ -14,60 +14,52 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.face_mesh import FaceMesh
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
+from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import level_track
+from kouxing.shared.audio_file import check_video
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
+from kouxing.shared.media_file import start_of
 
 MAX_DURATION_S = 1200.0
 MAX_SIDE_PX = 960  # larger images are reduced
 
 
 def read_video(
-    path: Path, on_image: Callable[[float, NDArray[np.uint8]], None]
+    path: Path, on_image: Callable[[float, NDArray[np.uint8]], None], track: int | None = None
 ) -> NDArray[np.float32]:
     """Read a video of any format that FFmpeg supports; return the audio, 16 kHz mono, (n,).
 
     ``on_image`` is called with each image: its time in the audio, seconds, and upright RGB,
-    (height, width, 3). Raises UserError if the video cannot be read, has no images or no audio, or
-    is too long.
+    (height, width, 3). ``track`` is the audio track, from 1. Raises UserError if the video cannot
+    be read, has no images or no audio, or is too long.
     """
+    check_video(path)
     try:
-        with av.open(str(path)) as container:
-            if not (container.streams.video and container.streams.audio):
-                raise UserError(
-                    f"{path}: the video must have images and audio; record it with a microphone"
-                )
-            return _decode(path, container, on_image)
+        with path.open("rb") as file, av.open(file, mode="r", metadata_errors="replace") as video:
+            _decode(path, video, on_image)
     except (av.error.FFmpegError, OSError) as error:
         raise UserError(f"cannot read the video {path}: {error.strerror}") from None
+    return read_mono_16k(path, track)
 
 
 def _decode(
     path: Path,
     container: av.container.InputContainer,
     on_image: Callable[[float, NDArray[np.uint8]], None],
-) -> NDArray[np.float32]:
-    video, audio = container.streams.video[0], container.streams.audio[0]
-    start_s = float((audio.start_time or 0) * (audio.time_base or 0))
-    resampler = av.AudioResampler(format="flt", layout="mono", rate=SAMPLE_RATE_HZ)
-    audio_parts = []
-    for frame in container.decode(video, audio):
-        if isinstance(frame, av.AudioFrame):
-            audio_parts += [part.to_ndarray()[0] for part in resampler.resample(frame)]
-            continue
-        if not isinstance(frame, av.VideoFrame) or frame.time is None:
+) -> None:
+    start_s = start_of(container) or 0.0
+    for frame in container.decode(video=0):
+        if frame.time is None or frame.time < start_s:
             continue
         time_s = frame.time - start_s
         if time_s > MAX_DURATION_S:
             raise UserError(
                 f"{path}: the video is longer than {MAX_DURATION_S / 60:g} minutes; shorten it"
             )
-        if time_s >= 0:
-            on_image(time_s, _image_of(frame))
-    audio_parts += [part.to_ndarray()[0] for part in resampler.resample(None)]
-    return np.concatenate(audio_parts) if audio_parts else np.zeros(0, np.float32)
+        on_image(time_s, _image_of(frame))
 
 
 def _image_of(frame: av.VideoFrame) -> NDArray[np.uint8]:
@@ -77,7 +69,7 @@ def _image_of(frame: av.VideoFrame) -> NDArray[np.uint8]:
     return np.rot90(pixels, round(frame.rotation / 90))  # phones store rotated images
 
 
-def track_video(video: Path, clip: Path) -> tuple[int, int]:
+def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tuple[int, int]:
     """Write the clip of a video as ``.flac``, ``.csv`` and ``.json``.
 
     Returns the number of images with a face, and of all images. Raises UserError if the video
@@ -92,7 +84,7 @@ def track_video(video: Path, clip: Path) -> tuple[int, int]:
         times.append(time_s)
         tracked.append(None if landmarks is None else landmarks[list(LANDMARKS)])
 
-    samples = read_video(video, track_image)
+    samples = read_video(video, track_image, audio_track)
     seen = np.array([landmarks is not None for landmarks in tracked])
     if seen.sum() < MIN_FRAMES:
         raise UserError(

@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from kouxing.shared.audio_file import read_duration_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
@@ -181,13 +182,11 @@ def _utterance(
 
 
 def duration_s(path: Path) -> float:
-    """Return the length of a recording; ValueError if libsndfile cannot read the file."""
-    import soundfile  # noqa: PLC0415  (only needed if no manifest states the length)
-
+    """Return the length of a recording; ValueError if the file cannot be read."""
     try:
-        return float(soundfile.info(path).duration)
-    except soundfile.LibsndfileError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+        return read_duration_s(path)
+    except UserError as error:
+        raise ValueError(str(error)) from error
 
 
 def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:

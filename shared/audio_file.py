@@ -207,6 +207,22 @@ def read_audio(path: Path) -> tuple[Samples, int]:
     return np.concatenate(list(source.blocks)), source.sample_rate_hz
 
 
+def read_duration_s(path: Path) -> float:
+    """Return the duration that a file states or, if it states none, that of its samples.
+
+    Raises ``UserError`` as ``open_audio``.
+    """
+    try:
+        with path.open("rb") as file:
+            source = _open_file(file, str(path), path.name, block_s=1.0, track=None)
+            num_samples = 0
+            if source.duration_s is None:
+                num_samples = sum(len(block) for block in source.blocks)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
+    return source.duration_s or num_samples / source.sample_rate_hz
+
+
 def check_video(path: Path) -> None:
     """Raise ``UserError`` if a file is not a video with audio."""
     try:
@@ -217,7 +233,7 @@ def check_video(path: Path) -> None:
     except OSError as error:
         raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
     if not is_video:
-        raise UserError(f"{path}: the video must have pictures and audio")
+        raise UserError(f"{path}: the video must have images and audio; record it with sound")
 
 
 def num_clipped(samples: Samples) -> int:

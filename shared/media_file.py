@@ -169,7 +169,9 @@ class MediaSound:
 
     def _blocks(self, first: Any) -> Iterator[tuple[int, Samples]]:
         """Yield the samples, with silence in gaps."""
-        origin_s, position_s = self._origin_s(first), 0.0
+        start_s = start_of(self._container)
+        origin_s = (first.time or 0.0) if start_s is None else start_s
+        position_s = 0.0
         guard = CancellationGuard(self._name, self.num_channels, self.remarks)
         frame: Any = first
         with self._container:
@@ -195,13 +197,6 @@ class MediaSound:
                 yield rate_hz, samples
                 frame = next(self._frames, None)
             self._check_end(position_s)
-
-    def _origin_s(self, first: Any) -> float:
-        """Return the time in the container's timestamps that is the start of the file."""
-        start = self._container.start_time
-        if _TIMES_COUNT_FROM_ZERO.match(self._container.format.name):
-            return min(0.0, (start or 0) / av.time_base)
-        return float((first.time or 0.0) if start is None else start / av.time_base)
 
     def _mix(self, frame: Any) -> tuple[Samples, Samples]:
         """Return all channels of a frame, and FFmpeg's mix of them if there are more than two."""
@@ -260,6 +255,14 @@ class MediaSound:
         estimated_bytes = bit_rate * (self._stated_s() or 0) / 8
         sizes = (container.size, container.size - (self._first_place or 0))
         return all(abs(estimated_bytes - size) > 0.002 * size for size in sizes)
+
+
+def start_of(container: Any) -> float | None:
+    """Return the timestamp that is the start of a file, seconds; None if unknown."""
+    start_s = None if container.start_time is None else container.start_time / av.time_base
+    if _TIMES_COUNT_FROM_ZERO.match(container.format.name):
+        return min(0.0, start_s or 0.0)
+    return start_s
 
 
 def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:

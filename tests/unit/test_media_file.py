@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from kouxing.corpora.lip_tracking import read_video
 from kouxing.shared.audio_file import AudioSource, check_video, open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.unit.media import write_media, write_tracks
@@ -203,5 +204,15 @@ def test_a_cover_picture_is_not_a_video(tmp_path: Path) -> None:
     source = open_audio(tmp_path / "a.mp3")
     assert len(_read(source)) == RATE_HZ
     assert source.remarks == []
-    with pytest.raises(UserError, match="must have pictures"):
+    with pytest.raises(UserError, match="must have images"):
         check_video(tmp_path / "a.mp3")
+
+
+def test_images_and_sound_of_a_video_share_their_times(tmp_path: Path) -> None:
+    write_media(tmp_path / "a.mkv", "pcm_s16le", TONE, RATE_HZ, start_s=1.0, video_s=3.0)
+    times_s: list[float] = []
+    samples = read_video(tmp_path / "a.mkv", lambda time_s, _image: times_s.append(time_s))
+    assert times_s == pytest.approx(np.arange(75) / 25, abs=0.001)
+    assert np.flatnonzero(np.abs(samples) > 0.1)[[0, -1]] / 16_000 == pytest.approx(
+        [1.0, 2.0], abs=0.01
+    )
