@@ -1,26 +1,44 @@
-"""A headless Chromium with one page, of which pictures can be taken."""
+"""A headless Chromium with one page, of which pictures can be taken, and a server of files."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
+import functools
+import http.server
 import io
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from kouxing.evaluation.system.chromium import Chromium, wait_until
+from kouxing.evaluation.system.chromium import Chromium
+from tests.system import wait_until
 
-SIZE_PX = (640, 480)
+SIZE_PX = (480, 360)
+READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
 
 
 class Browser(Chromium):
-    """A headless Chromium with a page of 640 x 480."""
+    """A headless Chromium with one page."""
 
-    def __init__(self, folder: Path, microphone: Path, camera: Path | None = None) -> None:
-        super().__init__(folder, SIZE_PX, microphone, camera)
+    def __init__(
+        self,
+        folder: Path,
+        microphone: Path,
+        camera: Path | None = None,
+        size_px: tuple[int, int] = SIZE_PX,
+    ) -> None:
+        super().__init__(folder, size_px, microphone, camera)
+
+    def open(self, address: str) -> None:
+        """Load the gateway's page."""
+        self.command("Page.navigate", url=address)
+        self.wait_for(READY)
 
     def steady_image(self) -> NDArray[np.uint8]:
         """Return the canvas once it no longer changes: every fade and redrawing is over."""
@@ -32,7 +50,7 @@ class Browser(Chromium):
             images.append(self.image())
             return np.array_equal(images[-1], images[-2])
 
-        wait_until(is_steady, 60)
+        wait_until(is_steady)
         return images[-1]
 
     def image(self) -> NDArray[np.uint8]:
@@ -40,3 +58,22 @@ class Browser(Chromium):
         data = self.command("Page.captureScreenshot", format="png")["data"]
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             return np.asarray(image.convert("RGB"))
+
+
+@contextlib.contextmanager
+def serve_folder(folder: Path, port: int = 0) -> Iterator[str]:
+    """Serve a folder like ``python -m http.server``; yield the origin."""
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    handler = functools.partial(Handler, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()

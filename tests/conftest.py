@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from kouxing.services.kinds import KINDS
 from tests.system import System
 from tests.videos import write_video
 
@@ -32,9 +33,8 @@ def _own_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    """Control, recognizer, synthesizer and driver on this host."""
-    folder = tmp_path_factory.mktemp("system")
-    with System(("control", "recognizer", "synthesizer", "driver"), folder) as running:
+    """All services on this host."""
+    with System(KINDS, tmp_path_factory.mktemp("system")) as running:
         yield running
 
 

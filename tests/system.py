@@ -1,8 +1,9 @@
-"""A running system for tests: real processes, real sockets, ports of its own."""
+"""Running services for tests: real processes, real sockets, and ports of their own."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import socket
@@ -10,21 +11,25 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Self
+from urllib.parse import urlsplit
 
 from kouxing_client import Client, KouxingError, Status
+from rich.console import Console
 
-from kouxing.services.kinds import KINDS, free_port_environment
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.cli.service_process import ServiceProcess
+from kouxing.services.kinds import KINDS, free_port_environment, kind_of
 from kouxing.shared.config import variable
-from kouxing.shared.keys import control_endpoint
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
 VOWELS_FILE = ROOT / "tests" / "sounds" / "vowels-male.wav"  # a o e i u ü, with pauses between
+CHAIN = ("control", "recognizer", "synthesizer")
+LIMIT_S = 60.0  # for anything that takes no time on an idle machine
 PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
-ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # nor is a session refused
+ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
 MAX_KEPT = 200
 
@@ -48,29 +53,21 @@ def own_addresses(
 
 
 def _keep(host: str, port: int) -> int:
-    # Bound but not listening, so that only those can bind it, too, that allow it (SO_REUSEADDR), as
-    # servers do, and are told the port.
+    # The socket is bound but does not listen. Only a program that sets SO_REUSEADDR and names
+    # this port can bind it, as servers do.
     kept = socket.socket()
     kept.bind((host, port))
     kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     _kept.append(kept)
     if len(_kept) > MAX_KEPT:
         _kept.popleft().close()
-    found: int = kept.getsockname()[1]
-    return found
+    return int(kept.getsockname()[1])
 
 
 def own_environment(folder: Path) -> dict[str, str]:
-    """Return an environment in which all services run on ports of their own, driver headless."""
-    own = {"XDG_RUNTIME_DIR": str(folder)}  # where its user's commands would find it
-    return {
-        **os.environ,
-        **ONE_THREAD,
-        **headless(folder),
-        **ANY_LOAD,
-        **own_addresses(),
-        **own,
-    }
+    """Return an environment in which ``kouxing run`` uses free ports and has no window."""
+    own = {"XDG_RUNTIME_DIR": str(folder)}  # commands find the running system there
+    return {**os.environ, **ONE_THREAD, **headless(folder), **ANY_LOAD, **own_addresses(), **own}
 
 
 def headless(folder: Path) -> dict[str, str]:
@@ -83,13 +80,27 @@ def headless(folder: Path) -> dict[str, str]:
     }
 
 
+def wait_until(
+    condition: Callable[[], object],
+    limit_s: float = LIMIT_S,
+    *,
+    step: Callable[[], object] = lambda: time.sleep(0.01),
+) -> None:
+    """Wait until a condition holds; call ``step`` before each check."""
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > end_s:
+            raise TimeoutError
+        step()
+
+
 def kouxing(
     *arguments: object,
     control: str = "",
     environment: dict[str, str] | None = None,
     stdin: bytes | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command line to its end; no input may bring a traceback."""
+    """Run the command line to its end; no input may cause a traceback."""
     environment = {**os.environ, **ONE_THREAD, "COLUMNS": "200", **(environment or {})}
     if control:
         environment["KOUXING_CONTROL"] = control.partition(" ")[0]
@@ -99,7 +110,7 @@ def kouxing(
         cwd=ROOT,
         capture_output=True,
         input=stdin,
-        timeout=110,
+        timeout=250,
         check=False,
     )
     texts = (result.stdout.decode(), result.stderr.decode())
@@ -107,113 +118,146 @@ def kouxing(
     return subprocess.CompletedProcess(result.args, result.returncode, *texts)
 
 
-class System:
-    """Services as processes, each on the address given for it."""
+def start_python(
+    *arguments: object, control: str = "", **environment: str
+) -> subprocess.Popen[str]:
+    """Start Python with pipes; a service is ``-m kouxing.services.KIND``."""
+    if control:
+        environment["KOUXING_CONTROL"] = control.partition(" ")[0]
+    return subprocess.Popen(
+        [sys.executable, *map(str, arguments)],
+        env={**os.environ, **ONE_THREAD, **environment},
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+class System(LocalSystem):
+    """Services in processes. A service that ends restarts only if ``restarts`` is set."""
 
     def __init__(
         self,
-        services: Iterable[str],
+        services: Collection[str],
         folder: Path,
-        hosts: dict[str, str] | None = None,
-        settings: dict[str, str] | None = None,
+        settings: Mapping[str, str] | None = None,
         *,
-        insecure: bool = False,
+        hosts: Mapping[str, str] | None = None,
+        restarts: bool = False,
     ) -> None:
         self.folder = folder
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._services = list(services)
-        addresses = own_addresses(self._services, hosts)
+        addresses = own_addresses(services, hosts)
+        named = [] if restarts else [name for name in services if name != "control"]
         self.ports = {int(address.rpartition(":")[2]) for address in addresses.values()}
-        self.environment = {
-            **os.environ,
-            **ONE_THREAD,
-            **headless(folder),
-            **PATIENT,
-            **ANY_LOAD,
-            **addresses,
-            "KOUXING_INSECURE": str(insecure),
-            **(settings or {}),
-        }
-        self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=insecure)
-        self._is_insecure = insecure
-
-    def __enter__(self) -> Self:
-        try:
-            for service in self._services:
-                self.start(service)
-            self.wait_ready()
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
+        self.page = f"http://127.0.0.1:{addresses.get('KOUXING_GATEWAY_PORT')}/"
+        self.console = io.StringIO()
+        self.running = {*services}  # services that must not end
+        super().__init__(
+            folder,
+            Console(file=self.console, width=200),
+            services=services,
+            settings={
+                **headless(folder),
+                **PATIENT,
+                **ANY_LOAD,
+                **addresses,
+                **{variable(name, "instance"): name for name in named},
+                **(settings or {}),
+            },
+        )
+        self._restarts = restarts
 
     def __exit__(self, *exc: object) -> None:
-        for process in self.processes.values():
-            process.send_signal(signal.SIGCONT)
-            process.terminate()
-        for service, process in self.processes.items():
-            try:
-                process.wait(60)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                raise AssertionError(f"{service} did not stop: {self.log(service)}") from None
+        for name in self.running:
+            with contextlib.suppress(KeyError, ProcessLookupError):  # it did not start
+                self.process(name).send_signal(signal.SIGCONT)
+        super().__exit__(*exc)
 
-    def start(self, service: str, name: str = "", **settings: str) -> None:
-        """Start a service, under another name if one of its kind runs already."""
-        name = name or service
-        with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", f"kouxing.services.{service}"],
-                env={**self.environment, **settings},
-                cwd=ROOT,
-                stderr=log,
-                stdout=log,
-            )
+    def process(self, name: str) -> ServiceProcess:
+        return self.supervisor.process(name)
 
-    def start_beside(self, service: str, name: str) -> None:
-        """Start one more service of a kind that runs already and wait until control knows it."""
-        addresses = own_addresses([service])
-        self.start(service, name, **addresses, **{variable(service, "instance"): name})
+    def add(self, name: str, **settings: str) -> None:
+        """Start a worker such as ``recognizer-2``, and wait until control has registered it."""
+        kind = kind_of(name)
+        instance = {variable(kind, "instance"): name}
+        self.start(name, **own_addresses([kind]), **instance, **settings)
         self.wait_until(lambda report: name in {state.instance for state in report.services})
 
-    def client(self, timeout_s: float = 10.0) -> Client:
-        """Return a client of the system."""
-        return Client(self.control, timeout_s=timeout_s, insecure=self._is_insecure)
+    def start(self, name: str, **settings: str) -> None:
+        """Start a service, or start it again."""
+        supervisor = self.supervisor
+        supervisor._more = {**supervisor._more, name: settings}
+        supervisor._backoff_s[name] = 0.0
+        supervisor._start(name)
+        self.running.add(name)
 
-    def log(self, service: str) -> str:
-        return (self.folder / f"{service}.log").read_text(encoding="utf-8")
+    def lose(self, name: str, number: signal.Signals = signal.SIGKILL) -> ServiceProcess:
+        """Signal a service that may end."""
+        self.running.remove(name)
+        process = self.process(name)
+        process.send_signal(number)
+        return process
 
-    def wait_ready(self) -> None:
-        self.wait_until(
-            lambda report: {state.service for state in report.services} >= set(self.processes)
-        )
+    def log(self, name: str) -> str:
+        return (self.folder / f"{name}.log").read_text(encoding="utf-8")
 
     def wait_until(self, condition: Callable[[Status], bool], deadline_s: float = 110.0) -> None:
-        """Wait until control reports what is wanted; no service may end meanwhile."""
+        """Wait until control's report meets a condition; no service may end in the meantime."""
         end_s = time.monotonic() + deadline_s
-        with self.client(timeout_s=2.0) as client:
+        with Client(self.control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.assert_all_alive()
-                with contextlib.suppress(KouxingError):  # control may not run yet
+                with contextlib.suppress(KouxingError):  # control is restarting
                     if condition(client.status()):
                         return
                 time.sleep(0.05)
-        raise AssertionError("the services did not become ready")
+        raise AssertionError(f"the condition does not become true: {client}")
 
     def endpoints(self) -> dict[str, str]:
-        """Return where every socket of the services is bound, with its key, by name."""
-        with self.client() as client:
-            services = client.status().services
-        return {name: each for state in services for name, each in state.endpoints.items()}
-
-    def num_gaps(self) -> float:
-        """Return how many gaps there were in the sound of all sessions."""
-        time.sleep(0.6)  # until the next heartbeat
-        with self.client() as client:
-            metrics = {state.service: state.metrics for state in client.status().services}
-        return metrics["recognizer"].get("audio_gaps", 0.0)
+        """Return the endpoint of every socket of the services, with its key, by name."""
+        services = self.status().services
+        return {name: endpoint for state in services for name, endpoint in state.endpoints.items()}
 
     def assert_all_alive(self) -> None:
-        for service, process in self.processes.items():
-            assert process.poll() is None, f"{service} ended: {self.log(service)}"
+        for name in self.running:
+            assert self.process(name).poll() is None, f"{name} ended: {self.log(name)}"
+
+
+class Gateway:
+    """A gateway process with settings by key, without keys if control has none."""
+
+    def __init__(self, control: str, *program: str, **settings: str) -> None:
+        port = free_port()
+        scheme = "https" if "certificate" in settings else "http"
+        self.page = f"{scheme}://127.0.0.1:{port}/"
+        settings = {
+            "port": str(port),
+            "insecure": str(" " not in control),
+            "log_level": "error",
+            **settings,
+        }
+        self._program = program or ("-m", "kouxing.services.gateway")
+        self._control = control
+        self._environment = {variable("gateway", key): value for key, value in settings.items()}
+        self.start()
+
+    def start(self) -> None:
+        self.process = start_python(*self._program, control=self._control, **self._environment)
+        wait_until(lambda: can_connect(port_of(self.page)))
+
+    def stop(self) -> int:
+        self.process.terminate()
+        self.process.communicate(timeout=LIMIT_S)
+        return self.process.returncode
+
+
+def can_connect(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def port_of(page: str) -> int:
+    """Return the port of a page."""
+    return urlsplit(page).port or 0

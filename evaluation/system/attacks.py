@@ -139,13 +139,11 @@ def _damage(
     with connect(system.control) as client:
         services = client.status().services
     endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
-    processes = {kind: system.supervisor.process_number(kind) for kind in KINDS}
+    processes = {kind: system.supervisor.process(kind).pid for kind in KINDS}
     memories = {kind: Memory(process_id) for kind, process_id in processes.items()}
     with _attacker(name, endpoints.get(target, ""), source):
         delays_ms = _delays_ms(system.control, speech, rate_hz)
-    restarted = [
-        kind for kind in KINDS if system.supervisor.process_number(kind) != processes[kind]
-    ]
+    restarted = [kind for kind in KINDS if system.supervisor.process(kind).pid != processes[kind]]
     for kind in restarted:
         del memories[kind]
     growth_mb = {kind: memory.growth_mb for kind, memory in memories.items()}

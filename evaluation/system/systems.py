@@ -90,29 +90,31 @@ class LocalSystem(System):
         settings: Mapping[str, str] | None = None,
         spare: str = "",
     ) -> None:
-        environment = {
+        self.environment = {
             **free_port_environment(services),
             "KOUXING_DRIVER_VIEW": "none",
             "KOUXING_INSECURE": "false",
             "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
             **(settings or {}),
         }
-        self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
+        self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=False)
         self.key = user_key()
-        self._spare_kind = spare
+        self._restarts = not spare
         self._spare_name = f"{spare}-2"
         more = {
             name: {**addresses, variable(spare, "instance"): SPARE}
             for name, addresses in extra_worker_environments(read_settings(), 2).items()
             if name == self._spare_name
         }
-        self.supervisor = Supervisor([], folder, console, environment, services=services, more=more)
+        self.supervisor = Supervisor(
+            [], folder, console, self.environment, services=services, more=more
+        )
 
     def __enter__(self) -> Self:
         try:
             self.supervisor.start()
             self.supervisor.wait_ready(self.control)
-            if not self._spare_kind:
+            if self._restarts:
                 self.supervisor.watch()
         except BaseException:
             self.__exit__()
@@ -125,7 +127,7 @@ class LocalSystem(System):
     def process_of(self, session: str, service: str) -> int:
         """Return the id of the process that serves a session."""
         is_spare = self.instance_of(session, service) == SPARE
-        return self.supervisor.process_number(self._spare_name if is_spare else service)
+        return self.supervisor.process(self._spare_name if is_spare else service).pid
 
 
 class HostsSystem(System):

@@ -137,9 +137,9 @@ class Supervisor:
                 del self._restart_at_s[name]
                 self._start(name)
 
-    def process_number(self, name: str) -> int:
-        """Return the process ID of a running service."""
-        return self._processes[name].pid
+    def process(self, name: str) -> ServiceProcess:
+        """Return the process of a running service."""
+        return self._processes[name]
 
     def stop(self) -> None:
         """Ask every service to stop, and kill those that do not stop in time."""

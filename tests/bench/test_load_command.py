@@ -11,8 +11,6 @@ from typer.testing import CliRunner
 from kouxing.evaluation.commands import bench_app
 from tests.system import VOWELS_FILE
 
-pytestmark = pytest.mark.bench
-
 
 def test_prints_writes_and_plots_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -1,23 +1,25 @@
-"""Streams audio through a running system and collects what comes out."""
+"""Stream audio into a session and collect its results."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from kouxing_client import Client, FapFrame, Phone, Result, Results, Session, Sound, Speech
+from kouxing_client import Client, FapFrame, Phone, Result, Session, Sound, Speech
 from kouxing_client.messages import Floats
 from numpy.typing import NDArray
 
 from kouxing.shared.audio_file import read_audio
+from tests.system import wait_until
+
+RATE_HZ = 16000
 
 
 class LipPositions(Result, frozen=True, kw_only=True):
-    """The mouth from a lip model that works on the audio itself."""
+    """Lip positions, which are no part of the public client."""
 
     kind: ClassVar[str] = "lip-positions"
 
@@ -27,35 +29,65 @@ class LipPositions(Result, frozen=True, kw_only=True):
     lip_to_teeth: float
 
 
-KINDS: tuple[type[Result], ...] = (FapFrame, Phone, LipPositions, Speech, Sound)
+class Stream:
+    """A session and everything that it has published."""
 
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.frames: list[FapFrame] = []
+        self.phones: list[Phone] = []
+        self.lips: list[LipPositions] = []
+        self.speech: list[Speech] = []
+        self.sounds: list[Sound] = []
+        self._lists: dict[type[Result], list[Any]] = {
+            FapFrame: self.frames,
+            Phone: self.phones,
+            LipPositions: self.lips,
+            Speech: self.speech,
+            Sound: self.sounds,
+        }
+        self._output = session.results(*self._lists, keep_all=True)
 
-@dataclass
-class Collected:
-    frames: list[FapFrame] = field(default_factory=list)
-    phones: list[Phone] = field(default_factory=list)
-    lips: list[LipPositions] = field(default_factory=list)
-    speech: list[Speech] = field(default_factory=list)
-    sounds: list[Sound] = field(default_factory=list)
+    def send(
+        self,
+        samples: NDArray[Any],
+        *,
+        chunk: int = 320,
+        rate_hz: int = RATE_HZ,
+        paced: bool = False,
+    ) -> None:
+        """Send samples, and collect results at the same time."""
+        begin_s = time.monotonic()
+        for begin in range(0, len(samples), chunk):
+            self.session.push(samples[begin : begin + chunk])
+            due_s = begin_s + (begin + chunk) / rate_hz if paced else 0.0
+            self.collect()
+            while (left_s := due_s - time.monotonic()) > 0:
+                self.collect(left_s)
 
-    def add(self, results: Iterable[Result]) -> None:
-        for result in results:
-            match result:
-                case FapFrame():
-                    self.frames.append(result)
-                case Phone():
-                    self.phones.append(result)
-                case LipPositions():
-                    self.lips.append(result)
-                case Speech():
-                    self.speech.append(result)
-                case Sound():
-                    self.sounds.append(result)
+    def collect(self, wait_s: float = 0.0) -> None:
+        for result in self._output.available(wait_s):
+            self._lists[type(result)].append(result)
+
+    def collect_until(self, condition: Callable[[], object]) -> None:
+        wait_until(condition, step=lambda: self.collect(0.1))
+
+    def finish(self) -> None:
+        """End the audio and collect the rest; the recognizer must not complain."""
+        self.session.finish()
+        self.collect_until(lambda: self._output.has_ended)
+        assert self.session.take_errors() == []
+        self.collect()
+
+    @property
+    def times(self) -> list[int]:
+        """Media times of all frames."""
+        return [frame.media_time for frame in self.frames]
 
     @property
     def faps(self) -> NDArray[np.float32]:
         """FAPs of all frames, shape (frames, 68)."""
-        return np.array([np.frombuffer(f.values, "<f4") for f in self.frames])
+        return np.array([np.frombuffer(frame.values, "<f4") for frame in self.frames])
 
     @property
     def symbols(self) -> list[str]:
@@ -66,78 +98,24 @@ class Collected:
 
 def samples_of_file(path: Path) -> NDArray[np.float32]:
     samples, rate_hz = read_audio(path)
-    assert rate_hz == 16000
+    assert rate_hz == RATE_HZ
     return samples[:, 0]
 
 
 def stream(
     control: str,
-    samples: NDArray[np.float32],
+    samples: NDArray[Any],
     *,
     chunk: int = 320,
-    session: str = "",
-    sample_rate_hz: int = 16000,
+    sample_rate_hz: int = RATE_HZ,
     paced: bool = False,
-    record: bool = False,
-) -> Collected:
-    """Stream float samples, paced or as fast as possible, and wait for the last frame."""
-    with Client(control) as client:
-        opened = client.open_session(
-            session=session,
-            encoding="f32le",
-            sample_rate_hz=sample_rate_hz,
-            num_channels=1,
-            paced=paced,
-            record=record,
-        )
-        try:
-            return stream_into(opened, samples, chunk=chunk, rate_hz=sample_rate_hz, paced=paced)
-        finally:
-            opened.close()
-
-
-def stream_into(
-    session: Session,
-    samples: NDArray[np.float32],
-    *,
-    chunk: int,
-    rate_hz: int = 16000,
-    paced: bool = False,
-) -> Collected:
-    """Stream samples into an open session and wait for the last frame."""
-    output = session.results(*KINDS, keep_all=True)
-    collected = Collected()
-    send(session, samples, output, collected, chunk=chunk, rate_hz=rate_hz, paced=paced)
-    finish(session, output, collected)
-    return collected
-
-
-def send(
-    session: Session,
-    samples: NDArray[np.float32],
-    output: Results[Any],
-    collected: Collected,
-    *,
-    chunk: int = 320,
-    rate_hz: int = 16000,
-    paced: bool = False,
-) -> None:
-    """Send samples, and collect results at the same time."""
-    begin_s = time.monotonic()
-    for begin in range(0, len(samples), chunk):
-        session.push(samples[begin : begin + chunk])
-        due_s = begin_s + (begin + chunk) / rate_hz if paced else 0.0
-        collected.add(output.available())
-        while (left_s := due_s - time.monotonic()) > 0:
-            collected.add(output.available(left_s))
-
-
-def finish(session: Session, output: Results[Any], collected: Collected) -> None:
-    """End the audio and collect the rest; the recognizer must not complain."""
-    session.finish()
-    end_s = time.monotonic() + 60
-    while not output.has_ended:
-        assert time.monotonic() < end_s, "the last frame did not come"
-        collected.add(output.available(0.2))
-        assert session.take_errors() == []
-    collected.add(output.available())
+    **options: Any,
+) -> Stream:
+    """Stream samples, paced or as fast as possible, and wait for the last frame."""
+    options = {"encoding": "f32le", **options}
+    options |= {"sample_rate_hz": sample_rate_hz, "paced": paced}
+    with Client(control) as client, client.open_session(**options) as session:
+        sent = Stream(session)
+        sent.send(samples, chunk=chunk, rate_hz=sample_rate_hz, paced=paced)
+        sent.finish()
+    return sent

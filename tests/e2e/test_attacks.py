@@ -11,17 +11,14 @@ from kouxing.evaluation.system.attacks import Memory
 from tests.raw_bytes import pour
 from tests.system import System
 
-pytestmark = pytest.mark.e2e
-
 SERVICES = {"commands": "control", "audio": "recognizer", "faps": "synthesizer"}  # by target
 MAX_GROWTH_MB = {False: 8.0, True: 64.0}  # without a key, with a key
 MAX_KEPT_MB = 8.0
-SECONDS = 1.0
+SECONDS = 0.5
 RUNS = [
-    (name, target)
+    (name, [target for target in attack.targets if target in SERVICES][-1])
     for name, attack in ATTACKS.items()
-    for target in attack.targets
-    if name != BUSY_PROCESSOR and target in SERVICES
+    if name != BUSY_PROCESSOR and SERVICES.keys() & {*attack.targets}
 ]
 
 
@@ -30,7 +27,7 @@ def test_limits_the_damage_of_an_attack(
     system: System, witness: Session, name: str, target: str
 ) -> None:
     attack = ATTACKS[name]
-    memory = Memory(system.processes[SERVICES[target]].pid)
+    memory = Memory(system.process(SERVICES[target]).pid)
     source = f"127.0.1.{2 + RUNS.index((name, target))}"
     attack.run(system.endpoints()[target], source, SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB[attack.has_key]

@@ -5,15 +5,12 @@ from __future__ import annotations
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zmq
 from kouxing_client import Client, KouxingError
-from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.kinds import KINDS
@@ -30,9 +27,8 @@ from kouxing.shared.wire.control import AllowedKey
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Joined, StatusRequest
-from tests.system import ROOT
+from tests.system import LIMIT_S, start_python
 
-pytestmark = pytest.mark.e2e
 LOCAL = "tcp://127.0.0.1:*"
 
 
@@ -64,8 +60,20 @@ def server() -> Iterator[Server]:
     made.bus.close()
 
 
-def key_of(name: str, *roles: str) -> Key:
-    return load_key(name, roles)
+def hidden(message: Message, shift: int) -> bytes:
+    """Return a browser's request whose body ZMTP 1 can read as a message.
+
+    ZMTP 1 reads the request line, the headers and the filler as frames. Every 1 in the filler is
+    either the length or the flags of an empty frame. ``shift`` (0 or 1) covers both cases.
+    """
+    frames = b""
+    parts = encode(message)
+    for part in parts:
+        length = 1 + len(part)
+        head = bytes([length]) if length < 255 else b"\xff" + length.to_bytes(8, "big")
+        frames += head + bytes([part is not parts[-1]]) + part
+    head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://evil.example\r\n\r\n"
+    return head + b"\x01" * (600 + shift) + b"\x01\x00" + frames
 
 
 def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
@@ -77,15 +85,15 @@ def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
 
 def test_a_message_has_the_key_of_its_sender(server: Server) -> None:
     router, endpoint = server.router("control.commands")
-    key = key_of("laptop", "client")
+    key = load_key("laptop", ("client",))
     with Bus(key) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
-        assert router.wait(5.0)
+        assert router.wait(LIMIT_S)
         (received,) = router.receive()
         assert received.sender.key == key.public
         router.send(StatusRequest(request="2"), to=received.sender)
-        assert dealer.wait(5.0)
+        assert dealer.wait(LIMIT_S)
 
 
 @pytest.mark.parametrize(
@@ -102,10 +110,10 @@ def test_a_socket_accepts_only_keys_of_its_role(
     server: Server, required: str, roles: tuple[str, ...], gets_in: bool
 ) -> None:
     router, endpoint = server.router("some.setting", role=required)
-    with Bus(key_of("grant", *roles)) as bus:
+    with Bus(load_key("grant", roles)) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
-        assert router.wait(5.0 if gets_in else 0.5) == gets_in
+        assert router.wait(LIMIT_S if gets_in else 0.5) == gets_in
         assert (bus.probe(endpoint) is Reach.ACCEPTED) == gets_in
 
 
@@ -115,7 +123,7 @@ def test_rejects_a_key_of_another_system(
     router, endpoint = server.router("control.commands")
     with monkeypatch.context() as there:
         there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-        key, control = key_of("grant", "client"), key_of("control")
+        key, control = load_key("grant", ("client",)), load_key("control", ())
     with Bus(key) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
         assert not router.wait(0.5)
@@ -129,16 +137,16 @@ def test_one_key_cannot_use_all_connections(
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
     monkeypatch.setattr(kernel_sockets, "network_of", lambda host: host)  # each is one of its own
     router, endpoint = server.router("recognizer.audio")
-    key = key_of("grant", "client")
+    key = load_key("grant", ("client",))
     with zmq.Context() as context:
         grants = [context.socket(zmq.DEALER) for _ in range(7)]
         ends = [grant.get_monitor_socket(zmq.EVENT_DISCONNECTED) for grant in grants]
         for number, grant in enumerate(grants, start=2):
             connect(grant, endpoint.replace("tcp://", f"tcp://127.0.0.{number}:0;"), key)
             grant.send_multipart(encode(StatusRequest(request="1")))
-            assert router.wait(5.0)
+            assert router.wait(LIMIT_S)
             list(router.receive())
-        assert ends[-1].poll(20_000)
+        assert ends[-1].poll(60_000)
         assert not any(end.poll(0) for end in ends[:-1])
         for grant, end in zip(grants, ends, strict=True):
             grant.disable_monitor()
@@ -151,16 +159,14 @@ def test_an_unused_port_does_not_refuse(server: Server) -> None:
         assert bus.probe(with_key("tcp://127.0.0.1:1", server.key.public)) is not Reach.REFUSED
 
 
-def test_a_hung_control_does_not_refuse() -> None:
+def test_a_hung_control_does_not_answer() -> None:
     program = (
-        "import sys, time; from tests.e2e.test_bus_keys import Server;"
+        "import time; from tests.e2e.test_bus_keys import Server;"
         "_, endpoint = Server().router('control.commands');"
         "print(endpoint, flush=True); time.sleep(600)"
     )
-    key = key_of("laptop", "client")
-    with subprocess.Popen(
-        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    ) as control:
+    key = load_key("laptop", ("client",))
+    with start_python("-c", program) as control:
         assert control.stdout is not None
         endpoint = control.stdout.readline().strip()
         control.send_signal(signal.SIGSTOP)
@@ -180,14 +186,15 @@ def test_a_hung_control_does_not_refuse() -> None:
     [
         b"\x01\x00" + b"\x03\x00hi",  # ZMTP 1
         b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00",  # ZMTP 2
-        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n\x01\x00" + b"\x03\x00hi",
+        hidden(StatusRequest(request="1"), 0),
+        hidden(StatusRequest(request="1"), 1),
     ],
 )
 def test_disconnects_old_zeromq_and_browsers(greeting: bytes, with_keys: bool) -> None:
     with Bus(load_key("control", ()) if with_keys else None) as bus:
         router = bus.bind_router(LOCAL, "control.commands")
         _, port = split_endpoint(router.endpoint, "")
-        with socket.create_connection(("127.0.0.1", int(port)), timeout=5.0) as browser:
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=LIMIT_S) as browser:
             browser.sendall(greeting + bytes(64))
             try:
                 while browser.recv(1000):
@@ -199,12 +206,12 @@ def test_disconnects_old_zeromq_and_browsers(greeting: bytes, with_keys: bool) -
 
 def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> None:
     publisher, endpoint = server.publisher()
-    with Bus(key_of("screen", "subscriber:mine")) as bus:
+    with Bus(load_key("screen", ("subscriber:mine",))) as bus:
         subscriber = bus.connect_subscriber(endpoint)
         for session in (None, "theirs"):
             subscriber.subscribe(FapFrame, session)
         subscriber.subscribe_session([FapFrame], "mine")
-        assert publisher.wait(5.0)
+        assert publisher.wait(LIMIT_S)
         while publisher.wait(0.2):
             list(publisher.receive())
         for session in ("theirs", "mine"):
@@ -227,7 +234,8 @@ def test_allows_and_revokes_a_key_while_running(
     with Bus(key) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
-        assert len(messages_of(router, 2.0)) == 1
+        assert router.wait(LIMIT_S)
+        assert len(list(router.receive())) == 1
         revoke_key("laptop")
         assert server.bus.zap is not None
         server.bus.zap.refresh()
@@ -248,8 +256,8 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    key = key_of("laptop", "client")
-    key_of("recognizer", "service:recognizer")
+    key = load_key("laptop", ("client",))
+    load_key("recognizer", ("service:recognizer",))
     shutil.copytree(key_folder(), tmp_path / "other" / "kouxing")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
     for name in ("control.key", "allowed"):  # as on another machine, whose list is empty yet
@@ -270,7 +278,7 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
 
 def test_ignores_a_broken_list(server: Server) -> None:
     router, endpoint = server.router("control.commands")
-    with Bus(key_of("laptop", "client")) as bus:
+    with Bus(load_key("laptop", ("client",))) as bus:
         assert bus.probe(endpoint) is not Reach.REFUSED
         (key_folder() / "allowed").write_text("nonsense\n", encoding="ascii")
         assert bus.probe(endpoint) is not Reach.REFUSED

@@ -1,59 +1,55 @@
-"""A wav through real processes over real sockets: phones, FAP frames, video."""
+"""A WAV file through real processes over real sockets: phones, FAP frames, video."""
 
 from __future__ import annotations
 
 import itertools
+import signal
 import time
-from collections.abc import Callable
 
 import av
 import numpy as np
 import pytest
-from kouxing_client import Client, FapFrame, Results
+from kouxing_client import Client, FapFrame
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.phones.inventory import load_inventory
-from tests.e2e.following import Collected, samples_of_file, stream, stream_into
-from tests.system import DEMO, VOWELS_FILE, System
+from tests.e2e.following import Stream, samples_of_file, stream
+from tests.system import DEMO, VOWELS_FILE, System, wait_until
 
-pytestmark = pytest.mark.e2e
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
-OPEN_JAW, RAISE_B_MIDLIP = 2, 4  # indices of FAP 3 and 5
+OPEN_JAW = 2  # index of FAP 3
+SENTENCE = samples_of_file(DEMO / "hello-female.wav")
+
+
+def opening(frame: FapFrame) -> float:
+    """Return how far the mouth is from rest, in FAP units."""
+    return float(np.abs(np.frombuffer(frame.values, "<f4")[2:13]).max())
 
 
 @pytest.fixture(scope="module")
-def collected(system: System) -> Collected:
-    return stream(system.control, samples_of_file(DEMO / "hello-female.wav"))
+def sent(system: System) -> Stream:
+    return stream(system.control, SENTENCE)
 
 
-def test_every_frame_arrives_in_order_and_on_time(collected: Collected) -> None:
-    times = np.array([frame.media_time for frame in collected.frames])
-    assert [f.sequence for f in collected.frames] == list(range(1, len(collected.frames) + 1))
-    np.testing.assert_array_equal(np.diff(times), 320)
-    assert times[0] == 0
-    assert times[-1] >= len(samples_of_file(DEMO / "hello-female.wav"))
+def test_every_frame_arrives_in_order_until_the_end(sent: Stream) -> None:
+    assert [frame.sequence for frame in sent.frames] == [*range(1, len(sent.frames) + 1)]
+    assert sent.times == [*range(0, 320 * len(sent.frames), 320)]
+    assert sent.times[-1] >= len(SENTENCE)
 
 
-def test_phones_are_those_of_the_language_and_final_in_the_end(collected: Collected) -> None:
-    assert len(collected.symbols) > 20
-    assert set(collected.symbols) <= set(load_inventory().phones)
-    finals = {phone.index: phone.final for phone in collected.phones}
-    assert all(finals.values())
+def test_phones_become_final_and_speech_starts_and_ends(sent: Stream) -> None:
+    assert len(sent.symbols) > 20
+    assert {*sent.symbols} <= {*load_inventory().phones}
+    assert all({phone.index: phone.final for phone in sent.phones}.values())
+    states = [speech.active for speech in sent.speech]
+    assert (states[0], states[-1]) == (True, False)
+    assert all(before != after for before, after in itertools.pairwise(states))
 
 
-def test_speech_begins_and_ends(collected: Collected) -> None:
-    states = [speech.active for speech in collected.speech]
-    assert states[0]
-    assert not states[-1]
-    assert all(a != b for a, b in itertools.pairwise(states))
-
-
-def test_the_mouth_moves_while_there_is_speech_and_rests_before_and_after(
-    collected: Collected,
-) -> None:
-    faps = collected.faps
-    begin = collected.speech[0].media_time // 320
-    mouth = list(range(2, 13)) + list(range(50, 60))
+def test_the_mouth_moves_during_speech_and_rests_before_and_after(sent: Stream) -> None:
+    faps = sent.faps
+    begin = sent.speech[0].media_time // 320
+    mouth = [*range(2, 13), *range(50, 60)]
     assert np.abs(faps[: max(1, begin - 5), mouth]).max() < 1
     assert np.abs(faps[-1, mouth]).max() < 1
     assert faps[:, 18].max() > 500, "the eyes blink"
@@ -61,95 +57,79 @@ def test_the_mouth_moves_while_there_is_speech_and_rests_before_and_after(
     assert np.isfinite(faps).all()
 
 
-def test_the_sound_is_the_audio_that_was_sent(collected: Collected) -> None:
-    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in collected.sounds])
-    sent = samples_of_file(DEMO / "hello-female.wav")
-    np.testing.assert_allclose(sound / 32768, sent, atol=1e-4)
+def test_the_sound_is_the_audio_that_was_sent(sent: Stream) -> None:
+    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in sent.sounds])
+    np.testing.assert_allclose(sound / 32768, SENTENCE, atol=1e-4)
 
 
-def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
-    samples = samples_of_file(VOWELS_FILE)
+def test_int16_stereo_gives_the_phones_of_float_mono(system: System, sent: Stream) -> None:
+    pcm = np.rint(32768 * SENTENCE).clip(-32768, 32767).astype(np.int16)
+    stereo = np.stack([pcm, pcm], axis=1)
+    both = stream(system.control, stereo, encoding="s16le", num_channels=2)
+    assert both.symbols == sent.symbols
+
+
+def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System, sent: Stream) -> None:
+    samples = SENTENCE[:32000]
     fast = stream(system.control, samples)
     end_s = time.monotonic() + 90
-    while True:
-        live = stream(system.control, samples, paced=True)
-        if [frame.sequence for frame in live.frames] == [frame.sequence for frame in fast.frames]:
-            break  # a machine that stalls for 0.2 s gets frames of rest before, or in between
+    while (live := stream(system.control, samples, paced=True)).times != fast.times:
+        # A stall of the machine for 0.2 s adds frames of rest.
         assert time.monotonic() < end_s, "this machine stalls too often for real time"
     np.testing.assert_array_equal(live.faps, fast.faps)
 
 
-def test_int16_stereo_gives_the_phones_of_float_mono(system: System, collected: Collected) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")
-    stereo = np.stack([samples, samples], axis=1) * 32768
-    stereo = np.rint(stereo).clip(-32768, 32767).astype(np.int16)
-    with Client(system.control) as client:
-        session = client.open_session(encoding="s16le", num_channels=2, paced=False)
-        result = stream_into(session, stereo, chunk=320)
-        session.close()
-    assert result.symbols == collected.symbols
+def num_repeated(sent: Stream) -> int:
+    """Return how many frames repeat the media time of the one before, since the first sound."""
+    times = [time for time in sent.times if time > 0]
+    return sum(after == before for before, after in itertools.pairwise(times))
 
 
-def test_a_stalled_stream_leads_to_rest_and_then_goes_on(system: System) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")
-    with Client(system.control) as client:
-        session = client.open_session(encoding="f32le")
-        output = session.results(FapFrame, keep_all=True)
-        session.push(samples[:8000])
-        session.push(samples[8000:16000])
-        spoken = _frames_until(output, lambda frame: _opening(frame) > 50)
-        still = _frames_until(output, lambda frame: _opening(frame) < 1)
-        assert still[-1].media_time == still[-5].media_time, (
-            "media time stands still with the sound"
-        )
-        assert spoken[0].media_time < still[-1].media_time <= 16000
-        session.push(samples[16000:24000])
-        _frames_until(output, lambda frame: frame.media_time > 20000)
-        session.close()
+def test_the_face_waits_for_a_slow_recognizer_and_rests_for_a_silent_client(
+    system: System,
+) -> None:
+    with Client(system.control) as client, client.open_session(encoding="f32le") as session:
+        sent = Stream(session)
+        sent.send(SENTENCE[:16000], paced=True)
+        recognizer = system.process("recognizer")
+        recognizer.send_signal(signal.SIGSTOP)
+        try:
+            sent.send(SENTENCE[16000:40000], paced=True)
+        finally:
+            recognizer.send_signal(signal.SIGCONT)
+        sent.send(SENTENCE[40000:56000], paced=True)
+        sent.collect_until(lambda: sent.times[-1] >= 52000 or num_repeated(sent))
+        assert num_repeated(sent) == 0, "the client was not silent"
+        sent.collect_until(lambda: num_repeated(sent) >= 10)
+        assert opening(sent.frames[-1]) < 1
+        sent.send(SENTENCE[56000:64000])
+        sent.collect_until(lambda: sent.times[-1] > 60000)
+        assert session.take_errors() == []
 
 
 def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")
-    with Client(system.control) as client:
-        session = client.open_session(encoding="f32le", paced=False)
-        output = session.results(FapFrame, keep_all=True)
-        for begin in range(0, 24000, 8000):
-            session.push(samples[begin : begin + 8000])
-        before = _frames_until(output, lambda frame: frame.media_time >= 24000 - DELAY)
-        assert _opening(before[-1]) > 50, "the mouth is open in mid-sentence"
+    with (
+        Client(system.control) as client,
+        client.open_session(encoding="f32le", paced=False) as session,
+    ):
+        sent = Stream(session)
+        sent.send(SENTENCE[:24000], chunk=8000)
+        sent.collect_until(lambda: sent.times[-1:] >= [24000 - DELAY])
+        assert opening(sent.frames[-1]) > 50, "the mouth is open in mid-sentence"
+        num_before = len(sent.frames)
         session.flush()
-        client.open_session().close()  # every service has what control told it before
+        client.open_session().close()  # every service has processed control's messages
         session.push(np.zeros(8000, np.float32))
-        after = _frames_until(output, lambda frame: frame.media_time >= 32000 - 3200)
-        session.close()
-    assert max(_opening(frame) for frame in after[8:]) < 1, "150 ms are 7.5 frames"
-
-
-def _opening(frame: FapFrame) -> float:
-    """Return how far the mouth is from rest, in FAP units."""
-    return float(np.abs(np.frombuffer(frame.values, "<f4")[2:13]).max())
-
-
-def _frames_until(output: Results[FapFrame], last: Callable[[FapFrame], bool]) -> list[FapFrame]:
-    """Return the frames up to the first that ``last`` holds for."""
-    frames: list[FapFrame] = []
-    end_s = time.monotonic() + 60
-    while time.monotonic() < end_s:
-        for frame in output.available(0.1):
-            frames.append(frame)
-            if last(frame):
-                return frames
-    raise AssertionError("the frame did not come")
+        sent.collect_until(lambda: sent.times[-1] >= 32000 - 3200)
+    after = sent.frames[num_before:]
+    assert max(map(opening, after[8:])) < 1, "150 ms are 7.5 frames"
 
 
 def test_the_driver_records_picture_and_sound_in_sync(system: System) -> None:
     samples = samples_of_file(VOWELS_FILE)
-    stream(system.control, samples, session="film", record=True)
+    stream(system.control, samples, name="film", record=True)
     path = system.folder / "film.mp4"
-    end_s = time.monotonic() + 60
-    while not path.exists():
-        assert time.monotonic() < end_s, system.log("driver")
-        time.sleep(0.1)
+    wait_until(path.exists)
     with av.open(str(path)) as film:
         images = sum(1 for _ in film.decode(video=0))
     with av.open(str(path)) as film:

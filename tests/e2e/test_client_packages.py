@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import http.server
 import json
 import os
 import re
@@ -13,26 +11,22 @@ import subprocess
 import sys
 import threading
 import venv
-import wave
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import soundfile
 from kouxing_client import Client
-from numpy.typing import NDArray
 
 from kouxing.shared.face.shapes import SHAPE_SETS
-from tests import sync
-from tests.browser import Browser
+from tests.browser import Browser, serve_folder
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file
 from tests.glb_writer import Mesh, write_glb
-from tests.scripted_system import Gateway
-from tests.system import DEMO, ROOT, System, free_port
+from tests.system import DEMO, ROOT, Gateway, System
 
-pytestmark = pytest.mark.e2e
 SPEECH = DEMO / "hello-female.wav"
 NODE = Path(sys.executable).with_name("node")
 JAVASCRIPT_CLIENT = ROOT / "clients" / "javascript"
@@ -47,7 +41,7 @@ def run(*command: object, cwd: Path | None = None, **environment: str) -> list[s
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=110,
+        timeout=250,
         check=False,
     )
     assert result.returncode == 0, result.stdout + result.stderr
@@ -55,18 +49,12 @@ def run(*command: object, cwd: Path | None = None, **environment: str) -> list[s
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    source = shutil.copytree(PYTHON_CLIENT, folder / "source")  # building writes beside it
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a Python that has only the built package and its dependencies."""
+    folder = tmp_path_factory.mktemp("python")
+    source = shutil.copytree(PYTHON_CLIENT, folder / "source")  # the build writes next to it
     pip("wheel", "--no-build-isolation", "--no-deps", "--wheel-dir", folder, source)
     (wheel,) = folder.glob("kouxing_client-*.whl")
-    return wheel
-
-
-@pytest.fixture(scope="module")
-def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a Python that has the built package and what it needs, and nothing else."""
-    folder = tmp_path_factory.mktemp("python")
     venv.create(folder / "venv")
     python = folder / "venv" / "bin" / "python"
     pip("--python", python, "install", wheel)
@@ -74,31 +62,15 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path: Path) -> None:
-    plain, awaited = code_blocks(PYTHON_CLIENT / "README.md", "python")
-    (tmp_path / "plain.py").write_text(plain, encoding="utf-8")
-    (tmp_path / "awaited.py").write_text(awaited, encoding="utf-8")
     control = system.control.partition(" ")[0]
-    jaw = run(python, "-I", tmp_path / "plain.py", SPEECH, KOUXING_CONTROL=control)
-    assert len(jaw) > 100
+    outputs = []
+    for number, example in enumerate(code_blocks(PYTHON_CLIENT / "README.md", "python")):
+        program = tmp_path / f"example{number}.py"
+        program.write_text(example, encoding="utf-8")
+        outputs.append(run(python, "-I", program, SPEECH, KOUXING_CONTROL=control))
+    jaw, phones = outputs
     assert max(float(line.split()[-1]) for line in jaw) > 200
-    phones = run(python, "-I", tmp_path / "awaited.py", SPEECH, KOUXING_CONTROL=control)
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
-
-
-def test_the_built_python_package_passes_its_tests(wheel: Path, tmp_path: Path) -> None:
-    pip("install", "--no-deps", "--target", tmp_path, wheel)
-    # in place of the source, which pytest's configuration names
-    options = ("--override-ini", f"pythonpath={tmp_path}", "-p", "no:cacheprovider", "--quiet")
-    find = "import kouxing_client, sys; sys.exit(kouxing_client.__path__[0] != sys.argv[1])"
-    tests = ("tests/process/test_client.py", "tests/unit/test_client_core.py")
-    for arguments in (
-        ["-c", find, tmp_path / "kouxing_client"],
-        ["-m", "pytest", *options, *tests],
-    ):
-        run(sys.executable, *arguments, cwd=ROOT, PYTHONPATH=str(tmp_path))
-
-
-def test_the_python_package_brings_its_types_and_needs_two_packages(python: Path) -> None:
     site = python.parent.parent / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
     assert (site / "kouxing_client" / "py.typed").is_file()
     installed = {path.name.partition("-")[0] for path in site.glob("*.dist-info")}
@@ -138,24 +110,13 @@ def npm(folder: Path, *arguments: object) -> None:
 @pytest.fixture(scope="module")
 def site(project: Path) -> Iterator[str]:
     """Serve the project to a browser; yields the origin."""
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    handler = functools.partial(Quiet, directory=str(project))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
+    with serve_folder(project) as origin:
+        yield origin
 
 
 @pytest.fixture(scope="module")
 def gateway(system: System, site: str) -> Iterator[Gateway]:
-    gateway = Gateway(system.control, free_port(), allowed_origins=site)
-    system.wait_until(lambda report: "gateway" in {state.service for state in report.services})
+    gateway = Gateway(system.control, allowed_origins=site)
     yield gateway
     gateway.stop()
 
@@ -165,10 +126,8 @@ def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -
     run(NODE, "--test", project / "client.test.mjs", GATEWAY=gateway.page, SPEECH=str(SPEECH))
     (example,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "js")
     (project / "example.mjs").write_text(example, encoding="utf-8")
-    wav = project / "two-seconds.wav"  # it is spoken in real time
-    with wave.open(str(SPEECH)) as whole, wave.open(str(wav), "wb") as part:
-        part.setparams(whole.getparams())
-        part.writeframes(whole.readframes(2 * whole.getframerate()))
+    wav = project / "one-second.wav"  # the gateway drops what a busy viewer does not read in time
+    soundfile.write(wav, samples_of_file(SPEECH)[:16000], 16000)
     lines = run(NODE, project / "example.mjs", wav, GATEWAY=gateway.page)
     assert max(float(line.split()[-1]) for line in lines if "jaw" in line) > 200
     assert [line.split()[-1] for line in lines if "phone" in line][:4] == ["n", "i", "h", "ao"]
@@ -256,7 +215,7 @@ def write_recording(path: Path, shapes: str, name: str) -> None:
 def faces(
     project: Path, site: str, gateway: Gateway, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Browser]:
-    """A browser with a page as the README has it, of many faces beside each other."""
+    """A browser with the page of the README, with many faces next to each other."""
     write_faces(project)
     (page,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "html")
     live = f'gateway="{gateway.page}" session="seen"'
@@ -266,12 +225,11 @@ def faces(
         "vrm": 'src="vrm.vrm" recording',
         "old": 'src="vrm-0.vrm" recording',
         "own": f'src="own.glb" onclick="this.turnSoundOn()" {live}',
-        "live": f'src="arkit.glb" {live}',
         "none": 'src="none.glb"',
     }
     elements = "".join(
         f"<kouxing-face id={name} onerror='this.failure = event.message'"
-        f" style='width: 80px' {values}></kouxing-face>"
+        f" style='width: 40px' {values}></kouxing-face>"
         for name, values in attributes.items()
     )
     page = re.sub(r"<kouxing-face.*</kouxing-face>", elements, page)
@@ -280,8 +238,7 @@ def faces(
         f"<body style='margin: 0; display: flex'>{page}",
         encoding="utf-8",
     )
-    browser = Browser(tmp_path_factory.mktemp("browser"), SPEECH)
-    sync.install(browser)
+    browser = Browser(tmp_path_factory.mktemp("browser"), SPEECH, size_px=(320, 120))
     browser.command("Page.navigate", url=f"{site}/index.html")
     names = [name for name in attributes if name != "none"]
     browser.wait_for(f"{names}.every((name) => window[name]?.set)")
@@ -289,45 +246,26 @@ def faces(
     browser.close()
 
 
-def test_the_web_component_knows_what_moves_a_model(faces: Browser) -> None:
+def test_the_web_component_detects_the_shapes_of_a_model(faces: Browser) -> None:
     sets = faces.evaluate("[arkit, oculus, vrm, old, own].map((face) => face.set)")
     assert sets == ["arkit", "oculus", "vrm", "vrm", "faps"]
     faces.wait_for("none.failure?.includes('cannot speak')")
 
 
-@pytest.mark.parametrize(
-    ("face", "shapes"),
-    [
-        ("arkit", ["jawOpen"]),
-        ("oculus", ["PP", "aa", "E", "ih", "oh", "ou"]),
-        ("vrm", ["aa"]),
-        ("old", ["aa"]),
-    ],
-)
 def test_the_web_component_plays_recordings_on_models_of_all_kinds(
-    faces: Browser, project: Path, face: str, shapes: list[str]
+    faces: Browser, project: Path
 ) -> None:
-    closed = play(faces, project, face, "")
-    for shape in shapes:
-        assert (play(faces, project, face, shape) != closed).any(), shape
+    closed = faces.steady_image()
+    for face, shape in (("arkit", "jawOpen"), ("oculus", "ou"), ("vrm", "aa"), ("old", "aa")):
+        name = f"{face}.jsonl"
+        write_recording(project / name, faces.evaluate(f"{face}.set"), shape)
+        faces.evaluate(f"{face}.setAttribute('recording', '{name}')")
+        faces.evaluate(f"Promise.all([{face}.play(), {face}.play()])")  # the second ends the first
         assert faces.evaluate(f"{face}.shown.{shape}") == 1
-
-
-def play(faces: Browser, project: Path, face: str, shape: str) -> NDArray[np.uint8]:
-    """Return how a face looks after it has taken on a shape, or after nothing."""
-    name = f"{face}-{shape}.jsonl"
-    write_recording(project / name, faces.evaluate(f"{face}.set"), shape)
-    faces.evaluate(f"{face}.setAttribute('recording', '{name}')")
-    faces.evaluate(f"{face}.play()")
-    left, width = faces.evaluate(f"[{face}.offsetLeft, {face}.offsetWidth]")
-    return faces.steady_image()[:width, left : left + width]
-
-
-def test_a_recording_that_is_played_again_ends_the_first(faces: Browser, project: Path) -> None:
-    write_recording(project / "again.jsonl", "arkit", "jawOpen")
-    faces.evaluate("arkit.setAttribute('recording', 'again.jsonl')")
-    faces.evaluate("Promise.all([arkit.play(), arkit.play()])")
-    assert faces.evaluate("arkit.shown.jawOpen") == 1
+        left, width = faces.evaluate(f"[{face}.offsetLeft, {face}.offsetWidth]")
+        region = slice(width), slice(left, left + width)
+        while not (faces.image()[region] != closed[region]).any():
+            pass
 
 
 @contextlib.contextmanager
@@ -354,39 +292,24 @@ def speech(system: System) -> Iterator[None]:
             session.close()
 
 
-def test_the_web_component_shows_a_session_and_keeps_its_sound_in_step(
-    faces: Browser, system: System
-) -> None:
+def test_the_web_component_shows_and_plays_a_session(faces: Browser, system: System) -> None:
     faces.evaluate(
         "import('/node_modules/kouxing-client/page/playout.js').then(({ Playout }) => {"
         " const { adjust } = Playout.prototype;"
         " Playout.prototype.adjust = function (nowMs) {"
-        "   if (this.isAudible) window.heard = { ...this, count: (window.heard?.count ?? 0) + 1 };"
+        "   window.isHeard ||= this.isAudible && this.imageDelayMs > 0;"
         "   adjust.call(this, nowMs); }; })"
     )
     faces.evaluate(
-        "window.most = window.widest = 0; window.told = []; setInterval(() => {"
-        " most = Math.max(most, own.shown?.[2] ?? 0);"
-        " widest = Math.max(widest, live.shown?.jawOpen ?? 0); }, 10);"
-        "live.addEventListener('session', ({ detail }) => told.push(detail.session))"
+        "window.sessions = [];"
+        "own.addEventListener('session', ({ detail }) => sessions.push(detail.session))"
     )
-    faces.click("own")  # sound begins with a gesture
+    faces.click("own")  # sound starts with a gesture
     with speech(system):
-        faces.wait_for("most > 200 && widest > 0.1")
-        faces.wait_for("probe.clicks.size > 0")  # loud samples leave the page
-        faces.wait_for("heard.imageDelayMs > 0")  # the delay of images
-        faces.evaluate(
-            "window.tick = requestAnimationFrame; window.ticks = [];"
-            "window.requestAnimationFrame = (act) => ticks.push(act)"
-        )
-        faces.wait_for("ticks.length >= 7")  # each face waits to be drawn,
-        faces.evaluate("heard.count = 0")
-        faces.wait_for("heard.count > 5")  # and its sound goes on in step
-        faces.evaluate("window.requestAnimationFrame = tick; ticks.forEach(tick)")
-        faces.evaluate("told.length = 0; live.setAttribute('token', 'another')")
-        faces.wait_for("told.includes('seen')")  # it has connected anew
-        faces.evaluate("live.setAttribute('src', 'own.glb')")
-        faces.wait_for("live.set === 'faps' && live.shown?.length === 68")
-        faces.wait_for("live.shown[2] > 100")
+        faces.wait_for("own.shown?.[2] > 100 && window.isHeard")
+        faces.evaluate("sessions.length = 0; own.setAttribute('token', 'another')")
+        faces.wait_for("sessions.includes('seen')")  # it has reconnected
+        faces.evaluate("own.setAttribute('src', 'arkit.glb')")
+        faces.wait_for("own.set === 'arkit' && own.shown?.jawOpen > 0.1")
     driver = "GL Driver Message"  # the processor draws
     assert [text for text in faces.complaints if driver not in text] == []

@@ -12,7 +12,6 @@ from ray.cluster_utils import Cluster
 from tests.e2e.following import samples_of_file, stream
 from tests.system import VOWELS_FILE, System, kouxing
 
-pytestmark = pytest.mark.e2e
 NODE = {"object_store_memory": 80 << 20, "include_dashboard": False}
 
 
@@ -30,7 +29,7 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
 
 @pytest.fixture
 def control(tmp_path: Path) -> Iterator[System]:
-    with System(["control"], tmp_path, settings={"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as running:
+    with System(["control"], tmp_path, {"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as running:
         yield running
 
 

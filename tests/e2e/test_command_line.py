@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -13,31 +14,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from kouxing_client import Client, FapFrame, Refused, Results
+from kouxing_client import Client, FapFrame, Refused
 
+from kouxing.services.cli.main import main
+from kouxing.services.kinds import KINDS
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.face.shapes import ARKIT
-from tests.e2e.following import samples_of_file, stream_into
-from tests.system import ROOT, VOWELS_FILE, System, free_port, kouxing
+from tests.e2e.following import Stream, samples_of_file
+from tests.receivers import read_osc
+from tests.system import (
+    CHAIN,
+    LIMIT_S,
+    ROOT,
+    VOWELS_FILE,
+    System,
+    free_port,
+    kouxing,
+    start_python,
+)
 
-pytestmark = pytest.mark.e2e
 SENTENCE = VOWELS_FILE
 
 
-@pytest.mark.parametrize("command", ["phones", "speak"])
-def test_reports_a_bad_file_in_one_line(system: System, tmp_path: Path, command: str) -> None:
-    path = tmp_path / "bad.wav"
-    path.write_text("this is no sound", encoding="utf-8")
-    result = kouxing(command, path, control=system.control)
-    assert result.returncode == 2
-    assert len(result.stderr.splitlines()) == 1
-    assert "bad.wav" in result.stderr
-    system.assert_all_alive()
-
-
-def test_reports_a_missing_file_and_a_missing_system(tmp_path: Path) -> None:
-    assert "no such file" in kouxing("phones", tmp_path / "nowhere.wav").stderr
+def test_reports_a_missing_system() -> None:
     result = kouxing("status", control=f"tcp://127.0.0.1:{free_port()}")
     assert result.returncode == 2
     assert "kouxing run" in result.stderr
@@ -54,44 +54,23 @@ def test_speaks_a_truncated_file_of_another_format(system: System, tmp_path: Pat
     assert "no speech" not in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("scale", "word"), [(0.0, "it is silent"), (30.0, "clipped")], ids=["silent", "clipped"]
-)
+@pytest.mark.parametrize(("scale", "word"), [(0.0, "it is silent"), (30.0, "clipped")])
 def test_warns_of_silence_and_clipping(
     system: System, tmp_path: Path, scale: float, word: str
 ) -> None:
     path = tmp_path / "sound.wav"
-    samples = np.clip(samples_of_file(SENTENCE) * scale, -1, 1)
-    soundfile.write(path, samples, 16000)
+    soundfile.write(path, np.clip(samples_of_file(SENTENCE)[:16000] * scale, -1, 1), 16000)
     result = kouxing("speak", path, "--fast", control=system.control)
     assert result.returncode == 0, result.stderr
     assert word in result.stderr
 
 
-def test_a_driver_that_was_lost_for_a_while_still_writes_its_video(tmp_path: Path) -> None:
-    services = ("control", "recognizer", "synthesizer", "driver")
-    with System(services, tmp_path, settings={"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as running:
-        driver = running.processes["driver"]
-        command = [sys.executable, "-m", "kouxing", "speak", str(SENTENCE), "--record", "--fast"]
-        speaker = subprocess.Popen(
-            command, env=running.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True
-        )
-        running.wait_until(lambda report: len(report.sessions) > 0)
-        driver.send_signal(signal.SIGSTOP)
-        running.wait_until(
-            lambda report: "driver" not in {state.service for state in report.services}
-        )
-        driver.send_signal(signal.SIGCONT)
-        _, log = speaker.communicate(timeout=100)
-    assert speaker.returncode == 0, log
-    assert "wrote" in log
-
-
-def test_speaks_raw_audio_from_standard_input(system: System) -> None:
+def test_speaks_raw_audio_from_standard_input_and_writes_the_video(system: System) -> None:
     pcm = (samples_of_file(SENTENCE) * 32767).astype("<i2").tobytes()
-    result = kouxing("speak", "-", "--fast", control=system.control, stdin=pcm)
+    result = kouxing("speak", "-", "--fast", "--record", control=system.control, stdin=pcm)
     assert result.returncode == 0, result.stderr
     assert "phones in 2.3 s" in result.stderr
+    assert "wrote" in result.stderr
 
 
 def test_phones_are_written_in_the_format_of_the_suffix(tmp_path: Path) -> None:
@@ -99,83 +78,112 @@ def test_phones_are_written_in_the_format_of_the_suffix(tmp_path: Path) -> None:
     assert kouxing("phones", SENTENCE, "-o", table).returncode == 0
     with table.open(encoding="utf-8") as file:
         assert {"phone", "onset_s", "duration_s"} <= set(next(csv.DictReader(file)))
-    assert "onset_s" in kouxing("phones", SENTENCE).stdout
 
 
 def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[str]:
     """Start ``kouxing listen``, and return after its first message."""
-    listener = subprocess.Popen(
-        [sys.executable, "-m", "kouxing", "listen", *map(str, arguments)],
-        env={**os.environ, "KOUXING_CONTROL": control.partition(" ")[0]},
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    listener = start_python("-m", "kouxing", "listen", *arguments, control=control)
     assert listener.stderr is not None
     assert says in listener.stderr.readline()
     return listener
 
 
+def output_of(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """Return the output of a program that must succeed."""
+    output, log = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0, log
+    return output, log
+
+
 def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_path: Path) -> None:
     recorded, table = tmp_path / "face.fap", tmp_path / "face.csv"
-    samples = samples_of_file(SENTENCE)
     waits = "waiting for session heard to open, as with kouxing speak my.wav --session heard"
     recorder = listening(system.control, "heard", "--output", recorded, says=waits)
     shaper = listening(system.control, "heard", "--as", "arkit", "-o", table, says=waits)
     printer = listening(system.control, "heard", "--show", "syllables", says=waits)
-    with Client(system.control) as client:
-        session = client.open_session(name="heard", encoding="f32le", paced=False)
+    with (
+        Client(system.control) as client,
+        client.open_session("heard", encoding="f32le", paced=False) as session,
+    ):
         for listener in (recorder, shaper, printer):
             assert listener.stderr is not None
             assert listener.stderr.readline() == "following session heard\n"
-        sent = stream_into(session, samples, chunk=320)
-        session.close()
-    _, log = recorder.communicate(timeout=100)
-    assert recorder.returncode == 0, log
+        sent = Stream(session)
+        sent.send(samples_of_file(SENTENCE))
+        sent.finish()
+    output_of(recorder)
     animation = read_fap(recorded)
     assert animation.frame_rate_hz == 50
     np.testing.assert_allclose(animation.faps, sent.faps, atol=0.5)
-    _, log = shaper.communicate(timeout=100)
-    assert shaper.returncode == 0, log
+    output_of(shaper)
     weights = np.genfromtxt(table, delimiter=",", names=True)
     assert weights.dtype.names == ("time_s", *ARKIT.names)
     jaw = [ARKIT.weights(faps)[ARKIT.names.index("jawOpen")] for faps in sent.faps]
     np.testing.assert_allclose(weights["jawOpen"], jaw, atol=1e-3)
-    printed, log = printer.communicate(timeout=100)
-    assert printer.returncode == 0, log
-    spoken = [line.split()[-1] for line in printed.splitlines()]
+    spoken = [line.split()[-1] for line in output_of(printer)[0].splitlines()]
     assert "sil" not in spoken
-    assert set(spoken) & {"a", "e", "yi", "wu", "yu"}, printed
+    assert {*spoken} & {"a", "e", "yi", "wu", "yu"}
 
 
 def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> None:
-    services = ("control", "recognizer", "synthesizer")
-    with System(services, tmp_path) as running, Client(running.control) as client:
+    with System(CHAIN, tmp_path) as system, Client(system.control) as client:
         phones = ("--show", "phones")
-        first = listening(running.control, *phones, says="waiting for a session to open")
-        older = client.open_session(name="older", encoding="f32le")
+        first = listening(system.control, *phones, says="waiting for a session to open")
+        older = client.open_session("older", encoding="f32le")
         assert first.stderr is not None
         assert first.stderr.readline() == "following session older\n"
-        newer = client.open_session(name="newer", encoding="f32le")
-        second = listening(running.control, *phones, says="following session newer")
+        newer = client.open_session("newer", encoding="f32le")
+        second = listening(system.control, *phones, says="following session newer")
         for session, listener in ((newer, second), (older, first)):
             session.close()
-            _, log = listener.communicate(timeout=100)
-            assert log == f"session {session.name} ended: 0 phones\n"
-            assert listener.returncode == 0
+            assert output_of(listener)[1] == f"session {session.name} ended: 0 phones\n"
+
+
+def test_send_sends_every_session_of_a_name(system: System) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind(("127.0.0.1", 0))
+        program.settimeout(LIMIT_S)
+
+        def jaw_opening() -> float:
+            while "/kouxing/jawOpen" not in (messages := dict(read_osc([program.recv(2000)]))):
+                pass
+            return float(messages["/kouxing/jawOpen"][0])
+
+        url = f"osc://127.0.0.1:{program.getsockname()[1]}"
+        sender = start_python(
+            "-m", "kouxing", "send", url, "--session", "sent", control=system.control
+        )
+        assert sender.stderr is not None
+        assert f"sending ARKit shapes and head to {url}" in sender.stderr.readline()
+        assert jaw_opening() == 0.0
+        for _ in range(2):
+            with (
+                Client(system.control) as client,
+                client.open_session("sent", encoding="f32le", paced=False) as session,
+            ):
+                assert sender.stderr.readline() == "following session sent\n"
+                session.push(samples_of_file(SENTENCE))
+                session.finish()
+                while jaw_opening() < 0.1:
+                    pass
+            while jaw_opening() > 0.01:  # until the face is at rest
+                pass
+        sender.send_signal(signal.SIGINT)
+        output_of(sender)
 
 
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
+        (["phones", "nowhere.wav"], "no such file"),
+        (["speak", __file__], "test_command_line.py"),
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
         (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "this format holds faps"),
         (["listen", "heard", "--show", "phones", "--as", "vrm"], "cannot be combined"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
-        (["speak", SENTENCE, "--session", "two words"], "letters, digits"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
+        (["send", "http://127.0.0.1"], "write vmc://HOST"),
         (["express", "heard", "glee=1"], "joy, sadness, anger"),
         (["express", "heard", "joy=2"], "between 0 and 1"),
         (["express", "heard", "joy"], "joy=0.4"),
@@ -183,35 +191,42 @@ def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> Non
         (["express", "nobody", "joy=1"], "session 'nobody' does not exist"),
     ],
 )
-def test_rejects_wrong_arguments(system: System, arguments: list[str], word: str) -> None:
-    result = kouxing(*arguments, control=system.control)
-    assert result.returncode == 2
-    assert word in result.stderr
-
-
-def wait_for_lip_corner(faces: Results[FapFrame], low: float, high: float) -> None:
-    """Wait until the lip corner is raised by ``low`` to ``high`` FAP units."""
-    corner = FAP_NUMBER["raise_l_cornerlip"] - 1
-    while (frame := faces.get(60.0)) is not None:
-        if low < frame.values[corner] < high:
-            return
-    raise TimeoutError
+def test_rejects_wrong_arguments(
+    system: System,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    word: str,
+) -> None:
+    monkeypatch.setenv("KOUXING_CONTROL", system.control.partition(" ")[0])
+    monkeypatch.setattr(sys, "argv", ["kouxing", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert word in message
+    assert len(message.splitlines()) == 1 or message.startswith("Usage")
 
 
 def test_express_changes_the_face(system: System) -> None:
-    with Client(system.control) as client:
-        session = client.open_session(name="smiling")
+    corner = FAP_NUMBER["raise_l_cornerlip"] - 1
+    with Client(system.control) as client, client.open_session("smiling") as session:
         faces = session.results(FapFrame, keep_all=True)
+
+        def wait_for_lip_corner(low: float, high: float) -> None:
+            """Wait until the lip corner is raised by ``low`` to ``high`` FAP units."""
+            while not low < faces.get(LIMIT_S).values[corner] < high:  # type: ignore[union-attr]
+                pass
+
         asked = kouxing("express", "smiling", "joy=1", "--hold", 600, control=system.control)
         assert asked.returncode == 0, asked.stderr
-        wait_for_lip_corner(faces, 300.0, 400.0)  # the frames of a face at rest go on without sound
+        wait_for_lip_corner(300.0, 400.0)  # a face at rest has frames without sound
         session.set_face(expressions={"smile": 0.25, "squint": 1.0}, hold_s=600.0)
-        wait_for_lip_corner(faces, 150.0, 200.0)
+        wait_for_lip_corner(150.0, 200.0)
         session.set_face(expressions={})
-        wait_for_lip_corner(faces, -50.0, 50.0)
+        wait_for_lip_corner(-50.0, 50.0)
         with pytest.raises(Refused, match="<= 1"):
             session.set_face(expressions={"joy": 1.5})
-        session.close()
 
 
 def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -> None:
@@ -221,16 +236,11 @@ def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -
     )
     assert result.returncode == 0, result.stderr
     instances = [line.split()[0] for line in result.stdout.splitlines() if " ready " in line]
-    assert {name.partition("-")[0] for name in instances} >= {"recognizer", "synthesizer"}
+    assert {*instances} >= {"recognizer", "synthesizer"}
     assert "…" not in result.stdout
     assert max(map(len, result.stdout.splitlines())) <= 80
     services = json.loads(figures.read_text(encoding="utf-8"))["services"]
-    assert {service["service"] for service in services} == {
-        "control",
-        "recognizer",
-        "synthesizer",
-        "driver",
-    }
+    assert {service["service"] for service in services} == {*KINDS}
 
 
 def test_a_command_writes_each_line_at_once() -> None:

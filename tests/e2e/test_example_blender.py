@@ -16,7 +16,6 @@ from tests.system import ROOT, free_port
 FOLDER = ROOT / "examples" / "blender"
 BLENDER = FOLDER / ".venv"  # `make blender` puts Blender there, as a Python module
 
-pytestmark = pytest.mark.e2e
 
 SCRIPT = """
 import math, os, socket, struct, sys

@@ -13,16 +13,14 @@ import pytest
 import soundfile
 from kouxing_client import Client
 
-from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream_into
-from tests.scripted_system import Gateway
-from tests.system import ROOT, VOWELS_FILE, System, free_port
+from tests.e2e.following import Stream, samples_of_file
+from tests.system import CHAIN, ROOT, VOWELS_FILE, System, free_port
 
 FOLDER = ROOT / "examples" / "subscribe"
 STREAM_CLIENTS = ROOT / "examples" / "stream"
 STREAM = ROOT / "examples" / "unity" / "KouxingStream.cs"
 NODE = str(Path(sys.executable).with_name("node"))
-
-pytestmark = pytest.mark.e2e
+SAMPLES = samples_of_file(VOWELS_FILE)
 
 
 @pytest.fixture
@@ -40,22 +38,28 @@ def programs(tmp_path: Path) -> list[list[str]]:
     ]
 
 
-@pytest.mark.parametrize("wav", ["mono 16", "stereo 24", "float 48k"])
-def test_the_clients_stream_wav_files(system: System, tmp_path: Path, wav: str) -> None:
-    samples, _ = soundfile.read(VOWELS_FILE, dtype="float32")
-    samples, rate_hz, form = {
-        "mono 16": (samples, 16000, "PCM_16"),
-        "stereo 24": (np.stack([samples, samples], axis=1), 16000, "PCM_24"),
-        "float 48k": (np.repeat(samples, 3), 48000, "FLOAT"),
-    }[wav]
-    soundfile.write(tmp_path / "said.wav", samples, rate_hz, form, format="WAVEX")
+@pytest.fixture
+def clients(tmp_path: Path, programs: list[list[str]]) -> list[list[str]]:
+    """The commands of the programs that stream a file."""
     shutil.copy(STREAM_CLIENTS / "client.mjs", tmp_path)
-    (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
-    for program in (
+    return [
         [sys.executable, str(STREAM_CLIENTS / "client.py")],
         [NODE, str(tmp_path / "client.mjs")],
-    ):
-        arguments = [*program, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
+    ]
+
+
+@pytest.mark.parametrize("wav", ["mono 16", "stereo 24", "float 48k"])
+def test_the_clients_stream_wav_files(
+    system: System, tmp_path: Path, clients: list[list[str]], wav: str
+) -> None:
+    samples, rate_hz, form = {
+        "mono 16": (SAMPLES, 16000, "PCM_16"),
+        "stereo 24": (np.stack([SAMPLES, SAMPLES], axis=1), 16000, "PCM_24"),
+        "float 48k": (np.repeat(SAMPLES, 3), 48000, "FLOAT"),
+    }[wav]
+    soundfile.write(tmp_path / "said.wav", samples, rate_hz, form, format="WAVEX")
+    for client in clients:
+        arguments = [*client, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
         output = subprocess.run(arguments, check=True, stdout=subprocess.PIPE, text=True).stdout
         jaw = [float(line.split()[-1]) for line in output.splitlines()]
         assert len(jaw) == pytest.approx(50 * len(samples) / rate_hz, abs=50)
@@ -63,13 +67,8 @@ def test_the_clients_stream_wav_files(system: System, tmp_path: Path, wav: str) 
 
 
 def test_without_a_server_each_program_prints_one_line(
-    programs: list[list[str]], tmp_path: Path
+    programs: list[list[str]], clients: list[list[str]]
 ) -> None:
-    shutil.copy(STREAM_CLIENTS / "client.mjs", tmp_path)
-    clients = [
-        [sys.executable, str(STREAM_CLIENTS / "client.py")],
-        [NODE, f"{tmp_path}/client.mjs"],
-    ]
     address = f"tcp://127.0.0.1:{free_port()}"
     assistant = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
     running = [
@@ -86,38 +85,13 @@ def test_without_a_server_each_program_prints_one_line(
         assert process.returncode == 1
 
 
-def test_follow_a_session_to_its_end(system: System, programs: list[list[str]]) -> None:
-    name = "followed-by-examples"
-    address = system.control.partition(" ")[0]
-    with ExitStack() as stack, Client(system.control) as client:
-        running = [
-            stack.enter_context(
-                subprocess.Popen([*program, name, address], stdout=subprocess.PIPE, text=True)
-            )
-            for program in programs
-        ]
-        session = client.open_session(name=name, encoding="f32le", paced=False)
-        for process in running:
-            assert process.stdout is not None
-            assert process.stdout.readline() == f"following {name}\n"
-        stream_into(session, samples_of_file(VOWELS_FILE), chunk=1600)
-        outputs = [process.communicate(timeout=60)[0].splitlines() for process in running]
-        session.close()
-    assert [process.returncode for process in running] == [0, 0, 0]
-    assert outputs[0] == outputs[1] == outputs[2]
-    times_s, jaw = zip(*(map(float, line.split()) for line in outputs[0]), strict=True)
-    assert len(jaw) > 100
-    assert sorted(times_s) == list(times_s)
-    assert 0.2 < max(jaw) <= 1, "/a/ must open the jaw"
-    assert min(jaw) == 0
-
-
-def test_follow_a_session_that_moves(tmp_path: Path, programs: list[list[str]]) -> None:
-    samples = samples_of_file(VOWELS_FILE)[:48000]
-    services = ("control", "recognizer", "synthesizer")
-    with ExitStack() as stack, System(services, tmp_path) as system:
-        client = stack.enter_context(Client(system.control))
-        session = client.open_session(encoding="f32le")
+def test_follow_a_session_that_moves_to_its_end(tmp_path: Path, programs: list[list[str]]) -> None:
+    with (
+        System(CHAIN, tmp_path) as system,
+        Client(system.control) as client,
+        client.open_session(encoding="f32le") as session,
+        ExitStack() as stack,
+    ):
         address = system.control.partition(" ")[0]
         running = [
             stack.enter_context(
@@ -130,57 +104,41 @@ def test_follow_a_session_that_moves(tmp_path: Path, programs: list[list[str]]) 
         for process in running:
             assert process.stdout is not None
             assert process.stdout.readline() == f"following {session.name}\n"
-        output = session.results(*KINDS, keep_all=True)
-        collected = Collected()
-        send(session, samples[:16000], output, collected, paced=True)
-        system.start_beside("synthesizer", "other")
-        lost = system.processes.pop("synthesizer")
-        lost.kill()
-        lost.wait()
-        send(session, samples[16000:], output, collected, paced=True)
-        finish(session, output, collected)
+        sent = Stream(session)
+        sent.send(SAMPLES[:16000], paced=True)
+        system.add("synthesizer-2")
+        system.lose("synthesizer").wait()
+        sent.send(SAMPLES[16000:], paced=True)
+        sent.finish()
         assert session.info["epoch"] > 1
         outputs = [process.communicate(timeout=60)[0].splitlines() for process in running]
-        session.close()
     assert [process.returncode for process in running] == [0, 0, 0]
     for lines in outputs:
-        times = [round(16000 * float(line.split()[0])) for line in lines]
+        times_s, jaw = zip(*(map(float, line.split()) for line in lines), strict=True)
+        times = [round(16000 * time_s) for time_s in times_s]
         assert times == sorted(times)
-        assert {frame.media_time for frame in collected.frames} <= {*times}
+        assert {*sent.times} <= {*times}
+        assert 0.2 < max(jaw) <= 1, "/a/ must open the jaw"
+        assert min(jaw) == 0
 
 
 def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path: Path) -> None:
     program = tmp_path / "follow.exe"
     subprocess.run(["mcs", f"-out:{program}", FOLDER / "Follow.cs", STREAM], check=True)
-    gateway = Gateway(system.control, free_port())
-    address = gateway.page.replace("http", "ws").rstrip("/")
-    name = "followed-by-c-sharp"
-    try:
-        with (
-            Client(system.control) as client,
-            subprocess.Popen(
-                ["mono", program, name, address], stdout=subprocess.PIPE, text=True
-            ) as running,
-        ):
-            try:
-                jaw = open_jaw(client, name, running)
-            finally:
-                running.terminate()
-    finally:
-        assert gateway.stop() == 0
-    assert 0.2 < jaw <= 1
-
-
-def open_jaw(client: Client, name: str, follower: subprocess.Popen[str]) -> float:
-    """Speak until the program prints that the jaw is open; return the opening."""
-    assert follower.stdout is not None
-    assert follower.stdout.readline() == "0.00\n", "a face at rest"
-    session = client.open_session(name=name, encoding="f32le", paced=False)
-    samples = samples_of_file(VOWELS_FILE)
-    jaw = 0.0
-    while jaw <= 0.2:
-        session.push(samples[:1600])
-        samples = np.roll(samples, -1600)
-        jaw = float(follower.stdout.readline())
-    session.close()
-    return jaw
+    address = system.page.replace("http", "ws").rstrip("/")
+    name, jaw, samples = "followed-by-c-sharp", 0.0, SAMPLES
+    with (
+        Client(system.control) as client,
+        subprocess.Popen(
+            ["mono", program, name, address], stdout=subprocess.PIPE, text=True
+        ) as follower,
+    ):
+        assert follower.stdout is not None
+        assert follower.stdout.readline() == "0.00\n", "a face at rest"
+        with client.open_session(name, encoding="f32le", paced=False) as session:
+            while jaw <= 0.2:
+                session.push(samples[:1600])
+                samples = np.roll(samples, -1600)
+                jaw = float(follower.stdout.readline())
+        follower.terminate()
+    assert jaw <= 1

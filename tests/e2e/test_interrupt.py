@@ -11,11 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
 from tests.system import ONE_THREAD, ROOT, VOWELS_FILE
 
-pytestmark = pytest.mark.e2e
 # A shell's background processes ignore Ctrl-C, and so do their children.
 COMMAND = """
 import signal

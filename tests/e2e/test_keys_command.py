@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +11,8 @@ import pytest
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import key_folder, read_grants
 from tests.e2e.following import stream
-from tests.system import ONE_THREAD, ROOT, System, kouxing, own_addresses
+from tests.system import System, kouxing, own_addresses, start_python, wait_until
 
-pytestmark = pytest.mark.e2e
 WORKERS = ("recognizer", "synthesizer")
 
 
@@ -48,12 +42,11 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
-    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1", **own_addresses(WORKERS)}
-    with System(["control"], tmp_path, settings=settings) as system:
+    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
+    with System(["control"], tmp_path, settings) as system:
         for kind in WORKERS:
             own = machine(tmp_path, f"{kind}-host", f"service:{kind}", kind)
-            system.start(kind, XDG_STATE_HOME=str(own))
-        system.wait_ready()
+            system.add(kind, XDG_STATE_HOME=str(own))
         laptop = machine(tmp_path, "laptop", "client", "client")
         monkeypatch.setenv("XDG_STATE_HOME", str(laptop))
         assert stream(system.control, np.zeros(3200, np.float32)).frames
@@ -72,9 +65,9 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         system.wait_until(
             lambda report: "recognizer" not in {each.service for each in report.services}
         )
-        while "kouxing keys add NAME --role service:recognizer" not in system.log("recognizer"):
-            system.assert_all_alive()
-            time.sleep(0.1)
+        advice = "kouxing keys add NAME --role service:recognizer"
+        wait_until(lambda: advice in system.log("recognizer"))
+        system.assert_all_alive()
 
 
 def test_a_service_waits_for_control_and_says_why(
@@ -83,38 +76,26 @@ def test_a_service_waits_for_control_and_says_why(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert kouxing("keys", "init").returncode == 0
     addresses = own_addresses(["control", "synthesizer"])
-    with started("synthesizer", tmp_path, addresses) as synthesizer:
-        log = read_until("nothing listens there; start the service", synthesizer)
+    started = [start_python("-m", "kouxing.services.synthesizer", **addresses)]
+    try:
+        log = read_until("nothing listens there; start the service", started[0])
         assert "waiting for control at tcp://127.0.0.1" in log
         assert '"ready' not in log
         checked = kouxing("doctor", environment=addresses)
         assert checked.returncode == 1
         assert "FAIL control at tcp://127.0.0.1" in checked.stdout
-        with started("control", tmp_path, addresses):
-            read_until('"message": "ready ', synthesizer)
-
-
-@contextmanager
-def started(
-    service: str, folder: Path, settings: dict[str, str]
-) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", f"kouxing.services.{service}"],
-        env={**os.environ, **ONE_THREAD, **settings},
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-    )
-    try:
-        yield process
+        started.append(start_python("-m", "kouxing.services.control", **addresses))
+        read_until('"message": "ready ', started[0])
     finally:
-        process.terminate()
-        process.communicate()
+        for process in started:
+            process.terminate()
+            process.communicate()
 
 
-def read_until(text: str, process: subprocess.Popen[bytes]) -> str:
+def read_until(text: str, process: subprocess.Popen[str]) -> str:
     log = ""
     while text not in log:
-        line = process.stderr.readline().decode() if process.stderr else ""
+        line = process.stderr.readline() if process.stderr else ""
         assert line, f"it ended: {log}"
         log += line
     return log

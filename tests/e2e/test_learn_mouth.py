@@ -14,21 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from kouxing_client import Client
 from PIL import Image
 
-from kouxing.evaluation.system.chromium import wait_until
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.mouth_profiles.landmark_file import landmark_file
-from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from tests import heads
 from tests.browser import Browser
+from tests.fake_control import FakeControl
 from tests.heads import neutral_faps
-from tests.scripted_system import Gateway, System
-from tests.system import DEMO, free_port
-
-pytestmark = pytest.mark.e2e
+from tests.system import DEMO, Gateway, wait_until
 
 NUM_PICTURES = 8
 
@@ -47,22 +43,18 @@ def write_speaking_head(path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def system() -> Iterator[System]:
-    system = System()
-    yield system
-    system.close()
+def control() -> Iterator[FakeControl]:
+    with FakeControl() as control:
+        yield control
 
 
 @pytest.fixture(scope="module")
-def browser(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(control: FakeControl, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     folder = tmp_path_factory.mktemp("browser")
     write_speaking_head(folder / "head.mjpeg")
-    gateway = Gateway(system.address, free_port())
-    browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg")
-    with Client(system.address) as client:
-        wait_until(lambda: len(client.status().services) == 4, 60)
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    gateway = Gateway(control.address)
+    browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg", (640, 480))
+    browser.open(gateway.page)
     yield browser
     browser.close()
     assert gateway.stop() == 0
@@ -107,13 +99,19 @@ def longer(recording: bytes) -> bytes:
 
 
 @pytest.mark.timeout(400)  # of a busy machine
-def test_learns_keeps_uses_and_forgets_a_mouth(system: System, browser: Browser) -> None:
+def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Browser) -> None:
     browser.evaluate(
         "window.realFetch = fetch; window.fetch = (url, options) => realFetch(url,"
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
     )
     read_aloud(browser)
     assert "of speech show the lips; film 10 s or more" in text_of(browser, "lesson-problem")
+    browser.evaluate(
+        "window.send = fetch; window.fetch = async () => { throw new Error('offline') }"
+    )
+    browser.click("lesson-resend")
+    browser.wait_for("document.getElementById('lesson-problem').innerText.includes('not answer')")
+    browser.evaluate("fetch = send")  # the recording is kept
 
     recording = browser.evaluate(
         "recording.bytes().then((bytes) =>"
@@ -131,17 +129,17 @@ def test_learns_keeps_uses_and_forgets_a_mouth(system: System, browser: Browser)
 
     assert browser.evaluate("window.kouxing.state.mouthProfile") == ""
     browser.click("lesson-keep")
-    browser.command("Page.navigate", url=browser.evaluate("location.href"))
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    browser.open(browser.evaluate("location.href"))
     browser.wait_for("window.kouxing.state.mouthProfile !== ''")
     profile = base64.b64decode(browser.evaluate("window.kouxing.state.mouthProfile"))
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.microphone")
-    assert system.recognizer is not None
-    (start,) = system.recognizer.starts.values()
-    assert start.mouth_profile == profile
-    learnt = (start.session, FaceSettings(lip_model="learnt"))
-    wait_until(lambda: system.synthesizer.changes == [learnt], 60)
+    ((session, opening),) = control.openings.items()
+    assert opening.mouth_profile == profile
+    wait_until(lambda: control.of(SetFace))
+    assert [(change.session, change.face) for change in control.of(SetFace)] == [
+        (session, FaceSettings(lip_model="learnt"))
+    ]
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")
 
@@ -151,19 +149,6 @@ def test_learns_keeps_uses_and_forgets_a_mouth(system: System, browser: Browser)
     assert browser.evaluate("window.kouxing.state.mouthProfile + localStorage.length") == "0"
     wrong = [text for text in browser.complaints if '"error"' in text or "exception" in text]
     assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
-
-
-def test_keeps_a_recording_that_could_not_be_sent(browser: Browser) -> None:
-    browser.evaluate(
-        "window.bodies = []; window.fetch ="
-        " async (_, { body }) => { bodies.push(body); throw new Error('offline'); };"
-    )
-    read_aloud(browser)
-    assert "gateway does not answer" in text_of(browser, "lesson-problem")
-    browser.click("lesson-resend")
-    browser.wait_for("bodies.length === 2")
-    assert browser.evaluate("bodies[0] === bodies[1]")
-    browser.evaluate("document.getElementById('learn-mouth').close()")
 
 
 def test_the_page_records_the_same_landmarks(browser: Browser) -> None:

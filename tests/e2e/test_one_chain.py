@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,25 +14,20 @@ from numpy.typing import NDArray
 from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, live_scheme, recognize_clip
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_frames import delay_for
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import to_samples
+from kouxing.shared.config import variable
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
-from tests.e2e.following import Collected, samples_of_file, stream, stream_into
+from tests.e2e.following import Stream, samples_of_file, stream
 from tests.lips import LIPS, clip_of
-from tests.system import DEMO, VOWELS_FILE, System
+from tests.system import CHAIN, DEMO, VOWELS_FILE, System
 
-pytestmark = pytest.mark.e2e
 MOUTH = np.array(MOUTH_FAPS) - 1
 JAW = 2  # column of FAP 3
-LIP_PREDICTOR = load_lip_predictor()
 
 
 def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
@@ -47,12 +40,7 @@ def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize(
     ("name", "rate_hz", "chunk"),
-    [
-        ("hello-female", 16000, 320),
-        ("lake-male", 16000, 97),
-        ("bilabials-female", 44100, 1021),
-        ("hello-male", 48000, 128),
-    ],
+    [("lake-male", 16000, 97), ("bilabials-female", 44100, 1021), ("hello-male", 48000, 128)],
 )
 def test_services_send_the_frames_of_the_chain(
     system: System, name: str, rate_hz: int, chunk: int
@@ -63,9 +51,7 @@ def test_services_send_the_frames_of_the_chain(
     chain = LiveChain(load_live_model(), load_lip_model(), sample_rate_hz=rate_hz)
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
-    assert [frame.media_time for frame in sent.frames] == [
-        to_samples(time_s) for time_s, _ in frames
-    ]
+    assert sent.times == [to_samples(time_s) for time_s, _ in frames]
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     assert sent.faps[:, MOUTH].any()
     assert lips_of(sent) == [
@@ -89,26 +75,27 @@ def test_services_send_the_frames_of_the_chain(
     ]
 
 
-@pytest.mark.parametrize(("lips", "rate_hz"), [("learnt", 48000), ("dynamic-visemes", 16000)])
-def test_services_send_the_frames_of_the_chain_with_chosen_lips(
-    tmp_path: Path, lips: str, rate_hz: int
+@pytest.mark.parametrize(
+    "settings", [{"lips": "dynamic-visemes"}, {"lips": "learnt", "delay_ms": 160.0}]
+)
+def test_services_send_the_frames_of_the_chain_with_other_settings(
+    tmp_path: Path, settings: dict[str, Any]
 ) -> None:
-    samples = at_rate(samples_of_file(VOWELS_FILE), rate_hz)
-    services = ("control", "recognizer", "synthesizer")
-    with System(services, tmp_path, settings={"KOUXING_SYNTHESIZER_LIPS": lips}) as running:
-        sent = stream(running.control, samples, chunk=997, sample_rate_hz=rate_hz)
+    samples = samples_of_file(VOWELS_FILE)
+    environment = {variable("synthesizer", key): str(value) for key, value in settings.items()}
+    with System(CHAIN, tmp_path, environment) as system:
+        sent = stream(system.control, samples, chunk=997)
     chain = LiveChain(
         load_live_model(),
-        load_lip_model(name=lips),
-        sample_rate_hz=rate_hz,
-        synthesizer=SynthesizerConfig(lips=lips),
+        load_lip_model(name=settings["lips"]),
+        synthesizer=SynthesizerConfig(**settings),
     )
     frames = chain.accept_waveform(samples) + chain.input_finished()
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     assert sent.faps[:, JAW].max() > 50.0
 
 
-def lips_of(sent: Collected) -> list[speech.LipPositions]:
+def lips_of(sent: Stream) -> list[speech.LipPositions]:
     """Lip frames without session, epoch and sequence."""
     return [
         speech.LipPositions(
@@ -122,82 +109,25 @@ def lips_of(sent: Collected) -> list[speech.LipPositions]:
     ]
 
 
-@contextlib.contextmanager
-def recognizer_with_lips(control: str) -> Iterator[None]:
-    """Run a recognizer in this process, since no shipped file holds the made-up lips."""
-    local = "tcp://127.0.0.1:*"
-    address = control.partition(" ")[0]
-    config = RecognizerConfig(control=address, audio=local, phones=local, unpaced_audio=local)
-    service = RecognizerService(config, LIP_PREDICTOR)
-    stop = threading.Event()
-
-    def serve() -> None:
-        service.startup()
-        while not stop.is_set():
-            service.step(0.01)
-        service.shutdown()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-
-
-@pytest.mark.parametrize("delay_ms", [40.0, 160.0])
-def test_services_send_the_frames_of_the_chain_with_learnt_lips(
-    tmp_path: Path, delay_ms: float
-) -> None:
-    samples = samples_of_file(DEMO / "bilabials-female.wav")
-    settings = {"KOUXING_SYNTHESIZER_LIPS": "learnt", "KOUXING_SYNTHESIZER_DELAY_MS": str(delay_ms)}
-    with (
-        System(("control", "synthesizer"), tmp_path, settings=settings) as running,
-        recognizer_with_lips(running.control),
-    ):
-        running.wait_until(
-            lambda report: "recognizer" in {each.service for each in report.services}
-        )
-        sent = stream(running.control, samples, chunk=1021)
-    chain = LiveChain(
-        load_live_model(),
-        load_lip_model(name="learnt"),
-        synthesizer=SynthesizerConfig(delay_ms=delay_ms),
-        lip_predictor=LIP_PREDICTOR,
-    )
-    frames = chain.accept_waveform(samples) + chain.input_finished()
-
-    np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
-    lips = [message_of(event) for event in chain.events if isinstance(event, LipPositions)]
-    assert lips_of(sent) == lips
-    (delay,) = {each.delay for each in sent.lips}
-    assert delay == round(delay_for(LIP_PREDICTOR.delays_s, delay_ms / 1e3) * 16000)
-    assert sent.faps[:, JAW].max() > 50.0
-
-
 def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
-    samples = samples_of_file(DEMO / "bilabials-female.wav")
-    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"), lip_predictor=LIP_PREDICTOR)
+    samples = samples_of_file(VOWELS_FILE)
+    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"))
     frames = chain.accept_waveform(samples) + chain.input_finished()
     settings = {
         "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",
         "KOUXING_SYNTHESIZER_DELAY_MS": str(SynthesizerConfig(lips="learnt").delay_ms),
     }
     with (
-        System(("control", "synthesizer"), tmp_path, settings=settings) as running,
-        recognizer_with_lips(running.control),
+        System(CHAIN, tmp_path, settings) as system,
+        Client(system.control) as client,
+        client.open_session(encoding="f32le", paced=False) as session,
     ):
-        running.wait_until(
-            lambda report: "recognizer" in {each.service for each in report.services}
-        )
-        with Client(running.control) as client:
-            session = client.open_session(encoding="f32le", sample_rate_hz=16000, paced=False)
-            session.set_face(lip_model="muscles")  # is reported and ignored
-            session.set_face(lip_model="learnt")
-            sent = stream_into(session, samples, chunk=320)
-            session.close()
-    # the choice may overtake the sound's beginning or not; both are at rest there
+        session.set_face(lip_model="muscles")  # is reported and ignored
+        session.set_face(lip_model="learnt")
+        sent = Stream(session)
+        sent.send(samples)
+        sent.finish()
+    # the choice may overtake the start of the audio; the face is at rest there
     np.testing.assert_allclose(sent.faps, np.array([faps for _, faps in frames]), atol=0.5)
     assert sent.faps[:, JAW].max() > 50.0
 

@@ -6,12 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from kouxing.services.kinds import KINDS
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.system import DEMO, ROOT
-from tests.watched import Watched
-
-pytestmark = pytest.mark.e2e
+from tests.system import DEMO, ROOT, System
 
 STATUS = "document.getElementById('status').textContent"
 WEBRTC_PAGE = ROOT / "docs" / "clients" / "webrtc.md"
@@ -19,16 +17,16 @@ IS_LIVE = f"{STATUS}.includes('live') && window.kouxing.state.voiceToPictureMs !
 
 
 @pytest.fixture(scope="module")
-def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
-    with Watched(tmp_path_factory.mktemp("logs")) as watched:
-        yield watched
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    with System(KINDS, tmp_path_factory.mktemp("logs"), restarts=True) as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
-def browser(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    browser = Browser(tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav")
-    browser.command("Page.navigate", url=watched.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+def browser(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    folder = tmp_path_factory.mktemp("browser")
+    browser = Browser(folder, DEMO / "hello-female.wav", size_px=(320, 240))
+    browser.open(system.page)
     # Records all notices, including short ones.
     browser.evaluate(
         "window.notices = []; const notice = document.getElementById('notice');"
@@ -68,11 +66,11 @@ def test_shows_the_measured_delay(browser: Browser) -> None:
     ],
 )
 def test_reports_a_crash_and_the_microphone_continues(
-    watched: Watched, live: Browser, service: str, text: str
+    system: System, live: Browser, service: str, text: str
 ) -> None:
     live.wait_for("document.getElementById('notice').textContent === ''")
     live.evaluate("window.notices = []")
-    watched.kill(service)
+    system.process(service).kill()
     live.wait_for(f"window.notices.some((notice) => notice.includes('{text}'))")
     live.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
 
@@ -89,18 +87,18 @@ def test_the_script_in_the_documentation_speaks_over_webrtc(browser: Browser) ->
     browser.evaluate("peer.close()")
 
 
-def test_a_restart_of_control_is_not_noticed(watched: Watched, live: Browser) -> None:
+def test_a_restart_of_control_is_not_noticed(system: System, live: Browser) -> None:
     live.wait_for("document.getElementById('notice').textContent === ''")
     live.evaluate("window.notices = []")
-    watched.kill("control")
+    system.process("control").kill()
     frames = live.evaluate("window.kouxing.state.numFrames")
-    live.wait_for(f"window.kouxing.state.numFrames > {frames + 200}")
+    live.wait_for(f"window.kouxing.state.numFrames > {frames + 100}")
     assert live.evaluate(f"window.kouxing.state.microphone && {IS_LIVE}")
     assert live.evaluate("window.notices") == []
 
 
-def test_an_abandoned_session_is_not_live(watched: Watched, live: Browser) -> None:
-    watched.kill("gateway")
+def test_an_abandoned_session_is_not_live(system: System, live: Browser) -> None:
+    system.process("gateway").kill()
     live.evaluate("document.getElementById('microphone').click()")  # the session is not closed
     live.wait_for("window.kouxing.state.connected && window.kouxing.state.session !== null")
     live.wait_for(f"{STATUS}.includes('waiting for speech')")  # after the last audio

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import base64
-import functools
-import http.server
 import io
-import socket
-import threading
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from kouxing.evaluation.system.chromium import wait_until
-from tests.browser import Browser
-from tests.scripted_system import Gateway, System
-from tests.system import DEMO, free_port
+from tests.browser import READY, Browser, serve_folder
+from tests.fake_control import FakeControl
+from tests.system import DEMO, Gateway, free_port, wait_until
 
-pytestmark = pytest.mark.e2e
-
-READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
+TOKEN = "#token=a%2Bsecret"  # noqa: S105 - of the test
 CONTROLS = [
     *("head", "show-phones", "microphone", "sample", "open-file", "record", "learn", "sound"),
     "open-settings",
@@ -30,14 +23,12 @@ CONTROLS = [
 
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-    system = System()
     certificate = tmp_path_factory.mktemp("https") / "kouxing.pem"
     settings = {"certificate": str(certificate), "token": "a+secret"}
-    gateway = Gateway(system.address, free_port(), **settings)
-    wait_until(certificate.is_file, 60)
-    yield gateway
-    assert gateway.stop() == 0
-    system.close()
+    with FakeControl() as control:
+        gateway = Gateway(control.address, **settings)
+        yield gateway
+        assert gateway.stop() == 0
 
 
 @pytest.fixture(scope="module")
@@ -56,86 +47,13 @@ def visit(browser: Browser, address: str) -> None:
 def test_the_token_is_used_and_removed_from_the_url(browser: Browser, gateway: Gateway) -> None:
     visit(browser, gateway.page)
     browser.wait_for("document.getElementById('notice')?.textContent.includes('#token=')")
-    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    visit(browser, gateway.page + TOKEN)
     browser.wait_for(READY)
     assert browser.evaluate("location.href") == gateway.page
     browser.click("microphone")  # https gives access to the microphone
     browser.wait_for("window.kouxing.state.microphone")
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")
-
-
-def test_the_bare_view_shows_only_the_face_on_a_transparent_background(
-    browser: Browser, gateway: Gateway
-) -> None:
-    visit(browser, f"{gateway.page}?view=bare&background=transparent#token=a%2Bsecret")
-    browser.wait_for(READY)
-    clear = {"r": 0, "g": 0, "b": 0, "a": 0}
-    browser.command("Emulation.setDefaultBackgroundColorOverride", color=clear)
-    browser.wait_for("document.getElementById('head').width > 0")
-    data = browser.command("Page.captureScreenshot", format="png")["data"]
-    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
-        alpha = np.asarray(image.convert("RGBA"))[..., 3]
-    browser.command("Emulation.setDefaultBackgroundColorOverride")
-    height, width = alpha.shape
-    assert alpha[:, [0, -1]].max() == 0
-    assert alpha[height // 2, width // 2] == 255
-    assert 0.1 < (alpha == 255).mean() < 0.8
-    assert browser.evaluate("document.body.innerText.trim()") == ""
-
-
-@pytest.fixture(scope="module")
-def other_pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Serve a page that frames the face on green; yield the port."""
-    folder = tmp_path_factory.mktemp("other")
-    port, own_port = free_port(), free_port()
-    gateway = Gateway("tcp://127.0.0.1:9", own_port, frame_ancestors=f"http://localhost:{port}")
-    (folder / "index.html").write_text(
-        "<!doctype html><style>body { margin: 0 } iframe { width: 100vw; height: 100vh; border: 0 }"
-        f"</style><iframe src='{gateway.page}?view=bare&background=%2300ff00'></iframe>",
-        encoding="utf-8",
-    )
-    handler = functools.partial(QuietFiles, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("", port), handler) as server:
-        threading.Thread(target=server.serve_forever).start()
-        wait_until(lambda: answers(own_port), 60)
-        yield port
-        server.shutdown()
-    assert gateway.stop() == 0
-
-
-class QuietFiles(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-def answers(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def test_an_allowed_page_can_frame_the_face(browser: Browser, other_pages: int) -> None:
-    visit(browser, f"http://localhost:{other_pages}/")
-    browser.wait_for("document.readyState === 'complete'")
-
-    def has_face_on_green() -> bool:
-        image = browser.image().astype(int)
-        height, width, _ = image.shape
-        is_green = (image[0, 0] == (0, 255, 0)).all()
-        red, green, _ = image[height // 2, width // 2]
-        return bool(is_green and red > green)
-
-    wait_until(has_face_on_green, 60)
-
-
-def test_other_pages_cannot_frame_the_face(browser: Browser, other_pages: int) -> None:
-    browser.complaints.clear()
-    visit(browser, f"http://127.0.0.1:{other_pages}/")
-    browser.wait_for("document.readyState === 'complete'")
-    wait_until(
-        lambda: browser.image().any() and "frame-ancestors" in "".join(browser.complaints), 60
-    )
-    assert not (browser.image() == (0, 255, 0)).all(axis=2).any()
 
 
 def press(browser: Browser, key: str) -> None:
@@ -150,7 +68,7 @@ def press(browser: Browser, key: str) -> None:
 def test_the_keyboard_reaches_all_controls_with_a_visible_focus(
     browser: Browser, gateway: Gateway
 ) -> None:
-    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    visit(browser, gateway.page + TOKEN)
     browser.wait_for(READY)
     reached = []
     for _ in CONTROLS:
@@ -170,21 +88,21 @@ def test_the_keyboard_reaches_all_controls_with_a_visible_focus(
 
 
 def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None:
-    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    visit(browser, gateway.page + TOKEN)
     browser.wait_for(READY)
     browser.evaluate("document.getElementById('settings').showPopover()")
     browser.command("Accessibility.enable")
     nodes = browser.command("Accessibility.getFullAXTree")["nodes"]
+    shown = [node for node in nodes if not node.get("ignored")]
     named = {
         node["role"]["value"]: node["name"]["value"]
-        for node in nodes
-        if not node.get("ignored") and "name" in node and "role" in node
+        for node in shown
+        if "name" in node and "role" in node
     }
     assert named["meter"] == "level"
     assert named["slider"].startswith("Mouth movement")
-    roles = ("button", "combobox", "slider", "meter", "image")
-    for node in nodes:
-        if not node.get("ignored") and node["role"]["value"] in roles:
+    for node in shown:
+        if node["role"]["value"] in ("button", "combobox", "slider", "meter", "image"):
             assert node["name"]["value"], node
     # Elements that are announced when they change; the others change too often.
     live = browser.evaluate(
@@ -193,4 +111,55 @@ def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None
     )
     announced = ["turned", "state", "notice", "send-problem", "lesson-advice", "lesson-problem"]
     assert live == announced
-    browser.evaluate("document.getElementById('settings').hidePopover()")
+
+
+def test_the_bare_view_shows_only_the_face_on_a_transparent_background(
+    browser: Browser, gateway: Gateway
+) -> None:
+    browser.resize(160, 120)
+    visit(browser, f"{gateway.page}?view=bare&background=transparent{TOKEN}")
+    browser.wait_for(READY)
+    clear = {"r": 0, "g": 0, "b": 0, "a": 0}
+    browser.command("Emulation.setDefaultBackgroundColorOverride", color=clear)
+    browser.wait_for("document.getElementById('head').width > 0")
+    data = browser.command("Page.captureScreenshot", format="png")["data"]
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        alpha = np.asarray(image.convert("RGBA"))[..., 3]
+    browser.command("Emulation.setDefaultBackgroundColorOverride")
+    height, width = alpha.shape
+    assert alpha[:, [0, -1]].max() == 0
+    assert alpha[height // 2, width // 2] == 255
+    assert 0.1 < (alpha == 255).mean() < 0.8
+    assert browser.evaluate("document.body.innerText.trim()") == ""
+
+
+@pytest.fixture(scope="module")
+def framing_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """Serve a page that frames the face on green."""
+    folder, port = tmp_path_factory.mktemp("other"), free_port()
+    gateway = Gateway("tcp://127.0.0.1:9", frame_ancestors=f"http://localhost:{port}")
+    (folder / "index.html").write_text(
+        "<!doctype html><style>body { margin: 0 } iframe { width: 100vw; height: 100vh; border: 0 }"
+        f"</style><iframe src='{gateway.page}?view=bare&background=%2300ff00'></iframe>",
+        encoding="utf-8",
+    )
+    with serve_folder(folder, port):
+        yield port
+    assert gateway.stop() == 0
+
+
+def test_only_an_allowed_page_can_frame_the_face(browser: Browser, framing_port: int) -> None:
+    def has_face_on_green() -> bool:
+        image = browser.image().astype(int)
+        height, width, _ = image.shape
+        red, green, _ = image[height // 2, width // 2]
+        return bool((image[0, 0] == (0, 255, 0)).all() and red > green)
+
+    visit(browser, f"http://localhost:{framing_port}/")
+    browser.wait_for("document.readyState === 'complete'")
+    wait_until(has_face_on_green)
+    browser.complaints.clear()
+    visit(browser, f"http://127.0.0.1:{framing_port}/")
+    browser.wait_for("document.readyState === 'complete'")
+    wait_until(lambda: browser.image().any() and "frame-ancestors" in "".join(browser.complaints))
+    assert not (browser.image() == (0, 255, 0)).all(axis=2).any()

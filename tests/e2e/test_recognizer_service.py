@@ -11,16 +11,13 @@ import pytest
 
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.service import MAX_BATCH_S, MAX_UNPACED_S, RecognizerService
-from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
-from kouxing.shared.wire.speech import AudioState, Progress
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES
 from tests.live_streams import START
 from tests.system import free_port
 
-pytestmark = pytest.mark.e2e
 RATE_HZ = START.sample_rate_hz
 PHONE_INPUT = {"phone_input": f"tcp://127.0.0.1:{free_port()}"}
 UNPACED = replace(START, paced=False, endpoints=PHONE_INPUT)
@@ -126,57 +123,3 @@ def test_unpaced_audio_waits_at_its_sender_while_live_audio_continues(
             service.step(0.001)
     assert num_sent < 250, "the socket must be full"
     assert (session.order.last, session.stream.media_time) == (1, 0)
-
-
-def test_acknowledges_the_end_once_everything_before_it_is_decoded(service: Recognizer) -> None:
-    service.start_session(UNPACED)
-    session = service._sessions["s"]
-    service.receive(chunk(0, 2 * RATE_HZ))
-    service.receive(AudioChunk(session="s", token="t", sequence=2, last=True, acknowledge=True))
-    assert (session.received_sequence, session.is_finished) == (1, False)
-    service.decode_all()
-    assert (session.received_sequence, session.is_finished) == (2, True)
-
-
-def test_rejects_live_audio_far_ahead_of_the_clock(service: Recognizer) -> None:
-    service.start_session(replace(UNPACED, paced=True))
-    for number in range(10):  # of 4 s
-        service.receive(chunk(number, 8 * RATE_HZ))
-    assert {reason for reason, _ in service.warned} == {"bad-audio"}
-    assert "paced = false" in service.warned[0][1]
-
-
-def test_reports_a_bad_mouth_profile_once_and_continues(service: Recognizer) -> None:
-    service.start_session(replace(UNPACED, mouth_profile=b"not a profile"))
-    for number in range(2):
-        service.receive(chunk(number, 3200))
-    service.decode_all()
-    assert [reason for reason, _ in service.warned] == ["bad-mouth-profile"]
-    assert service.media_times[-1] == pytest.approx(6400, abs=640)
-
-
-def test_reports_a_stalled_client_again_after_a_flush_and_to_a_new_face(
-    service: Recognizer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sent: list[Message] = []
-    monkeypatch.setattr(
-        SynthesizerLink, "send", lambda _link, message, _now_s: sent.append(message)
-    )
-    now_s = time.monotonic()
-
-    def num_reports(num_ticks: int) -> int:
-        nonlocal now_s
-        sent.clear()
-        for _ in range(num_ticks):
-            now_s += 0.01
-            service.on_tick(now_s)
-        progress = [message for message in sent if isinstance(message, Progress)]
-        return sum(message.state == AudioState.STALLED for message in progress)
-
-    start = replace(UNPACED, paced=True)
-    service.start_session(start)
-    assert [num_reports(100), num_reports(100)] == [1, 0]
-    service.flush_session("s")
-    assert num_reports(100) == 1
-    service.start_session(replace(start, epoch=2))
-    assert num_reports(100) == 1

@@ -35,7 +35,6 @@ from tests.glb_writer import write_glb
 from tests.meshes import meshes
 from tests.system import VOWELS_FILE, System, kouxing
 
-pytestmark = pytest.mark.e2e
 SENTENCE = VOWELS_FILE
 
 
@@ -211,10 +210,11 @@ def test_the_page_loads_the_chosen_head(tmp_path: Path) -> None:
         "KOUXING_DRIVER_HEAD": str(tmp_path / "my.glb"),
         "KOUXING_GATEWAY_HEAD": str(page_head),
     }
-    with System(("control", "gateway"), tmp_path, settings=environment) as system:
-        address = f"http://127.0.0.1:{system.environment['KOUXING_GATEWAY_PORT']}/head.glb"
-        with urllib.request.urlopen(address, timeout=30) as answer:
-            assert answer.read() == page_head.read_bytes()
+    with (
+        System(("control", "gateway"), tmp_path, environment) as system,
+        urllib.request.urlopen(f"{system.page}head.glb", timeout=60) as answer,  # noqa: S310
+    ):
+        assert answer.read() == page_head.read_bytes()
 
 
 def test_run_exports_missing_heads_to_the_cache(

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import urllib.request
 from pathlib import Path
 
 import av
 import pytest
 
-from tests.system import ONE_THREAD, ROOT, VOWELS_FILE, kouxing, own_environment
+from tests.system import LIMIT_S, VOWELS_FILE, kouxing, own_environment, start_python
 
-pytestmark = pytest.mark.e2e
 SENTENCE = VOWELS_FILE
 
 
@@ -34,19 +30,13 @@ def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
 
 
 def test_runs_on_free_ports_until_it_is_interrupted(tmp_path: Path) -> None:
-    environment = {**os.environ, **ONE_THREAD, "XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "kouxing", "run"]
-    for setting in ("driver.view=none", f"driver.out={tmp_path}"):
-        command += ["--set", setting]
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    options = ["--set", "driver.view=none", "--set", f"driver.out={tmp_path}", "--no-browser"]
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # another program uses it, which has the same effect
             stack.enter_context(socket.create_server(("127.0.0.1", 5550)))
-        running = subprocess.Popen(
-            [*command, "--no-browser", "--port", "0", "--workers", "2"],
-            env=environment,
-            cwd=ROOT,
-            stderr=subprocess.PIPE,
-            text=True,
+        running = start_python(
+            "-m", "kouxing", "run", *options, "--port", "0", "--workers", "2", **environment
         )
         stack.callback(running.communicate)
         stack.callback(running.kill)
@@ -64,7 +54,7 @@ def test_runs_on_free_ports_until_it_is_interrupted(tmp_path: Path) -> None:
         shown = kouxing("status", environment=environment).stdout
         assert (len(re.findall("recognizer-", shown)), len(re.findall("driver-", shown))) == (2, 1)
         running.send_signal(signal.SIGINT)
-        _, rest = running.communicate(timeout=60)
+        _, rest = running.communicate(timeout=LIMIT_S)
     assert running.returncode == 0, rest
     assert "Traceback" not in rest
 

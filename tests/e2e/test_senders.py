@@ -7,7 +7,7 @@ import errno
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +21,8 @@ from kouxing.services.senders.senders import MAX_SENDERS, Senders
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.face.shapes import SHAPE_SETS
+from tests.system import LIMIT_S, wait_until
 from tests.vtube_studio import VTubeStudioStub
-
-pytestmark = pytest.mark.e2e
-
-LIMIT_S = 20.0
 
 
 def open_mouth() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
@@ -62,13 +59,6 @@ def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def wait_until(is_so: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not is_so():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 def problem(senders: Senders, url: str) -> str:

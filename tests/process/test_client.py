@@ -6,9 +6,8 @@ The other end is the product's own, so it checks what the package sends.
 from __future__ import annotations
 
 import asyncio
-import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from kouxing_client import (
     Phone,
     Refused,
     Shapes,
-    core,
     find_key,
 )
 
@@ -31,8 +29,8 @@ from kouxing.shared.wire.control import Event
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import CloseSession, Error
 from tests.fake_control import FakeControl
+from tests.system import wait_until
 
-pytestmark = pytest.mark.process
 CHUNK = bytes(3200)  # 100 ms
 
 
@@ -44,15 +42,8 @@ def control() -> Iterator[FakeControl]:
 
 @pytest.fixture
 def client(control: FakeControl) -> Iterator[Client]:
-    with Client(control.commands.endpoint, insecure=True) as made:
+    with Client(control.address, insecure=True) as made:
         yield made
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    end_s = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 def frame(sequence: int) -> face.FapFrame:
@@ -158,7 +149,7 @@ def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
 
 def test_asyncio_does_the_same(control: FakeControl) -> None:
     async def run() -> list[float]:
-        async with AsyncClient(control.commands.endpoint, insecure=True) as client:
+        async with AsyncClient(control.address, insecure=True) as client:
             assert [state.service for state in (await client.status()).services]
             session = await client.open_session("s")
             frames = await session.frames()
@@ -171,29 +162,3 @@ def test_asyncio_does_the_same(control: FakeControl) -> None:
             return values
 
     assert asyncio.run(run()) == [1.0, 2.0]
-
-
-def test_requests_are_answered_at_once_while_audio_streams(control: FakeControl) -> None:
-    """One thread reads the sockets, so no answer is lost among the acknowledgements of audio."""
-    num_flushes = 20
-
-    async def run() -> list[float]:
-        times_s: list[float] = []
-        async with AsyncClient(control.commands.endpoint, insecure=True) as client:
-            session = await client.open_session("s")
-
-            async def stream() -> None:
-                while len(times_s) < num_flushes:
-                    session.try_push(CHUNK)
-                    session.take_errors()
-                    await asyncio.sleep(0.0005)
-
-            streaming = asyncio.create_task(stream())
-            for _ in range(num_flushes):
-                begin_s = time.monotonic()
-                await session.flush()
-                times_s.append(time.monotonic() - begin_s)
-            await streaming
-        return times_s
-
-    assert max(asyncio.run(run())) < core.RETRY_S

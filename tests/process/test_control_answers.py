@@ -18,8 +18,6 @@ from kouxing.shared.wire.control import SessionInput
 from kouxing.shared.wire.session import OpenSession, SessionOpened
 from tests.control_stage import Stage
 
-pytestmark = pytest.mark.process
-
 
 @pytest.fixture(params=[True, False])
 def stage(

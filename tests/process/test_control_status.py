@@ -18,8 +18,6 @@ from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
 from tests.control_stage import Stage
 
-pytestmark = pytest.mark.process
-
 
 def ask(stage: Stage, client: Socket, **fields: object) -> StatusReport | Error:
     """Return the answer to a status request."""

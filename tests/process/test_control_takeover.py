@@ -25,7 +25,6 @@ from kouxing.shared.wire.session import (
 from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage, beat
 
-pytestmark = pytest.mark.process
 PLACED = {
     "audio": "tcp://127.0.0.1:1",
     "phones": "tcp://127.0.0.1:1",

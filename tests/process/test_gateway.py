@@ -1,4 +1,4 @@
-"""The gateway's WebSockets, between a scripted system and clients."""
+"""The gateway's WebSockets, between a scripted control and clients."""
 
 from __future__ import annotations
 
@@ -24,24 +24,22 @@ from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE,
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.face import EndOfFaps
-from tests.process.gateway_system import (
-    EPOCH,
+from kouxing.shared.wire.control import SessionStarted
+from kouxing.shared.wire.face import EndOfFaps, SetFace
+from kouxing.shared.wire.session import CloseSession, FlushSession
+from tests.fake_control import EPOCH, FakeControl
+from tests.process.web_clients import (
     FACE,
-    GatewayProcess,
-    ScriptedSystem,
     async_test,
     connected,
+    publish_all,
+    publish_phone,
     receive_binary,
     receive_json,
     receive_of_session,
-    spawn,
     until,
-    wait_until,
 )
-from tests.system import DEMO, free_port
-
-pytestmark = pytest.mark.process
+from tests.system import DEMO, LIMIT_S, Gateway, free_port, start_python
 
 LONG_TIMEOUT = """
 from kouxing.services.gateway import audio_sessions
@@ -52,36 +50,36 @@ run_module("gateway")
 
 
 @pytest.fixture(scope="module")
-def shared_system() -> Iterator[ScriptedSystem]:
-    system = ScriptedSystem()
-    yield system
-    system.close()
+def shared_control() -> Iterator[FakeControl]:
+    with FakeControl() as control:
+        yield control
 
 
 @pytest.fixture(scope="module")
-def gateway(shared_system: ScriptedSystem) -> Iterator[GatewayProcess]:
-    gateway = GatewayProcess(shared_system)
+def gateway(shared_control: FakeControl) -> Iterator[Gateway]:
+    gateway = Gateway(shared_control.address)
+    assert shared_control.page == gateway.page
     yield gateway
     assert gateway.stop() == 0
 
 
 @pytest.fixture
-def system(shared_system: ScriptedSystem) -> ScriptedSystem:
-    """The system of the module, without the records of earlier tests."""
-    shared_system.clear_records()
-    return shared_system
+def control(shared_control: FakeControl) -> FakeControl:
+    """The control of the module, without the records of earlier tests."""
+    shared_control.clear()
+    return shared_control
 
 
 @pytest.fixture
-def own_system() -> Iterator[ScriptedSystem]:
-    system = ScriptedSystem()
-    yield system
-    system.close()
+def own_control() -> Iterator[FakeControl]:
+    with FakeControl() as control:
+        yield control
 
 
 @pytest.fixture
-def own_gateway(own_system: ScriptedSystem) -> Iterator[GatewayProcess]:
-    gateway = GatewayProcess(own_system)
+def own_gateway(own_control: FakeControl) -> Iterator[Gateway]:
+    gateway = Gateway(own_control.address)
+    assert own_control.page == gateway.page
     yield gateway
     gateway.stop()
 
@@ -90,7 +88,7 @@ def own_gateway(own_system: ScriptedSystem) -> Iterator[GatewayProcess]:
 
 
 @async_test
-async def test_an_idle_face_moves_without_a_session(gateway: GatewayProcess) -> None:
+async def test_an_idle_face_moves_without_a_session(gateway: Gateway) -> None:
     faces: list[NDArray[np.float32]] = []
     async with connected(gateway.page, "viewer?session=later") as (viewer,):
         while len(faces) < 25:
@@ -104,14 +102,11 @@ async def test_an_idle_face_moves_without_a_session(gateway: GatewayProcess) -> 
 
 
 @async_test
-async def test_viewers_receive_their_session(
-    system: ScriptedSystem, gateway: GatewayProcess
-) -> None:
+async def test_viewers_receive_their_session(control: FakeControl, gateway: Gateway) -> None:
     async with connected(gateway.page, "viewer", "viewer?session=other") as (newest, other):
         await receive_json(newest, "status", missing=[])
-        system.do(lambda: system.start("one"))
-        await until(lambda: system.started == ["one"])
-        system.do(lambda: system.publish_all("one"))
+        control.start("one")
+        publish_all(control, "one")
         await receive_json(newest, "session", session="one", lips="dynamic-visemes", sample=False)
         messages = [await receive_of_session(newest) for _ in range(5)]
         binary = {m.data[0]: m.data for m in messages if m.type is aiohttp.WSMsgType.BINARY}
@@ -124,10 +119,9 @@ async def test_viewers_receive_their_session(
 
         await other.send_json({"follow": "one"})
         await receive_json(other, "session", session="one")
-        system.do(lambda: system.start("one", epoch=EPOCH + 1))
+        control.start("one", epoch=EPOCH + 1)
         await receive_json(newest, "session", session="one", epoch=EPOCH + 1)
-        await until(lambda: system.started == ["one", "one"])
-        system.stop_session("one")
+        control.stop_session("one")
         await receive_json(newest, "session", session=None)
         await other.send_str("[[[[")
         await receive_json(other, "error", code="refused")
@@ -135,7 +129,7 @@ async def test_viewers_receive_their_session(
 
 @async_test
 async def test_viewers_receive_shapes_in_the_requested_format(
-    system: ScriptedSystem, gateway: GatewayProcess
+    control: FakeControl, gateway: Gateway
 ) -> None:
     query = "viewer?session=shaped&shapes=vrm"
     weights = VRM.weights(np.frombuffer(FACE, "<f4"))
@@ -146,9 +140,8 @@ async def test_viewers_receive_shapes_in_the_requested_format(
             await receive_json(viewer, "shapes", set="vrm", names=[*VRM.names])
         assert len(await receive_binary(binary, REST_SHAPES_TYPE)) == 16 + 4 * len(VRM.names)
         assert {*(await receive_json(text, "rest"))["weights"]} == {*VRM.names}
-        system.do(lambda: system.start("shaped"))
-        await until(lambda: system.started == ["shaped"])
-        system.do(lambda: system.publish_all("shaped"))
+        control.start("shaped")
+        publish_all(control, "shaped")
         assert (await receive_binary(binary, FAP_TYPE))[16:] == FACE
         shapes = await receive_binary(binary, SHAPES_TYPE)
         assert struct.unpack_from("<B3xId", shapes) == (SHAPES_TYPE, EPOCH, 320.0)
@@ -164,66 +157,50 @@ async def test_viewers_receive_shapes_in_the_requested_format(
             assert (frame["epoch"], frame["media_time"]) == (EPOCH, 320)
             assert [*frame["weights"]] == [*VRM.names]
             np.testing.assert_allclose([*frame["weights"].values()], weights, atol=1e-4)
-    system.stop_session("shaped")
-
-
-@async_test
-async def test_viewers_are_notified_of_missing_services(
-    system: ScriptedSystem, gateway: GatewayProcess
-) -> None:
-    async with connected(gateway.page, "viewer") as (viewer,):
-        await receive_json(viewer, "status", missing=[])
-        system.running.remove("recognizer")
-        await receive_json(viewer, "status", missing=["recognizer"])
+    control.stop_session("shaped")
 
 
 @async_test
 async def test_a_viewer_sets_the_expressions_of_its_face(
-    system: ScriptedSystem, gateway: GatewayProcess
+    control: FakeControl, gateway: Gateway
 ) -> None:
     async with connected(gateway.page, "viewer?session=seen") as (viewer,):
         await viewer.send_json({"express": {"joy": 0.5}})
         assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
-        system.do(lambda: system.start("seen"))
+        control.start("seen")
         await receive_json(viewer, "session", session="seen")
         await viewer.send_json({"express": {"glee": 0.5}})
         assert "use joy, sadness," in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"express": {"joy": 0.5, "squint": 1}, "hold_s": 7})
         await viewer.send_json({"express": {}})
         await viewer.send_json({"expressiveness": 2})
-        await until(lambda: len(system.expressions) == 2 and bool(system.amounts))
-    faces = [message.face for message in system.expressions]
-    assert [face.expressions for face in faces] == [{"joy": 0.5, "squint": 1.0}, {}]
-    assert faces[0].hold_s == 7
-    assert {message.session for message in system.expressions} == {"seen"}
-    assert system.amounts == [("seen", 2.0)]
-    system.stop_session("seen")
+        await until(lambda: len(control.of(SetFace)) == 3)
+    faces = [message.face for message in control.of(SetFace)]
+    assert [face.expressions for face in faces] == [{"joy": 0.5, "squint": 1.0}, {}, None]
+    assert (faces[0].hold_s, faces[2].expressiveness) == (7, 2.0)
+    assert {*control.sessions_of(SetFace)} == {"seen"}
+    control.stop_session("seen")
 
 
 # --- microphones and the sample sentence
 
 
-def test_a_microphone_session_closes_after_its_last_frame(own_system: ScriptedSystem) -> None:
-    system, gateway = own_system, GatewayProcess(own_system, "-c", LONG_TIMEOUT)
-
-    @async_test
-    async def speak() -> None:
-        async with connected(gateway.page, "microphone") as (microphone,):
-            await microphone.send_json({"sample_rate_hz": 48000, "num_channels": 1})
-            session = (await receive_json(microphone, "opened"))["session"]
-            for _ in range(5):
-                await microphone.send_bytes(b"\x01\x00" * 960)
-            await until(lambda: len(system.audio_messages) == 5)
-        await until(lambda: len(system.audio_messages) == 6)
-        assert not system.closed  # before the last frame has arrived
-        system.do(lambda: system.faps.send(EndOfFaps(session=session, epoch=EPOCH)))
-        await until(lambda: system.closed == [session])
-
-    try:
-        speak()
-    finally:
-        gateway.stop()
-    *chunks, last = system.audio_messages
+@async_test
+async def test_a_microphone_session_closes_after_its_last_frame(own_control: FakeControl) -> None:
+    control, gateway = own_control, Gateway(own_control.address, "-c", LONG_TIMEOUT)
+    assert control.page == gateway.page
+    async with connected(gateway.page, "microphone") as (microphone,):
+        await microphone.send_json({"sample_rate_hz": 48000, "num_channels": 1})
+        session = (await receive_json(microphone, "opened"))["session"]
+        for _ in range(5):
+            await microphone.send_bytes(b"\x01\x00" * 960)
+        await until(lambda: len(control.audio_messages) == 5)
+    await until(lambda: len(control.audio_messages) == 6)
+    assert not control.of(CloseSession)  # before the last frame has arrived
+    control.publish(control.faps, EndOfFaps(session=session, epoch=EPOCH))
+    await until(lambda: control.sessions_of(CloseSession) == [session])
+    gateway.stop()
+    *chunks, last = control.audio_messages
     assert [chunk.media_time for chunk in chunks] == [0, 320, 640, 960, 1280]
     assert all(isinstance(chunk, AudioChunk) and len(chunk.pcm) == 1920 for chunk in chunks)
     assert isinstance(last, AudioChunk)
@@ -232,10 +209,10 @@ def test_a_microphone_session_closes_after_its_last_frame(own_system: ScriptedSy
 
 @async_test
 async def test_dropped_audio_leaves_a_gap_in_media_time(
-    own_system: ScriptedSystem, own_gateway: GatewayProcess
+    own_control: FakeControl, own_gateway: Gateway
 ) -> None:
-    system = own_system
-    system.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # not bound yet
+    control = own_control
+    control.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # not bound yet
     num_chunks = MAX_UNACKNOWLEDGED + 100
     last_pcm = b"\x02\x00" * 320
     async with connected(own_gateway.page, "microphone") as (microphone,):
@@ -244,13 +221,13 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
         for _ in range(num_chunks):
             await microphone.send_bytes(b"\x01\x00" * 320)
         await microphone.send_json({"flush": True})
-        await until(lambda: bool(system.flushed))  # the gateway has read all chunks
-        system.do(system.bind_audio)
-        await until(lambda: len(system.audio_messages) == MAX_UNACKNOWLEDGED)
+        await until(lambda: control.of(FlushSession))  # the gateway has read all chunks
+        control.do(control.bind_audio)
+        await until(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED)
         await microphone.send_json({"skip": 320})
         await microphone.send_bytes(last_pcm)
-        await until(lambda: len(system.audio_messages) > MAX_UNACKNOWLEDGED)
-    *queued, last = system.audio_messages[: MAX_UNACKNOWLEDGED + 1]
+        await until(lambda: len(control.audio_messages) > MAX_UNACKNOWLEDGED)
+    *queued, last = control.audio_messages[: MAX_UNACKNOWLEDGED + 1]
     assert [chunk.media_time for chunk in queued] == [320 * n for n in range(MAX_UNACKNOWLEDGED)]
     assert isinstance(last, AudioChunk)
     assert last.pcm == last_pcm
@@ -260,38 +237,36 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
 
 @async_test
 async def test_a_session_gets_the_mouth_profile_of_its_microphone(
-    system: ScriptedSystem, gateway: GatewayProcess
+    control: FakeControl, gateway: Gateway
 ) -> None:
     profile = bytes(range(256)) * 256  # 64 KiB, the maximum
     async with connected(gateway.page, "microphone") as (microphone,):
         encoded = base64.b64encode(profile).decode()
         await microphone.send_json({"sample_rate_hz": 16000, "mouth_profile": encoded})
         await receive_json(microphone, "opened")
-    assert system.profiles == [profile]
+    assert [opening.mouth_profile for opening in control.openings.values()] == [profile]
 
 
 @pytest.mark.parametrize("ahead", [False, True])
 @async_test
 async def test_the_largest_message_is_spoken_in_real_time(
-    own_system: ScriptedSystem, own_gateway: GatewayProcess, *, ahead: bool
+    control: FakeControl, gateway: Gateway, *, ahead: bool
 ) -> None:
     def num_bytes() -> int:
-        return sum(len(message.pcm) for message in own_system.audio_messages)
+        return sum(len(message.pcm) for message in control.audio_messages)
 
-    async with connected(own_gateway.page, "microphone") as (microphone,):
+    async with connected(gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 48000, "ahead": ahead})
         await receive_json(microphone, "opened")
         await microphone.send_bytes(bytes(MAX_MESSAGE_BYTES))
         await until(lambda: num_bytes() > 0)
         assert num_bytes() < MAX_MESSAGE_BYTES / 2
         await microphone.send_json({"flush": True})
-        await until(lambda: bool(own_system.flushed))
+        await until(lambda: control.of(FlushSession))
 
 
 @async_test
-async def test_bad_audio_is_refused_with_a_reason(
-    system: ScriptedSystem, gateway: GatewayProcess
-) -> None:
+async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway: Gateway) -> None:
     hello = json.dumps({"sample_rate_hz": 16000})
     for messages, reason in (
         (['{"sample_rate_hz": 4000}'], "sample_rate_hz"),
@@ -304,15 +279,15 @@ async def test_bad_audio_is_refused_with_a_reason(
                 await send(message)  # type: ignore[arg-type]
             text = (await receive_json(microphone, "error"))["text"]
             assert reason in text
-            assert (await microphone.receive(60)).extra == text[:123]  # of the close
+            assert (await microphone.receive(LIMIT_S)).extra == text[:123]  # of the close
     async with connected(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)
         await receive_json(microphone, "opened")
         await microphone.send_bytes(bytes(MAX_MESSAGE_BYTES + 1))
-        closing = await microphone.receive(60)
+        closing = await microphone.receive(LIMIT_S)
         assert closing.data == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
         assert closing.extra == "a message is larger than 4096 KiB; send it in smaller messages"
-    system.refuse = True
+    control.refuse = True
     async with connected(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)
         assert (await receive_json(microphone, "error"))["text"] == "start one"
@@ -320,20 +295,20 @@ async def test_bad_audio_is_refused_with_a_reason(
 
 @async_test
 async def test_the_sample_sentence_is_played_once_for_all_viewers(
-    own_system: ScriptedSystem, own_gateway: GatewayProcess
+    own_control: FakeControl, own_gateway: Gateway
 ) -> None:
-    system = own_system
+    control = own_control
     async with connected(own_gateway.page, "viewer", "viewer") as viewers:
         for viewer in viewers:
             await viewer.send_json({"play": "sample"})
         shown = [await receive_json(viewer, "session", sample=True) for viewer in viewers]
         names = {message["session"] for message in shown}
-        await until(lambda: len(system.audio_messages) > 10)
-        assert names == {*system.started}
-        system.do(lambda: system.publish_phone(names.pop(), "n"))
+        await until(lambda: len(control.audio_messages) > 10)
+        assert names == {*control.sessions_of(SessionStarted)}
+        publish_phone(control, names.pop(), "n")
         await receive_json(viewers[0], "syllable", symbol="你")
     assert own_gateway.stop() == 0
-    assert system.closed == system.started
+    assert control.sessions_of(CloseSession) == control.sessions_of(SessionStarted)
 
 
 def test_the_text_of_the_sample_is_its_transcript() -> None:
@@ -345,9 +320,9 @@ def test_the_text_of_the_sample_is_its_transcript() -> None:
 
 @async_test
 async def test_microphone_and_sample_choose_their_lips(
-    own_system: ScriptedSystem, own_gateway: GatewayProcess
+    own_control: FakeControl, own_gateway: Gateway
 ) -> None:
-    system = own_system
+    control = own_control
     async with connected(own_gateway.page, "viewer", "microphone") as (viewer, microphone):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
@@ -361,13 +336,14 @@ async def test_microphone_and_sample_choose_their_lips(
         await viewer.send_json({"lips": "learnt"})
         assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lips": "learnt"})
-        await until(lambda: len(system.chosen) == 3)
+        await until(lambda: len(control.of(SetFace)) == 3)
         await receive_json(viewer, "session", sample=True)
         await viewer.send_json({"lips": "dynamic-visemes"})
-        await until(lambda: len(system.chosen) == 4)
-        system.stop_session(system.chosen[3][0])
+        await until(lambda: len(control.of(SetFace)) == 4)
+        control.stop_session(control.sessions_of(SetFace)[3])
         await receive_json(viewer, "session", sample=False)
-    sessions, lips_chosen = zip(*system.chosen, strict=True)
+    sessions = control.sessions_of(SetFace)
+    lips_chosen = tuple(message.face.lip_model for message in control.of(SetFace))
     assert sessions[0] == sessions[1] != sessions[2] == sessions[3]
     assert lips_chosen == ("learnt", "dynamic-visemes") * 2
 
@@ -377,7 +353,7 @@ async def test_microphone_and_sample_choose_their_lips(
 
 @async_test
 async def test_the_newest_face_is_sent_to_another_program(
-    system: ScriptedSystem, gateway: GatewayProcess
+    control: FakeControl, gateway: Gateway
 ) -> None:
     senders = f"{gateway.page}senders"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
@@ -391,11 +367,10 @@ async def test_the_newest_face_is_sent_to_another_program(
             async with http.post(senders, json={"start": url}) as answer:
                 assert [sender["target"] for sender in (await answer.json())["senders"]] == [url]
             await until(lambda: time_sent(program) > 1.0)  # a face at rest
-            system.do(lambda: system.start("older"))
-            system.do(lambda: system.start("newer"))
-            await until(lambda: {"older", "newer"} <= {*system.started})
-            system.do(lambda: system.publish_all("older"))
-            system.do(lambda: system.publish_all("newer"))
+            for session in ("older", "newer"):
+                control.start(session)
+            for session in ("older", "newer"):
+                publish_all(control, session)
             await until(lambda: time_sent(program) == 320 / 16000)
             async with http.get(senders) as answer:
                 (state,) = (await answer.json())["senders"]
@@ -420,7 +395,7 @@ def time_sent(program: socket.socket) -> float:
 
 @async_test
 async def test_sigterm_closes_sockets_with_a_reason_and_exits_0(
-    own_gateway: GatewayProcess,
+    own_gateway: Gateway,
 ) -> None:
     async with connected(own_gateway.page, "viewer") as (viewer,):
         await receive_json(viewer, "status")
@@ -428,48 +403,33 @@ async def test_sigterm_closes_sockets_with_a_reason_and_exits_0(
         with pytest.raises(EOFError):
             await receive_json(viewer, "never")
         assert viewer.close_code == aiohttp.WSCloseCode.GOING_AWAY
-    assert own_gateway.process.wait(60) == 0
+    assert own_gateway.process.wait(LIMIT_S) == 0
 
 
-def test_without_control_browsers_are_told_to_start_it() -> None:
-    port = free_port()
-    process = spawn(KOUXING_GATEWAY_PORT=str(port), KOUXING_CONTROL="tcp://127.0.0.1:9")
-    page = f"http://127.0.0.1:{port}/"
-
-    @async_test
-    async def connect() -> None:
-        async with connected(page, "viewer", "microphone") as (viewer, microphone):
-            await receive_json(viewer, "status", missing=["control"])
-            await microphone.send_json({"sample_rate_hz": 16000})
-            text = (await receive_json(microphone, "error"))["text"]
-            assert "does not answer" in text
-            assert "kouxing run" in text
-
-    try:
-        wait_until(lambda: can_connect(port))
-        connect()
-    finally:
-        process.terminate()
-        process.communicate(timeout=60)
-    assert process.returncode == 0
-
-
-def can_connect(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+@async_test
+async def test_without_control_browsers_are_told_to_start_it() -> None:
+    gateway = Gateway("tcp://127.0.0.1:9")
+    async with connected(gateway.page, "viewer", "microphone") as (viewer, microphone):
+        await receive_json(viewer, "status", missing=["control"])
+        await microphone.send_json({"sample_rate_hz": 16000})
+        text = (await receive_json(microphone, "error"))["text"]
+    assert "does not answer" in text
+    assert "kouxing run" in text
+    assert gateway.stop() == 0
 
 
 def test_an_address_that_is_not_available_is_a_users_mistake() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = str(listener.getsockname()[1])
-        for process, text in (
-            (spawn(KOUXING_GATEWAY_PORT=port), f"gateway.port: {port} is in use"),
-            (
-                spawn(KOUXING_GATEWAY_HOST="192.0.2.1", KOUXING_GATEWAY_INSECURE="1"),
-                "gateway.host",
-            ),
+        for host, text in (
+            ("127.0.0.1", f"gateway.port: {port} is in use"),
+            ("192.0.2.1", "gateway.host"),
         ):
-            _, log = process.communicate(timeout=60)
+            settings = {"KOUXING_GATEWAY_HOST": host, "KOUXING_GATEWAY_PORT": port}
+            process = start_python(
+                "-m", "kouxing.services.gateway", KOUXING_INSECURE="1", **settings
+            )
+            _, log = process.communicate(timeout=LIMIT_S)
             assert process.returncode == 2
             assert text in log
             assert "Traceback" not in log

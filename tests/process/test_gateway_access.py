@@ -12,15 +12,10 @@ import subprocess
 from collections.abc import Iterator
 from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import pytest
 
-from tests.process.gateway_system import spawn, wait_until
-from tests.scripted_system import Gateway
-from tests.system import free_port
-
-pytestmark = pytest.mark.process
+from tests.system import LIMIT_S, Gateway, free_port, port_of, start_python, wait_until
 
 NO_CONTROL = "tcp://127.0.0.1:9"
 UPGRADE = {
@@ -38,32 +33,22 @@ class Site:
         if certificate is not None:
             settings["certificate"] = str(certificate)
         self.certificate = certificate
-        self.gateway = Gateway(NO_CONTROL, free_port(), **settings)
-        self.port = urlsplit(self.gateway.page).port
+        self.gateway = Gateway(NO_CONTROL, insecure="false", **settings)
+        wait_until(lambda: certificate is None or certificate.is_file())
 
     def ask(
         self, path: str, method: str = "GET", body: str | None = None, **headers: str
     ) -> HTTPResponse:
         """Return the head of an answer."""
-        with contextlib.closing(self._connection()) as connection:
-            wait_until(lambda: can_connect(connection))
+        port = port_of(self.gateway.page)
+        if self.certificate is None:
+            connection = HTTPConnection("127.0.0.1", port, timeout=LIMIT_S)
+        else:
+            tls = ssl.create_default_context(cafile=self.certificate)  # also checks the names
+            connection = HTTPSConnection("127.0.0.1", port, timeout=LIMIT_S, context=tls)
+        with contextlib.closing(connection):
             connection.request(method, f"/{path}", body, headers)
             return connection.getresponse()
-
-    def _connection(self) -> HTTPConnection:
-        if self.certificate is None:
-            return HTTPConnection("127.0.0.1", self.port, timeout=60)
-        wait_until(lambda: bool(self.certificate and self.certificate.is_file()))
-        tls = ssl.create_default_context(cafile=self.certificate)  # also checks the names
-        return HTTPSConnection("127.0.0.1", self.port, timeout=60, context=tls)
-
-
-def can_connect(connection: HTTPConnection) -> bool:
-    try:
-        connection.connect()
-    except ConnectionRefusedError:
-        return False
-    return True
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +199,8 @@ def test_only_the_owner_can_read_the_certificate(public: Site) -> None:
 
 def gateway_process(**settings: str) -> subprocess.Popen[str]:
     names = {f"KOUXING_{name.upper()}": value for name, value in settings.items()}
-    return spawn(KOUXING_CONTROL=NO_CONTROL, KOUXING_INSECURE="0", **names)
+    names = {"KOUXING_GATEWAY_PORT": "0", **names}
+    return start_python("-m", "kouxing.services.gateway", control=NO_CONTROL, **names)
 
 
 def test_plain_http_for_a_proxy_creates_and_prints_a_token() -> None:
@@ -236,7 +222,7 @@ def test_plain_http_for_a_proxy_creates_and_prints_a_token() -> None:
                 assert http.getresponse().status == status
     finally:
         process.terminate()
-        process.communicate(timeout=60)
+        process.communicate(timeout=LIMIT_S)
 
 
 @pytest.mark.parametrize(
@@ -251,6 +237,6 @@ def test_plain_http_for_a_proxy_creates_and_prints_a_token() -> None:
 )
 def test_reports_wrong_settings(settings: dict[str, str], text: str) -> None:
     process = gateway_process(**settings)
-    _, log = process.communicate(timeout=60)
+    _, log = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2
     assert text in log

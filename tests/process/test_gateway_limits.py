@@ -10,7 +10,6 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import urlsplit
 
 import aiohttp
 import pytest
@@ -25,9 +24,8 @@ from kouxing.services.gateway.viewers import Viewers
 from kouxing.services.gateway.web_server import WebServer
 from kouxing.services.gateway.whip import MISSING, WhipClients
 from kouxing.shared.metrics import Metrics
-from tests.process.gateway_system import GatewayProcess, ScriptedSystem, async_test
-
-pytestmark = pytest.mark.process
+from tests.process.web_clients import async_test
+from tests.system import Gateway, port_of
 
 UPGRADE = b"GET /long HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: upgrade\r\n\r\n"
 SDP = {"Content-Type": "application/sdp"}
@@ -270,17 +268,13 @@ async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPat
 
 
 def test_logs_requests_that_are_not_http_once() -> None:
-    system = ScriptedSystem()
-    gateway = GatewayProcess(system)
-    address = urlsplit(gateway.page)
+    gateway = Gateway("tcp://127.0.0.1:9", log_level="info")
+    address = ("127.0.0.1", port_of(gateway.page))
     for garbage in (b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01" * 100, b"\xff\x00" * 5000):
-        with socket.create_connection((address.hostname, address.port), 60) as client:
+        with socket.create_connection(address, 60) as client:
             client.sendall(garbage)
             assert b" 400 " in client.recv(100)
     gateway.process.terminate()
-    assert gateway.process.stderr is not None
-    log = gateway.process.stderr.read()
-    gateway.stop()
-    system.close()
+    _, log = gateway.process.communicate()
     assert log.count("not HTTP") == 1
     assert "Traceback" not in log

@@ -21,9 +21,7 @@ from kouxing.services.gateway.http import MAX_UPLOAD_BYTES, make_application
 from kouxing.services.gateway.learn_mouth import MouthLearner
 from kouxing.services.mouth_profiles.worker import Learn
 from kouxing.shared.errors import UserError
-from tests.process.gateway_system import async_test
-
-pytestmark = pytest.mark.process
+from tests.process.web_clients import async_test
 
 Learned = tuple[bytes, dict[str, object]]
 
@@ -117,14 +115,6 @@ async def test_rejects_a_recording_that_is_too_large() -> None:
         status, answer = await gateway.post(bytes(MAX_UPLOAD_BYTES + 1))
         assert (status, answer) == (413, {"error": "the recording is larger than 8 MiB"})
         assert (await gateway.post(bytes(MAX_UPLOAD_BYTES)))[0] == 200
-
-
-@async_test
-async def test_rejects_pages_of_other_origins() -> None:
-    async with serve(reverse) as gateway:
-        origin = {"Origin": "http://evil.example"}
-        async with gateway.http.post(gateway.address, data=b"abc", headers=origin) as answer:
-            assert answer.status == 403
 
 
 @async_test

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import urllib.request
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +17,6 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.config import variable
 from tests.raw_bytes import pour
 from tests.system import ROOT, VOWELS_FILE, System, free_port
-
-pytestmark = pytest.mark.process
 
 SERVICES = ("control", "recognizer", "synthesizer")
 ELSEWHERE = {"frames_missed", "videos", "video_seconds"}  # metrics of services that do not run here
@@ -34,7 +30,7 @@ def families(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, lis
     ports = {service: free_port() for service in SERVICES}
     settings = {variable(name, "metrics_port"): str(port) for name, port in ports.items()}
     folder = tmp_path_factory.mktemp("metrics")
-    with System(SERVICES, folder, settings=settings) as system, Client(system.control) as client:
+    with System(SERVICES, folder, settings) as system, Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)
         session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz, paced=False)
         output = session.results(FapFrame, keep_all=True)
@@ -114,20 +110,3 @@ def test_the_dashboard_uses_only_known_metrics(families: dict[str, list[Metric]]
 def _forms(family: Metric) -> set[str]:
     suffixes = {"counter": SUFFIXES[:1], "histogram": SUFFIXES[1:], "gauge": ("",)}
     return {f"{family.name}{suffix}" for suffix in suffixes[family.type]}
-
-
-def test_metrics_are_off_by_default(tmp_path: Path) -> None:
-    with System(["control"], tmp_path) as system:
-        number = system.processes["control"].pid
-        sockets = set()
-        for link in Path(f"/proc/{number}/fd").iterdir():
-            with contextlib.suppress(FileNotFoundError):  # it opens and closes files meanwhile
-                sockets.add(link.readlink().name)
-        table = Path(f"/proc/{number}/net/tcp").read_text("ascii").splitlines()[1:]
-        rows = [line.split() for line in table]
-        listening = {
-            int(row[1].rpartition(":")[2], 16)
-            for row in rows
-            if row[3] == "0A" and f"socket:[{row[9]}]" in sockets
-        }
-    assert listening == system.ports

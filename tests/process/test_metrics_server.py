@@ -14,8 +14,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.prometheus import MAX_REQUESTS, MetricsServer
 
-pytestmark = pytest.mark.process
-
 
 @pytest.fixture
 def server() -> Iterator[MetricsServer]:

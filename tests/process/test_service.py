@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -14,21 +13,15 @@ from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
-from kouxing.shared.keys import NO_PEER, Peer
+from kouxing.shared.keys import Peer
 from kouxing.shared.service import RESYNC_AFTER_S, SESSIONS_PER_HEARTBEAT, Service
 from kouxing.shared.service_kind import ServiceKind
-from kouxing.shared.wire.control import (
-    Heartbeat,
-    HeartbeatReply,
-    SessionInput,
-    SessionStarted,
-    StartSession,
-)
-from kouxing.shared.wire.session import CloseSession, Done, SessionFacts
+from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted, StartSession
+from kouxing.shared.wire.session import Done, SessionFacts
 from kouxing.shared.wire.speech import Progress, Speech
+from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
-
-pytestmark = pytest.mark.process
+from tests.system import LIMIT_S, wait_until
 
 
 class Slow(Service):
@@ -61,10 +54,7 @@ def slow() -> Iterator[Slow]:
 
 
 def handle(service: Slow, num_messages: int) -> None:
-    end_s = time.monotonic() + 30
-    while service.num_handled < num_messages:
-        assert time.monotonic() < end_s
-        service.step(0.01)
+    wait_until(lambda: service.num_handled >= num_messages, step=lambda: service.step(0.01))
 
 
 def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: Slow) -> None:
@@ -83,7 +73,7 @@ def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
         sender.send(Speech(session="s", active=True))
         sender.send(Progress(level_db=0.0))
         handle(slow, 1)
-        assert sender.wait(2.0)
+        assert sender.wait(LIMIT_S)
         (answer,) = [received.message for received in sender.receive()]
     assert getattr(answer, "code", "") == "bad-message"
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
@@ -149,105 +139,56 @@ class Worker(Service):
         return dict.fromkeys(self.names, SessionInput())
 
 
-class Control:
-    """Answers heartbeats under the instance name ``instance``."""
-
-    def __init__(self) -> None:
-        self.bus = Bus()
-        self.socket = self.bus.bind_router("tcp://127.0.0.1:*", "control.commands")
-        self.instance = "control-1"
-        self.stops: list[str] = []  # sessions to stop, before each reply
-        self.beats: list[Heartbeat] = []
-        self.starts: list[StartSession] = []
-        self.peer = NO_PEER
-
-    def answer(self) -> None:
-        assert self.socket.wait(20.0)
-        self.step()
-
-    def step(self) -> None:
-        for received in self.socket.receive():
-            self.peer = received.sender
-            match received.message:
-                case Heartbeat() as beat:
-                    self.beats.append(beat)
-                    for session in self.stops:
-                        self.socket.send(CloseSession(session=session), to=self.peer)
-                    self.socket.send(
-                        HeartbeatReply(
-                            sent_ns=beat.sent_ns,
-                            received_ns=0,
-                            replied_ns=0,
-                            control=self.instance,
-                        ),
-                        to=self.peer,
-                    )
-                case SessionStarted(start=StartSession() as start):
-                    self.starts.append(start)
+@pytest.fixture
+def control() -> Iterator[FakeControl]:
+    with FakeControl() as made:
+        yield made
 
 
 @pytest.fixture
-def control() -> Iterator[Control]:
-    made = Control()
+def worker(control: FakeControl) -> Iterator[Worker]:
+    made = Worker(control.address)
     yield made
     made.bus.close()
 
 
-@pytest.fixture
-def worker(control: Control) -> Iterator[Worker]:
-    made = Worker(control.socket.endpoint)
-    yield made
-    made.bus.close()
+def run_until(worker: Worker, condition: Callable[[], object]) -> None:
+    wait_until(condition, step=lambda: worker.step(0.01))
 
 
-def run_until(control: Control, worker: Worker, condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end_s
-        worker.step(0.01)
-        control.step()
-
-
-def test_resyncs_with_control_after_a_stall(control: Control, worker: Worker) -> None:
-    run_until(control, worker, lambda: bool(control.beats))
+def test_resyncs_with_control_after_a_stall(control: FakeControl, worker: Worker) -> None:
+    run_until(worker, lambda: control.heartbeats)
     with Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
         sender.send(Progress(level_db=0.0))
         time.sleep(RESYNC_AFTER_S + 0.1)
         control.stops = ["s0"]
-        answering = threading.Thread(target=control.answer)
-        answering.start()
-        worker.step(0.01)
-        answering.join()
-        run_until(control, worker, lambda: "input" in worker.happened)
+        run_until(worker, lambda: "input" in worker.happened)
     assert worker.happened[:2] == ["stop s0", "input"]
 
 
 def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
-    control: Control, worker: Worker, monkeypatch: pytest.MonkeyPatch
+    control: FakeControl, worker: Worker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_until(control, worker, lambda: bool(control.beats))
-
+    run_until(worker, lambda: control.heartbeats)
     control.stops = ["s0"]
-    answering = threading.Thread(target=control.answer)
 
     def stall(*_: object) -> None:
         time.sleep(RESYNC_AFTER_S + 0.1)
         worker.happened.append("input")
-        answering.start()
 
     worker._handlers[worker.input][Progress] = stall
     monkeypatch.setattr(worker, "on_tick", lambda _now_s: worker.happened.append("tick"))
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
-        while "input" not in worker.happened:
-            worker.step(0.01)
-    answering.join()
-    assert worker.happened[-3:] == ["input", "stop s0", "tick"]
+        run_until(worker, lambda: "input" in worker.happened)
+    after = worker.happened.index("input")
+    assert worker.happened[after : after + 3] == ["input", "stop s0", "tick"]
 
 
-def test_continues_after_a_stall_without_control(worker: Worker) -> None:
-    with Bus() as bus:
+def test_continues_after_a_stall_without_control() -> None:
+    worker = Worker("tcp://127.0.0.1:9")
+    with worker.bus, Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
         sender.send(Progress(level_db=0.0))
         time.sleep(RESYNC_AFTER_S + 0.1)
@@ -257,18 +198,18 @@ def test_continues_after_a_stall_without_control(worker: Worker) -> None:
 
 
 def test_a_restarted_control_learns_the_sessions(
-    monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
+    monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker
 ) -> None:
     start = StartSession(
         session="s0", epoch=3, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
         num_channels=1, record=False, paced=True, facts=SessionFacts(), endpoints={},
     )  # fmt: skip
     monkeypatch.setattr(worker, "served_sessions", lambda: [start])
-    run_until(control, worker, lambda: bool(control.beats))
-    assert not control.starts
-    control.instance = "control-2"
-    run_until(control, worker, lambda: bool(control.starts))
-    assert control.starts == [start]
+    run_until(worker, lambda: control.heartbeats)
+    assert not control.of(SessionStarted)
+    control.name = "control-2"
+    run_until(worker, lambda: control.of(SessionStarted))
+    assert [started.start for started in control.of(SessionStarted)] == [start]
 
 
 @pytest.mark.parametrize(
@@ -286,17 +227,18 @@ def test_registers_at_an_address_where_another_program_answered_before(
     answer_handshake(listener, curve, rest)
     config = ControlConfig(control=commands, events="tcp://127.0.0.1:*", insecure=True)
     control = ControlService(config)
-    end_s = time.monotonic() + 30
-    while worker.instance not in control._registry:
-        assert time.monotonic() < end_s
+
+    def step() -> None:
         worker.step(0.01)
         control.step(0.01)
+
+    wait_until(lambda: worker.instance in control._registry, step=step)
     for service in (worker, control):
         service.bus.close()
 
 
 def test_keeps_messages_for_a_control_that_hangs(
-    monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
+    monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker
 ) -> None:
     monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.0)
     monkeypatch.setattr(Service, "_warn_about_control", lambda self: None)
@@ -305,32 +247,32 @@ def test_keeps_messages_for_a_control_that_hangs(
         worker._heartbeat_due_s = 0.0
         worker.send_heartbeat_if_due()
     assert worker.control is connected
-    run_until(control, worker, lambda: len(control.beats) >= 3)
+    run_until(worker, lambda: len(control.heartbeats) >= 3)
 
 
-def test_reports_draining_before_it_finishes_its_sessions(control: Control) -> None:
-    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_PER_HEARTBEAT)
-    run_until(control, worker, lambda: bool(control.beats))
-    seen: list[Heartbeat] = []
+def test_reports_draining_before_it_finishes_its_sessions(control: FakeControl) -> None:
+    worker = Worker(control.address, num_sessions=2 * SESSIONS_PER_HEARTBEAT)
+    run_until(worker, lambda: control.heartbeats)
+
+    def draining() -> list[Heartbeat]:
+        return [beat for beat in [*control.heartbeats] if beat.state == "draining"]
 
     def finish() -> bool:
-        control.answer()
-        seen.extend(beat for beat in control.beats if beat.state == "draining")
+        wait_until(draining)
         return True
 
     worker.on_drain = finish  # type: ignore[method-assign]
     worker.shutdown()
-    assert seen
-    assert {*seen[0].sessions} == {*worker.names}
+    assert {*draining()[0].sessions} == {*worker.names}
 
 
-def test_heartbeats_report_many_sessions_in_turn(control: Control) -> None:
-    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_PER_HEARTBEAT + 10)
+def test_heartbeats_report_many_sessions_in_turn(control: FakeControl) -> None:
+    worker = Worker(control.address, num_sessions=2 * SESSIONS_PER_HEARTBEAT + 10)
     try:
-        run_until(control, worker, lambda: len(control.beats) >= 3)
+        run_until(worker, lambda: len(control.heartbeats) >= 3)
     finally:
         worker.bus.close()
-    named = [name for beat in control.beats[:3] for name in beat.sessions]
+    named = [name for beat in control.heartbeats[:3] for name in beat.sessions]
     assert len(named) == 3 * SESSIONS_PER_HEARTBEAT
     assert {*named} == {*worker.names}
 

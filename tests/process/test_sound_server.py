@@ -12,7 +12,6 @@ import pytest
 from kouxing.evaluation.system.chromium import wait_until
 from kouxing.shared.sound_devices import monitor, sound_devices
 
-pytestmark = pytest.mark.process
 RATE_HZ, TONE_HZ = 16_000, 1000
 MAX_BLOCKS = 1000  # 20 s: playback without a loudspeaker may start late
 SERVER = (

@@ -18,7 +18,7 @@ from kouxing.services.gateway import sound_upload
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.http import make_application
 from kouxing.services.gateway.sound_upload import REMARKS_HEADER, SoundUpload
-from tests.process.gateway_system import async_test
+from tests.process.web_clients import async_test
 
 Post = Callable[[str, bytes], Awaitable[tuple[int, bytes, str]]]
 SINE = 0.5 * np.sin(np.arange(32_000) * 0.1)

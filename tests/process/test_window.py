@@ -11,7 +11,7 @@ import pytest
 
 from tests.system import ONE_THREAD, ROOT
 
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

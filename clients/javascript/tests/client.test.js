@@ -38,15 +38,19 @@ test("speech returns as frames, shapes, phones and sound", async () => {
   const viewer = new Viewer(GATEWAY, handlers, { session: speaker.session, shapes: "arkit" });
   await viewer.ready;
   const samples = new Int16Array(wav.buffer.slice(wav.indexOf("data") + 8));
-  await speaker.push(samples.subarray(0, 32000));
+  for (let begin = 0; begin < 16000; begin += 4000) {
+    await speaker.push(samples.subarray(begin, begin + 4000));
+    // The gateway drops what a busy viewer does not read in time.
+    while (numSamples < begin + 3000) await new Promise((resolve) => setTimeout(resolve, 10));
+  }
   await speaker.finish();
   viewer.close();
   assert.ok(Math.max(...faps.map(([, jaw]) => jaw)) > 200);
   assert.ok(Math.max(...openings.map(([, weight]) => weight)) > 0.1);
-  const [times, shapeTimes] = [faps, openings].map((frames) => frames.slice(0, 50).map(([time]) => time));
+  const [times, shapeTimes] = [faps, openings].map((frames) => frames.slice(0, 25).map(([time]) => time));
   assert.deepEqual(shapeTimes, times);
   assert.deepEqual(symbols.slice(0, 4), ["n", "i", "h", "ao"]);
-  assert.ok(numSamples > 30000);
+  assert.ok(numSamples > 15000);
 });
 
 test("a refused session is rejected with the reason", async () => {

@@ -1,0 +1,104 @@
+"""A fake control that publishes a face and its sound in real time, for the page."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.audio import AudioChunk, Sound
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.speech import Phone
+from tests.fake_control import EPOCH, FakeControl
+
+FRAME = 320  # samples; 20 ms
+CLICK_EVERY = 25 * FRAME  # samples; 0.5 s
+LOOK_AHEAD_MS = 60
+
+
+class PageControl(FakeControl):
+    """Control with a synthesizer that publishes the face ``shown`` in one session.
+
+    If ``flash`` is set, the face changes to it and back twice a second, and the sound clicks.
+    """
+
+    def __init__(self) -> None:
+        self.shown: NDArray[np.float32] | None = None  # None: nothing is published
+        self.flash: NDArray[np.float32] | None = None
+        self.look_ahead_ms = LOOK_AHEAD_MS  # between a frame and its sound
+        self._symbol = "a"
+        self._session = ""
+        self._media_time = 0
+        self._sequence = 0
+        self._due_s = time.monotonic()
+        super().__init__()
+
+    def talk(self, session: str, shown: NDArray[np.float32], symbol: str) -> None:
+        """Show a face in a session, and publish a phone."""
+        self._session, self._symbol, self.shown = session, symbol, shown
+
+    def samples(self, session: str) -> NDArray[np.int16]:
+        """Return the audio that a session has received."""
+        chunks = [chunk for chunk in [*self.audio_messages] if chunk.session == session]
+        return np.frombuffer(b"".join(chunk.pcm for chunk in chunks), "<i2")
+
+    def has_ended(self, session: str) -> bool:
+        """Return whether a session has received the end of its audio."""
+        return any(chunk.last for chunk in [*self.audio_messages] if chunk.session == session)
+
+    def on_audio(self, chunk: AudioChunk, sender: Peer) -> None:
+        super().on_audio(chunk, sender)
+        if chunk.last:
+            self.faps.send(EndOfFaps(session=chunk.session, epoch=EPOCH))
+
+    def on_tick(self) -> None:
+        now_s = time.monotonic()
+        if now_s >= self._due_s:
+            self._due_s = max(self._due_s + FRAME / 16000, now_s - 0.1)
+            if self.shown is not None:
+                self._publish(self.shown)
+
+    def _publish(self, shown: NDArray[np.float32]) -> None:
+        self._sequence += 1
+        stamp: dict[str, Any] = {
+            "session": self._session,
+            "epoch": EPOCH,
+            "sequence": self._sequence,
+        }
+        pcm = self._sound().tobytes()
+        self.phones.send(Sound(**stamp, media_time=self._media_time, pcm=pcm))
+        self._media_time += FRAME
+        frame_time = self._media_time - self.look_ahead_ms * 16
+        if frame_time >= 0:
+            if self.flash is not None:
+                shown = (self.flash if frame_time % CLICK_EVERY < CLICK_EVERY / 2 else shown).copy()
+                shown[FAP_NUMBER["head_yaw"] - 1] = frame_time % 16000  # all pictures differ
+            values = shown.astype("<f4").tobytes()
+            self.faps.send(
+                FapFrame(**stamp, media_time=frame_time, values=values, mask=bytes(MASK_BYTES))
+            )
+        if self._sequence % 10 == 0:
+            self.phones.send(
+                Phone(
+                    **stamp,
+                    media_time=self._media_time,
+                    index=self._sequence // 10,
+                    symbol=self._symbol,
+                    duration=3200,
+                    confidence=0.9,
+                    final=True,
+                )
+            )
+
+    def _sound(self) -> NDArray[np.int16]:
+        """Return the next samples of a tone, or of a click in the middle of a flash."""
+        times = self._media_time + np.arange(FRAME)
+        if self.flash is not None:
+            sound = np.where((times + FRAME // 2) % CLICK_EVERY == 0, 20000.0, 0.0)
+        else:
+            sound = 3000 * np.sin(2 * np.pi * 200 / 16000 * times)
+        return sound.astype(np.int16)
