@@ -12,7 +12,8 @@ lips, phones also decide where the lips do not close. In the live chain, they ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +24,10 @@ from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.offline import decode_offline
 from kouxing.services.recognizer.speech_scorer import (
+    ScoreEvent,
     SpeechEnd,
     SpeechStart,
+    WithProgress,
     frame_time_s,
     score_recording,
 )
@@ -61,6 +64,7 @@ def analyze_recording(
     samples: NDArray[np.float32],
     lip_predictor: LipFrameModel | None = None,
     aligned: Sequence[Phone] | None = None,
+    with_progress: WithProgress = iter,
 ) -> AnalyzedRecording:
     """Find the phones, lip frames, voice activity and levels of a recording.
 
@@ -74,36 +78,56 @@ def analyze_recording(
         The network that predicts learnt lips, if it fits the acoustic model.
     aligned
         The phones of the known text; None: phones are recognized.
+    with_progress
+        Shows the progress.
     """
-    silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)  # the delay of the face
-    padded = np.concatenate([samples, silence])
     lip_stream = None
     if lip_predictor is not None:
         lip_stream = lip_predictor.create_stream(lip_predictor.delays_s[-1:])
-    events = score_recording(model, padded, MEDIA_RATE_HZ, lip_stream)
-    phones = decode_offline(model, events) if aligned is None else aligned
+    lip_positions: list[LipPositions] = []
+    changes: list[SpeechChange] = []
+
+    def scores() -> Iterator[ScoreEvent]:
+        """Yield the events for decoding, and collect the others."""
+        for event in score_recording(
+            model,
+            samples,
+            MEDIA_RATE_HZ,
+            lip_stream,
+            silence_s=MAX_DELAY_S,
+            with_progress=with_progress,
+        ):
+            if isinstance(event, LipPositions):
+                if event.time_s >= 0.0:
+                    lip_positions.append(event)
+                continue
+            if isinstance(event, SpeechStart | SpeechEnd):
+                is_start = isinstance(event, SpeechStart)
+                changes.append(SpeechChange(active=is_start, time_s=frame_time_s(event.frame)))
+            yield event
+
+    if aligned is None:
+        phones = decode_offline(model, scores())
+    else:
+        phones = [replace(phone, confidence=1.0) for phone in aligned]
+        deque(scores(), maxlen=0)
     return AnalyzedRecording(
         duration_s=len(samples) / MEDIA_RATE_HZ,
-        events=[
-            *(phone if aligned is None else replace(phone, confidence=1.0) for phone in phones),
-            *(event for event in events if isinstance(event, LipPositions) and event.time_s >= 0.0),
-            *(
-                SpeechChange(
-                    active=isinstance(event, SpeechStart), time_s=frame_time_s(event.frame)
-                )
-                for event in events
-                if isinstance(event, SpeechStart | SpeechEnd)
-            ),
-            *progress_of(padded),
-        ],
+        events=[*phones, *lip_positions, *changes, *progress_of(samples, MAX_DELAY_S)],
         is_text_known=aligned is not None,
     )
 
 
 def animate_recording(
-    recording: AnalyzedRecording, lip_model: LipModel, config: SynthesizerConfig
+    recording: AnalyzedRecording,
+    lip_model: LipModel,
+    config: SynthesizerConfig,
+    with_progress: WithProgress = iter,
 ) -> list[Frame]:
-    """Return all frames of a recording, until the face is at rest. ``delay_ms`` is ignored."""
+    """Return all frames of a recording, until the face is at rest. ``delay_ms`` is ignored.
+
+    ``with_progress`` shows the progress.
+    """
     if isinstance(lip_model, LearntLips):
         lip_model = replace(
             lip_model, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED
@@ -118,7 +142,7 @@ def animate_recording(
     end = EndOfSound(time_s=recording.duration_s + MAX_DELAY_S)
     frames = [
         frame
-        for event in [*sorted(recording.events, key=_time_of), end]
+        for event in with_progress([*sorted(recording.events, key=_time_of), end])
         for frame in face.process(event)
     ]
     return [frame for frame in frames if frame[0] <= recording.duration_s + REST_S]

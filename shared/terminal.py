@@ -6,12 +6,15 @@ import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from kouxing.shared.errors import UserError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 CONSOLE = Console(stderr=True)
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the results here.")]
@@ -20,6 +23,13 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the re
 def print_message(text: str) -> None:
     """Print a message to standard error. Standard output is for results."""
     CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def open_progress() -> Progress:
+    """Return progress bars for a terminal. They disappear when they are done."""
+    from rich.progress import Progress  # noqa: PLC0415 (few commands need it)
+
+    return Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive)
 
 
 def command_name() -> str:

@@ -141,7 +141,7 @@ def _recognize(
     model: AcousticModel, samples: Samples, rule: OutputRuleConfig
 ) -> dict[str, list[str]]:
     """Return the phones of a recording in each of ``_OUTPUTS``."""
-    scores = score_recording(model, samples, SAMPLE_RATE_HZ)
+    scores = list(score_recording(model, samples, SAMPLE_RATE_HZ))
     events = LiveDecoder(model.topology, rule).decode(scores)
     outputs = {
         "offline": decode_offline(model, scores),

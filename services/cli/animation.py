@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +82,15 @@ def animate(
 
     Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """
+    reading = progress.add_task("reading", total=None)
     model = load_live_model()
     predictor = _load_lip_predictor(model, mouth)
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
     settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
     models = [load_lip_model(name=name) for name in lip_models]
+    transcript = None if text is None else read_text(text, model.inventory)
     samples = read_mono_16k(source, track)
+    progress.remove_task(reading)
     events: Sequence[SoundEvent]
     if live:
         chains = [
@@ -96,11 +100,20 @@ def animate(
         faces = [_stream(chain, samples, progress) for chain in chains]
         events = chains[-1].events
     else:
-        progress.add_task("recognizing", total=None)
-        phones = None if text is None else _align(model, samples, source, text)
-        recording = analyze_recording(model, samples, predictor, phones)
+        phones = None
+        if transcript is not None:
+            with_progress = partial(progress.track, description="aligning")
+            alignment = align_syllables(
+                model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress
+            )
+            if not alignment.fits:
+                print_message(mismatch_message(source, alignment))
+            phones = alignment.phones
+        with_progress = partial(progress.track, description="recognizing")
+        recording = analyze_recording(model, samples, predictor, phones, with_progress)
+        with_progress = partial(progress.track, description="animating")
         faces = [
-            animate_recording(recording, lip_model, config)
+            animate_recording(recording, lip_model, config, with_progress)
             for lip_model, config in zip(models, settings, strict=True)
         ]
         events = recording.events
@@ -119,17 +132,6 @@ def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) 
     for start in progress.track(range(0, len(samples), MEDIA_RATE_HZ), description="recognizing"):
         frames += chain.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
     return frames + chain.input_finished()
-
-
-def _align(
-    model: AcousticModel, samples: NDArray[np.float32], source: Path, text: str
-) -> list[Phone]:
-    """Return the phones of a text with their times."""
-    transcript = read_text(text, model.inventory)
-    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
-    if not alignment.fits:
-        print_message(mismatch_message(source, alignment))
-    return alignment.phones
 
 
 def _load_lip_predictor(model: AcousticModel, mouth: Path | None) -> LipPredictor | None:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import Progress
 
 from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import Timing
@@ -23,6 +23,7 @@ from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
 from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
@@ -32,14 +33,20 @@ from kouxing.services.synthesizer.lips.ferguson.key_frames import (
     key_frames_of,
 )
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
-from kouxing.services.synthesizer.lips.ferguson.timing import time_text
+from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.terminal import CONSOLE, check_output, print_message, write_error, write_text
+from kouxing.shared.terminal import (
+    check_output,
+    open_progress,
+    print_message,
+    write_error,
+    write_text,
+)
 
 Span = tuple[float, float, str]  # start and end in seconds, and the label
 
@@ -104,8 +111,9 @@ def draw_mouth(
         text = SherpaTranscriber(speech_to_text).transcribe(samples) or None
         print_message(f"{source}: {text or 'no words were recognized'}")
     transcript = None if text is None else read_text(text, inventory)
-    with CONSOLE.status(f"timing {len(samples) / MEDIA_RATE_HZ:.0f} s"):
-        timed = _time_phones(source, samples, transcript, timing or Timing.ENDPOINTS)
+    with open_progress() as progress:
+        with_progress = partial(progress.track, description="timing")
+        timed = _time_phones(source, samples, transcript, timing, with_progress)
     phones = spoken(timed, inventory)
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
@@ -122,14 +130,21 @@ def draw_mouth(
 
 
 def _time_phones(
-    source: Path, samples: NDArray[np.float32], transcript: Transcript | None, timing: Timing
+    source: Path,
+    samples: NDArray[np.float32],
+    transcript: Transcript | None,
+    timing: Timing | None,
+    with_progress: WithProgress,
 ) -> list[Phone]:
+    if transcript is not None and timing is None:
+        is_long = len(transcript.syllables) > MAX_SYLLABLES
+        timing = Timing.ALIGN if is_long else Timing.ENDPOINTS
     if transcript is not None and timing is Timing.ENDPOINTS:
         return time_text(progress_of(samples), transcript.phones, load_table(load_inventory()))
     model = load_live_model()
     if transcript is None:
-        return recognize(model, samples, MEDIA_RATE_HZ)
-    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
+        return recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     if not alignment.fits:
         print_message(mismatch_message(source, alignment))
     return alignment.phones
@@ -212,7 +227,7 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
     frames = list(zip(times_s.tolist(), openings.tolist(), strict=True))
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
-        Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive) as progress,
+        open_progress() as progress,
     ):
         writer.write_sound(mouth.samples)
         for time_s, opening in progress.track(frames, description="drawing"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +21,7 @@ from kouxing.services.cli.options import (
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
-from kouxing.shared.terminal import CONSOLE, print_message, write_output
+from kouxing.shared.terminal import open_progress, print_message, write_output
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
 Acoustic = Annotated[
@@ -116,8 +117,6 @@ def render(
     ] = None,
 ) -> None:
     """Make a video, pictures or curves from sound, or from curves."""
-    from rich.progress import Progress
-
     from kouxing.services.cli.animation import animate, has_motion, read_motion
     from kouxing.services.cli.exporters import open_exporter
 
@@ -138,7 +137,7 @@ def render(
         yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,
     )  # fmt: skip
     exporter = open_exporter(output, options)
-    with Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive) as progress:
+    with open_progress() as progress:
         if has_motion(source):
             motion = read_motion(source, sound)
         else:
@@ -182,8 +181,10 @@ def phones(
     style = _format(form, output)
     samples = read_mono_16k(audio, track)
     duration_s = len(samples) / MEDIA_RATE_HZ
-    with CONSOLE.status(f"recognizing {duration_s:.0f} s"):
-        recognized = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
+    model = load_model(model_path(acoustic))
+    with open_progress() as progress:
+        with_progress = partial(progress.track, description="recognizing")
+        recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
     if not recognized:
         print_message(f"{audio}: no speech was found")
     write_output(format_phones(recognized, style, duration_s), output)
@@ -208,10 +209,12 @@ def align(
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
-    samples = read_mono_16k(audio, track)
     model = load_model(model_path(acoustic))
     transcript = read_text(text, model.inventory)
-    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
+    samples = read_mono_16k(audio, track)
+    with open_progress() as progress:
+        with_progress = partial(progress.track, description="aligning")
+        alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     duration_s = len(samples) / MEDIA_RATE_HZ
     syllables = timed_syllables(alignment.phones, transcript, model.inventory)
     write_output(format_phones(alignment.phones, style, duration_s, syllables), output)

@@ -16,16 +16,16 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
-from kouxing.services.recognizer.front_end.features import HOP_S
-from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats, Topology
+from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, frames_in
+from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
     segments_of_path,
     utterance_graph,
     viterbi_path,
 )
-from kouxing.services.recognizer.speech_scorer import frame_time_s
+from kouxing.services.recognizer.speech_scorer import WithProgress, frame_time_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
@@ -33,6 +33,7 @@ from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
 # Calibrated with the block model on dev sentences and conversation; see docs/recognition.md.
 MIN_FIT = 0.85
+_FIT_FRAMES = 10_000  # to compare at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +81,10 @@ def align_syllables(
     samples: NDArray[np.float32],
     sample_rate_hz: int,
     syllables: Sequence[Syllable],
+    with_progress: WithProgress = iter,
 ) -> Alignment:
-    """Like :func:`align_phones`, with the fit."""
+    """Like :func:`align_phones`, with the fit. ``with_progress`` shows the progress."""
     inventory, topology = model.inventory, model.topology
-    frames = model.create_front_end().accept_waveform(to_16_khz(samples, sample_rate_hz))
-    scores = score_segment(model, frames)
     silence = inventory.index[inventory.silence]
     graph = utterance_graph(
         [inventory.index[symbol] for syllable in syllables for symbol in syllable],
@@ -92,21 +92,20 @@ def align_syllables(
         topology.first_state,
         silence=silence,
     )
-    path = np.empty(0, dtype=np.int64)
-    if len(scores):
-        on_graph = scores[:, graph.states]
-        path, _ = viterbi_path(on_graph, graph, topology.log_stay, topology.log_leave)
-    if len(path) == 0:
+    num_frames = frames_in(-(-len(samples) * SAMPLE_RATE_HZ // sample_rate_hz))
+    if num_frames < graph.num_needed[0]:
         raise UserError(
-            f"{len(frames) * HOP_S:.2f} s of audio is too short for "
+            f"{num_frames * HOP_S:.2f} s of audio is too short for "
             f"{sum(map(len, syllables))} phones; check that the text matches the recording"
         )
-    best_of_phones = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
+    scores = _score_recording(model, samples, sample_rate_hz, num_frames, with_progress)
+    path, _ = viterbi_path(scores, graph.states, graph, topology.log_stay, topology.log_leave)
     phones: list[Phone] = []
     for segment in segments_of_path(path, graph):
         onset_s = frame_time_s(segment.start)
         # posterior of the phone, if one phone fills these frames
-        evidence = best_of_phones[segment.start : segment.end].sum(axis=0, dtype=np.float64)
+        best_of_phones = _best_of_phones(scores[segment.start : segment.end], topology)
+        evidence = best_of_phones.sum(axis=0, dtype=np.float64)
         likelihood = np.exp(evidence - evidence.max())
         phones.append(
             Phone(
@@ -118,28 +117,65 @@ def align_syllables(
                 final=True,
             )
         )
-    return Alignment(phones, _fit(path, graph, scores, best_of_phones, silence))
+    return Alignment(phones, _fit(graph, path, scores, topology, silence))
+
+
+def _score_recording(
+    model: AcousticModel,
+    samples: NDArray[np.float32],
+    sample_rate_hz: int,
+    num_frames: int,
+    with_progress: WithProgress,
+) -> Floats:
+    """Return the scores of all frames, (frames, states), computed second by second."""
+    resampler = Resampler(sample_rate_hz, 1 if samples.ndim == 1 else samples.shape[1])
+    front_end, stream = model.create_front_end(), model.create_stream()
+    scores = np.empty((num_frames, model.topology.num_states), np.float32)
+    num_scored = 0
+
+    def append(rows: Floats) -> None:
+        nonlocal num_scored
+        scores[num_scored : num_scored + len(rows)] = rows
+        num_scored += len(rows)
+
+    for start in with_progress(range(0, len(samples), sample_rate_hz)):
+        piece = resampler.accept_waveform(samples[start : start + sample_rate_hz])
+        append(stream.score(front_end.accept_waveform(piece)))
+    append(stream.score(front_end.accept_waveform(resampler.finish())))
+    append(stream.score(None))
+    return scores[:num_scored]
+
+
+def _best_of_phones(scores: Floats, topology: Topology) -> Floats:
+    """Return the score of each phone's best state, (frames, phones)."""
+    best: Floats = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
+    return best
 
 
 def _fit(
-    path: NDArray[np.int64],
     graph: UtteranceGraph,
-    scores: NDArray[np.float32],
-    best_of_phones: NDArray[np.float32],
+    path: NDArray[np.int64],
+    scores: Floats,
+    topology: Topology,
     silence: int,
 ) -> float:
-    """Compare a path's states with the best phone of each frame, (frames, phones).
+    """Compare a path's states with the best phone of each frame.
 
     Frames that are silent in the path and in the audio are excluded, so that pauses do not count.
     """
-    lost = best_of_phones.max(axis=1) - scores[np.arange(len(path)), graph.states[path]]
-    lost_on_average = best_of_phones.max(axis=1) - best_of_phones.mean(axis=1)
-    is_silent = (graph.phones[graph.phone_number[path]] == silence) & (
-        best_of_phones.argmax(axis=1) == silence
-    )
-    if is_silent.all():
-        return 0.0
-    return 1.0 - float(lost[~is_silent].sum() / lost_on_average[~is_silent].sum())
+    losses = []
+    for first in range(0, len(path), _FIT_FRAMES):
+        rows, nodes = scores[first : first + _FIT_FRAMES], path[first : first + _FIT_FRAMES]
+        best_of_phones = _best_of_phones(rows, topology)
+        best = best_of_phones.max(axis=1)
+        lost = best - rows[np.arange(len(nodes)), graph.states[nodes]]
+        lost_on_average = best - best_of_phones.mean(axis=1)
+        is_silent = (graph.phones[graph.phone_number[nodes]] == silence) & (
+            best_of_phones.argmax(axis=1) == silence
+        )
+        losses.append(np.stack([lost, lost_on_average])[:, ~is_silent])
+    lost, lost_on_average = np.concatenate(losses, axis=1)
+    return 1.0 - float(lost.sum() / lost_on_average.sum()) if len(lost) else 0.0
 
 
 def spoken(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Phone]:

@@ -16,15 +16,23 @@ from kouxing.services.recognizer.speech_scorer import (
     ScoreEvent,
     SpeechEnd,
     SpeechStart,
+    WithProgress,
     frame_time_s,
     score_recording,
 )
 from kouxing.shared.phones.events import Phone
 
 
-def recognize(model: AcousticModel, samples: Floats, sample_rate_hz: int) -> list[Phone]:
-    """Recognize the phones of a recording, (n,) or (n, channels), and silence within speech."""
-    return decode_offline(model, score_recording(model, samples, sample_rate_hz))
+def recognize(
+    model: AcousticModel, samples: Floats, sample_rate_hz: int, with_progress: WithProgress = iter
+) -> list[Phone]:
+    """Recognize the phones of a recording, (n,) or (n, channels), and silence within speech.
+
+    ``with_progress`` shows the progress.
+    """
+    return decode_offline(
+        model, score_recording(model, samples, sample_rate_hz, with_progress=with_progress)
+    )
 
 
 def decode_offline(model: AcousticModel, events: Iterable[ScoreEvent]) -> list[Phone]:

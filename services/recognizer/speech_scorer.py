@@ -10,16 +10,16 @@ every step processes whole frames and whole VAD blocks, in order.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats, Work
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
-from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.shared.phones.events import EndOfSound, LipPositions, Progress, Waveform
@@ -54,6 +54,7 @@ class FrameScores:
     provisional: Floats  # (k, states) of the frames after those, until the next FrameScores
 
 
+WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, or a progress bar
 ScoreEvent: TypeAlias = (
     SpeechStart | SpeechEnd | FrameScores | LipPositions | Progress | EndOfSound | Waveform
 )
@@ -223,10 +224,36 @@ def score_recording(
     samples: Floats,
     sample_rate_hz: int,
     lip_stream: LipFrameStream | None = None,
-) -> list[ScoreEvent]:
-    """Score a whole recording, shape (n,) or (n, channels)."""
+    *,
+    silence_s: float = 0.0,
+    with_progress: WithProgress = iter,
+) -> Iterator[ScoreEvent]:
+    """Score a whole recording, second by second.
+
+    Parameters
+    ----------
+    model, lip_stream
+        As for :class:`SpeechScorer`.
+    samples
+        The recording, shape (n,) or (n, channels).
+    sample_rate_hz
+        Sample rate of the recording.
+    silence_s
+        Duration of the silence to append.
+    with_progress
+        Shows the progress.
+    """
     scorer = SpeechScorer(model, lip_stream)
-    scorer.accept_waveform(to_16_khz(samples, sample_rate_hz))
+    resampler = Resampler(sample_rate_hz, 1 if samples.ndim == 1 else samples.shape[1])
+
+    def score(more: Floats) -> list[ScoreEvent]:
+        scorer.accept_waveform(more)
+        score_streams(model, [scorer])
+        return scorer.get_events()
+
+    for start in with_progress(range(0, len(samples), sample_rate_hz)):
+        yield from score(resampler.accept_waveform(samples[start : start + sample_rate_hz]))
+    yield from score(resampler.finish())
+    yield from score(np.zeros(round(silence_s * SAMPLE_RATE_HZ), np.float32))
     scorer.input_finished()
-    score_streams(model, [scorer])
-    return scorer.get_events()
+    yield from score(np.zeros(0, np.float32))

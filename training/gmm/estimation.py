@@ -159,8 +159,10 @@ class FrameSet:
             start, end = int(self.bounds[number]), int(self.bounds[number + 1])
             present, position = np.unique(graph.states, return_inverse=True)
             chosen = np.ascontiguousarray(matrix[:, present]).reshape(len(matrix), -1)
-            scores = mixture_scores(self.features[start:end], chosen, num_mixtures)[:, position]
-            path, log_likelihood = viterbi_path(scores, graph, hmm.log_stay, hmm.log_leave)
+            scores = mixture_scores(self.features[start:end], chosen, num_mixtures)
+            path, log_likelihood = viterbi_path(
+                scores, position, graph, hmm.log_stay, hmm.log_leave
+            )
             self.paths[number] = path
             if len(path) == 0:
                 self.states[start:end] = -1

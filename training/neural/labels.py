@@ -155,7 +155,7 @@ def _align_all(
         graph = utterance_graph(
             example.phones, example.syllables, topology.first_state, silence=silence
         )
-        path, _ = viterbi_path(rows[:, graph.states], graph, topology.log_stay, topology.log_leave)
+        path, _ = viterbi_path(rows, graph.states, graph, topology.log_stay, topology.log_leave)
         if len(path):
             on_path = graph.states[path]
             states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
-from kouxing.shared.clock import to_seconds
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
@@ -87,10 +87,20 @@ def progress_at(media_time: int, newest: NDArray[np.float32], pitch: PitchTracke
     )
 
 
-def progress_of(samples: NDArray[np.float32]) -> list[Progress]:
-    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does."""
+def progress_of(samples: NDArray[np.float32], silence_s: float = 0.0) -> list[Progress]:
+    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does.
+
+    A silence of ``silence_s`` follows the recording.
+    """
     pitch = PitchTracker()
+    num_samples = len(samples) + round(silence_s * MEDIA_RATE_HZ)
     return [
-        progress_at(end, samples[end - SLICE : end], pitch)
-        for end in range(SLICE, len(samples) + 1, SLICE)
+        progress_at(end, _extended(samples[end - SLICE : end]), pitch)
+        for end in range(SLICE, num_samples + 1, SLICE)
     ]
+
+
+def _extended(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return samples, (n,), with silence up to the length of a slice."""
+    num_missing = SLICE - len(samples)
+    return np.pad(samples, (0, num_missing)) if num_missing else samples

@@ -5,14 +5,26 @@ Source: the HTK book (Young et al. 2009), chapter 8; used in Li et al. 2011, sec
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.search.decoder import Segment
+
+# scores of its frames, and columns, stay, leave and skip of its nodes
+_Block: TypeAlias = tuple[
+    NDArray[np.float32],
+    NDArray[np.int64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]
+MAX_BAND = 2**15  # nodes: 14 minutes of fluent speech
 
 
 @dataclass(slots=True, kw_only=True)
@@ -24,6 +36,12 @@ class UtteranceGraph:
     phone_number: NDArray[np.int64]  # (nodes,) running number of the phone, pauses included
     phones: NDArray[np.int64]  # (running numbers,) indices into the inventory's phones
     num_last: int  # number of nodes of the last pause, which is optional too
+
+    @property
+    def num_needed(self) -> NDArray[np.int64]:
+        """Number of frames from each node to the end of the last phone, (nodes,)."""
+        is_phone = self.phones[self.phone_number] != self.phones[0]
+        return np.cumsum(is_phone[::-1])[::-1]
 
 
 def utterance_graph(
@@ -71,67 +89,152 @@ def utterance_graph(
 
 def viterbi_path(
     scores: NDArray[np.float32],
+    columns: NDArray[np.int64],
     graph: UtteranceGraph,
     log_stay: NDArray[np.float32],
     log_leave: NDArray[np.float32],
 ) -> tuple[NDArray[np.int64], float]:
-    """Find the best path through a graph, given the scores of its nodes, (frames, nodes).
+    """Find the best path through a graph.
 
-    ``log_stay`` and ``log_leave`` are those of ``Topology``. Returns the node of every frame,
-    (frames,), and the path's log-likelihood. With too few frames: nothing and minus infinity.
+    Parameters
+    ----------
+    scores
+        Scores of the frames, shape (frames, columns).
+    columns
+        Column with the scores of each node, shape (nodes,).
+    graph
+        The utterance.
+    log_stay, log_leave
+        Those of ``Topology``.
+
+    Returns
+    -------
+    tuple
+        The node of every frame, (frames,), and the path's log-likelihood. With too few frames:
+        nothing and minus infinity.
+
+    Memory grows with the square root of the number of frames: only some rows of scores are kept,
+    and each block between two of them is computed again to trace the path (Hirschberg 1975). A
+    graph of more than ``MAX_BAND`` nodes is searched in a band around the best node.
     """
-    path, log_likelihood = _viterbi(
-        scores,
-        graph.skip_from,
-        log_stay[graph.states],
-        log_leave[graph.states],
-        graph.num_last,
-        int((graph.phone_number == 0).sum()),
-    )
-    return path, float(log_likelihood)
+    num_frames, num_nodes = len(scores), len(graph.states)
+    num_needed = graph.num_needed
+    if num_frames < num_needed[0]:
+        return np.empty(0, dtype=np.int64), -np.inf
+    stay = log_stay[graph.states].astype(np.float64)
+    leave = log_leave[graph.states].astype(np.float64)
+    skip = np.where(graph.skip_from >= 0, leave[graph.skip_from], -np.inf)
+    num_skipped = graph.num_last + 1
+    width = min(num_nodes, MAX_BAND)
+    first = np.full(width, -np.inf)
+    num_first = int((graph.phone_number == 0).sum())
+    for node in (0, num_first):  # the first pause is optional
+        first[node] = scores[0, columns[node]]
+    step = math.isqrt(num_frames) + 1
+    starts = range(0, num_frames - 1, step)  # the frame before each block
 
+    def block_of(start: int, low: int, end: int) -> _Block:
+        """Return the inputs of a block for the nodes from ``low`` to ``end``."""
+        band = slice(low, end)
+        block = scores[start + 1 : start + 1 + step]
+        return block, columns[band], stay[band], leave[band], skip[band]
 
-@numba.njit(cache=True)
-def _viterbi(
-    scores: NDArray[np.float32],
-    skip_from: NDArray[np.int64],
-    stay: NDArray[np.float32],
-    leave: NDArray[np.float32],
-    num_last: int,
-    num_first: int,
-) -> tuple[NDArray[np.int64], float]:
-    num_frames, num_nodes = scores.shape
-    score = np.full(num_nodes, -np.inf)
-    back = np.zeros((num_frames, num_nodes), dtype=np.int32)
-    score[0] = scores[0, 0]
-    score[num_first] = scores[0, num_first]  # the first pause is optional
-    for frame in range(1, num_frames):
-        for node in range(num_nodes - 1, -1, -1):
-            best, origin = score[node] + stay[node], node
-            if node > 0:
-                value = score[node - 1] + leave[node - 1]
-                if value > best:
-                    best, origin = value, node - 1
-            before = skip_from[node]
-            if before >= 0:
-                value = score[before] + leave[before]
-                if value > best:
-                    best, origin = value, before
-            score[node] = best + scores[frame, node]
-            back[frame, node] = origin
+    rows, lows = [first], [0]
+    for start in starts:
+        low = lows[-1]
+        row = _advance(rows[-1], *block_of(start, low, low + width), num_skipped)
+        num_left = num_frames - 1 - min(start + step, num_frames - 1)
+        needed = int(np.searchsorted(-num_needed, -num_left))  # smaller nodes miss the end
+        center = max(low + int(row.argmax()), needed)
+        lows.append(max(low, min(center - width // 2, num_nodes - width)))
+        rows.append(np.full(width, -np.inf))
+        rows[-1][: width - (lows[-1] - low)] = row[lows[-1] - low :]
     # The last pause is optional too.
-    node = num_nodes - 1
-    before = num_nodes - num_last - 1
-    if score[before] + leave[before] > score[node] + leave[node]:
-        node = before
-    total = score[node] + leave[node]
+    ends = np.array([num_nodes - 1, num_nodes - 1 - graph.num_last])
+    totals = rows[-1][ends - lows[-1]] + leave[ends]
     path = np.zeros(num_frames, dtype=np.int64)
-    if total == -np.inf:
-        return path[:0], total
-    for frame in range(num_frames - 1, -1, -1):
-        path[frame] = node
-        node = back[frame, node]
-    return path, total
+    path[-1] = ends[totals.argmax()]
+    if totals.max() == -np.inf:
+        return path[:0], -np.inf
+    for start, row, low in zip(starts[::-1], rows[-2::-1], lows[-2::-1], strict=True):
+        piece = path[start : start + step + 1]
+        end = int(piece[-1]) + 1
+        first_node = max(low, end - step * num_skipped)  # the path cannot come from before
+        inputs = block_of(start, first_node, end)
+        back = _origins(row[first_node - low : end - low], *inputs, num_skipped)
+        _trace(back, first_node, num_skipped, piece)
+    return path, float(totals.max())
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _advance(
+    row: NDArray[np.float64],
+    scores: NDArray[np.float32],
+    columns: NDArray[np.int64],
+    stay: NDArray[np.float64],
+    leave: NDArray[np.float64],
+    skip: NDArray[np.float64],
+    num_skipped: int,
+) -> NDArray[np.float64]:
+    """Return the row after a block, (nodes,), given the row before it."""
+    num_nodes = len(row)
+    # nodes that do not exist, before the first one
+    old = np.full(num_nodes + num_skipped, -np.inf)
+    new = old.copy()
+    old[num_skipped:] = row
+    leave_before = np.full(num_nodes, 0.0)
+    leave_before[1:] = leave[:-1]
+    for frame in range(len(scores)):
+        of_frame = scores[frame]
+        for node in range(num_nodes):
+            best = old[node + num_skipped] + stay[node]
+            best = max(best, old[node + num_skipped - 1] + leave_before[node])
+            best = max(best, old[node] + skip[node])
+            new[node + num_skipped] = best + of_frame[columns[node]]
+        old, new = new, old
+    return old[num_skipped:].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _origins(
+    row: NDArray[np.float64],
+    scores: NDArray[np.float32],
+    columns: NDArray[np.int64],
+    stay: NDArray[np.float64],
+    leave: NDArray[np.float64],
+    skip: NDArray[np.float64],
+    num_skipped: int,
+) -> NDArray[np.int8]:
+    """Return where the best path to each node of a block comes from, (frames, nodes).
+
+    0: the node itself, 1: the node before it, 2: the node before the pause.
+    """
+    origins = np.zeros((len(scores), len(row)), dtype=np.int8)
+    old, new = row.copy(), np.empty_like(row)
+    for frame in range(len(scores)):
+        for node in range(len(row)):
+            best = old[node] + stay[node]
+            if node > 0:
+                value = old[node - 1] + leave[node - 1]
+                if value > best:
+                    best = value
+                    origins[frame, node] = 1
+            if node >= num_skipped:
+                value = old[node - num_skipped] + skip[node]
+                if value > best:
+                    best = value
+                    origins[frame, node] = 2
+            new[node] = best + scores[frame, columns[node]]
+        old, new = new, old
+    return origins
+
+
+@numba.njit(cache=True, nogil=True)
+def _trace(back: NDArray[np.int8], low: int, num_skipped: int, path: NDArray[np.int64]) -> None:
+    """Fill a block of the path, (frames + 1,), from its last node."""
+    for frame in range(len(path) - 1, 0, -1):
+        origin = back[frame - 1, path[frame] - low]
+        path[frame - 1] = path[frame] - (0, 1, num_skipped)[origin]
 
 
 def segments_of_path(path: NDArray[np.int64], graph: UtteranceGraph) -> list[Segment]:

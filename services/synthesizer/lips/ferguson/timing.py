@@ -55,7 +55,8 @@ def time_text(
         raise UserError("the text is empty; give the spoken words")
     if len(syllables) > MAX_SYLLABLES:
         raise UserError(
-            f"the text has {len(syllables)} syllables; give at most {MAX_SYLLABLES} at once"
+            f"the text has {len(syllables)} syllables, of at most {MAX_SYLLABLES}; use forced"
+            " alignment (--timing align)"
         )
     phones: list[Phone] = []
     for syllable, (start_s, end_s) in zip(
