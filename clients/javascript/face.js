@@ -5,7 +5,7 @@ import { DrawRate, ImageQueue, drawsInSoftware } from "./page/draw-rate.js";
 import { Player } from "./page/player.js";
 import { FapTrack } from "./page/playout.js";
 import { Sound } from "./page/sound.js";
-import { loadAvatar } from "./avatar.js";
+import { loadPuppet } from "./puppet.js";
 import { readRecording } from "./recording.js";
 import { chooseSet } from "./shape-names.js";
 import { Viewer } from "./viewer.js";
@@ -128,7 +128,7 @@ export class KouxingFace extends HTMLElement {
     this.#avatar = null;
     if (!url) return;
     try {
-      const avatar = await loadAvatar(url);
+      const avatar = await loadPuppet(url);
       if (loadId !== this.#loadId) return; // another load has started
       this.#avatar = avatar;
     } catch (error) {

@@ -26,11 +26,11 @@ import { readFileSync } from "node:fs";
 globalThis.self = globalThis;
 globalThis.ProgressEvent = Event;
 console.warn = console.error = () => {};
-const { loadAvatar } = await import("./avatar.js");
+const { loadPuppet } = await import("./puppet.js");
 for (const file of process.argv.slice(2)) {
   try {
     const url = "data:;base64," + readFileSync(file).toString("base64");
-    const { set, view } = await loadAvatar(url);
+    const { set, view } = await loadPuppet(url);
     console.log(JSON.stringify({ set, target: view.target.toArray(), height: view.height }));
   } catch (error) {
     console.log(JSON.stringify({ error: error.message.replace(/^data:[^:]*: /, "") }));

@@ -22,7 +22,7 @@ const VRM_FACE_M = 0.24;
  *   pose(values, names), update(seconds), view: { target, height } of the face, meters }; it is
  *   rejected if the model cannot be read or cannot speak
  */
-export async function loadAvatar(url) {
+export async function loadPuppet(url) {
   try {
     return await readAvatar(url);
   } catch (error) {
