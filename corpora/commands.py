@@ -12,7 +12,14 @@ from rich.table import Table
 
 from kouxing.services.cli.options import AudioTrack
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from kouxing.shared.terminal import (
+    CONSOLE,
+    Force,
+    JsonFile,
+    check_output,
+    print_message,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from kouxing.services.mouth_profiles.learning import FilmedSpeech
@@ -29,12 +36,13 @@ def adapt(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Mouth profile to write.")],
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Learn a speaker's mouth profile from tracked lips, for the option --mouth."""
     from kouxing.services.mouth_profiles.learning import learn_mouth_profile
     from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 
-    check_output(output, json_file)
+    check_output(output, json_file, inputs=sources, force=force)
     learned = learn_mouth_profile([_read(source) for source in sources])
     output.write_bytes(learned.content)
     table = Table("correlation with the tracked lips", "without the profile", "with it")
@@ -70,11 +78,13 @@ def track(
         Path, typer.Option("--output", "-o", help="Clip to write: .flac, .csv and .json.")
     ],
     audio_track: AudioTrack = None,
+    force: Force = False,
 ) -> None:
     """Track the lips in a video, for kouxing adapt."""
     from kouxing.corpora.lip_tracking import track_video
 
-    check_output(*(output.with_suffix(suffix) for suffix in (".flac", ".csv", ".json")))
+    outputs = [output.with_suffix(suffix) for suffix in (".flac", ".csv", ".json")]
+    check_output(*outputs, inputs=[video], force=force)
     with CONSOLE.status(f"tracking {video}"):
         num_tracked, num_images = track_video(video, output, audio_track)
     print_message(

@@ -11,7 +11,14 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from kouxing.shared.terminal import (
+    CONSOLE,
+    Force,
+    JsonFile,
+    check_output,
+    print_message,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -61,12 +68,13 @@ def recognizer(
     look_ahead: LookAhead = None,
     curve: Annotated[Path | None, typer.Option(help="Plot errors against delay (.png).")] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Compare phone and viseme errors and delays of acoustic models."""
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
     from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
 
-    check_output(curve, json_file)
+    check_output(curve, json_file, force=force)
     results = {
         title: {
             "acoustic": name,
@@ -91,11 +99,12 @@ def robustness(
         Path | None, typer.Option(help="Folder of recordings in another language.")
     ] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Measure errors in disturbed speech, and phones recognized in sounds without speech."""
     from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
 
-    check_output(json_file)
+    check_output(json_file, force=force)
     results = {
         title: evaluate_robustness(
             model, manifest, split, rule, audio=audio, other_language=other_language
@@ -129,6 +138,7 @@ def lips(
         list[str] | None, typer.Option(help="Use only clips named SOURCE_...; repeatable.")
     ] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Compare every lip model with tracked lips, at several delays, on held-out clips.
 
@@ -137,7 +147,7 @@ def lips(
     from kouxing.evaluation.lips.report import print_scores
     from kouxing.evaluation.lips.scores import score_lip_models
 
-    check_output(json_file)
+    check_output(json_file, force=force)
     scores = score_lip_models(clips, parameters, source or ())
     print_scores(scores, Console())
     write_json(json_file, [asdict(score) for score in scores])
@@ -171,6 +181,7 @@ def schemes(
         typer.Option("--sound-at-once", help="Do not delay the sound in videos of live faces."),
     ] = False,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Compare the four schemes of Li et al. 2011: aligned, recognized, live, next phone.
 
@@ -185,7 +196,7 @@ def schemes(
     from kouxing.services.recognizer.acoustic.load import load_live_model
     from kouxing.shared.errors import UserError
 
-    check_output(json_file)
+    check_output(json_file, force=force)
     if manifest and clips:
         raise UserError("use either --manifest or --clips, not both")
     model = load_live_model()
@@ -216,12 +227,13 @@ def ferguson(
         Path | None, typer.Option(help="Plot accuracy against speaking rate (.png).")
     ] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Compare lip models with tracked lips at several speaking rates, as in Zhang et al. 2021."""
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.lips.speaking_rates import print_rates, rates_figure, score_rates
 
-    check_output(picture, json_file)
+    check_output(picture, json_file, force=force)
     scores = score_rates(clips)
     print_rates(scores, Console())
     if picture is not None:
@@ -237,6 +249,7 @@ def visemes(
         Path | None, typer.Option(help="Plot measured and modeled curves (.png).")
     ] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Measure how well the visemes fit held-out lips, as in Wang & Cai 2003."""
     from kouxing.corpora.figures import save_figure
@@ -247,7 +260,7 @@ def visemes(
         viseme_errors,
     )
 
-    check_output(picture, json_file)
+    check_output(picture, json_file, force=force)
     fitted = fit_folder(clips, parameters)
     errors = viseme_errors(fitted)
     print_errors(errors, Console())
@@ -264,11 +277,12 @@ def attacks(
         list[str] | None, typer.Option(help="Name of an attack; repeatable. Default: all.")
     ] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Measure what attackers cost the services (memory) and other clients (delay)."""
     from kouxing.evaluation.system.attacks import measure, show
 
-    check_output(json_file)
+    check_output(json_file, force=force)
     damages = measure(audio, attack or (), CONSOLE)
     show(damages, Console())
     write_json(json_file, [asdict(damage) for damage in damages])
@@ -282,6 +296,7 @@ def faults(
     ] = None,
     logs: Annotated[Path | None, typer.Option(help="Folder for the services' logs.")] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Measure how faults affect a live face: how long it stops, lost frames, and jumps.
 
@@ -294,7 +309,7 @@ def faults(
     """
     from kouxing.evaluation.system.faults import TIMING, measure, show
 
-    check_output(json_file)
+    check_output(json_file, force=force)
     outcomes = list(measure(audio, fault or (), logs, CONSOLE, TIMING))
     show(outcomes, Console())
     write_json(json_file, [asdict(outcome) for outcome in outcomes])
@@ -305,6 +320,7 @@ def chain(
     audio: AudioFile,
     repeats: Annotated[int, typer.Option(min=1, help="Times to stream the file.")] = 3,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Measure latency, CPU time and images per second of the whole chain on this machine.
 
@@ -312,6 +328,7 @@ def chain(
     """
     from kouxing.evaluation.system import chromium, costs, latency, page
 
+    check_output(json_file, force=force)
     delays = latency.measure(audio, repeats, CONSOLE)
     sessions = costs.measure_sessions(audio)
     images = costs.measure_images()
@@ -342,6 +359,7 @@ def load(
     ] = 12.0,
     picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Measure how many live sessions control, a recognizer and a synthesizer can serve here.
 
@@ -350,7 +368,7 @@ def load(
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.system.load import draw, measure, show
 
-    check_output(picture, json_file)
+    check_output(picture, json_file, force=force)
     figures = measure(audio or sorted(SENTENCE.parent.glob("*.wav")), sessions, seconds, CONSOLE)
     show(figures, Console())
     if picture is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 CONSOLE = Console(stderr=True)
+Force = Annotated[bool, typer.Option("--force", help="Overwrite output files that exist.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the results here.")]
 
 
@@ -30,6 +32,11 @@ def open_progress() -> Progress:
     from rich.progress import Progress  # noqa: PLC0415 (few commands need it)
 
     return Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive)
+
+
+def plural(count: int, noun: str) -> str:
+    """Return a count with its noun, such as "1 image" or "2 images"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def command_name() -> str:
@@ -46,6 +53,7 @@ def write_output(text: str, output: Path | None) -> None:
         sys.stdout.write(text)
     else:
         write_text(output, text)
+        print_message(f"wrote {output}")
 
 
 def write_json(path: Path | None, results: object) -> None:
@@ -54,15 +62,25 @@ def write_json(path: Path | None, results: object) -> None:
         write_text(path, json.dumps(results, indent=1, ensure_ascii=False, default=_to_python))
 
 
-def check_output(*paths: Path | None) -> None:
+def check_output(
+    *paths: Path | None, inputs: Iterable[Path | None] = (), force: bool = False
+) -> None:
     """Check that output files can be written. Call this before long work; None is skipped.
 
-    Raises ``UserError`` if a file cannot be written.
+    Asks whether to overwrite a file, unless ``force`` is set. Raises ``UserError`` if a file cannot
+    be written, exists and nobody can be asked, or is also one of the ``inputs``.
     """
+    sources = [source for source in inputs if source is not None and _exists(source)]
     for path in paths:
         if path is None:
             continue
-        is_new = not path.exists()
+        is_new = not _exists(path)
+        if not is_new and any(path.samefile(source) for source in sources):
+            raise UserError(f"{path}: the output is also an input; give the output another name")
+        if path.is_file() and not force:
+            if not (sys.stdin.isatty() and CONSOLE.is_terminal):
+                raise UserError(f"{path} exists; add --force to overwrite it")
+            typer.confirm(f"{path} exists. Overwrite it?", abort=True, err=True)
         try:
             with path.open("a"):
                 pass
@@ -70,6 +88,13 @@ def check_output(*paths: Path | None) -> None:
                 path.unlink()
         except OSError as error:
             raise write_error(path, error) from None
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # it cannot be the name of a file
+        return False
 
 
 def write_text(path: Path, text: str) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.terminal import check_output, print_message
+from kouxing.shared.terminal import Force, check_output, print_message
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
@@ -48,9 +48,9 @@ Untranscribed = Annotated[
 
 
 @contextmanager
-def _neural_training(output: Path) -> Iterator[None]:
+def _neural_training(output: Path, *, force: bool) -> Iterator[None]:
     """Check the output, and explain how to install a missing package."""
-    check_output(output)
+    check_output(output, force=force)
     try:
         yield
     except ModuleNotFoundError as error:
@@ -82,12 +82,13 @@ def phone_lm(
     ] = 1_000_000,
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
+    force: Force = False,
 ) -> None:
     """Train a phone language model on texts."""
     from kouxing.training.phone_lm.open_gram import draw_phones
     from kouxing.training.phone_lm.recipe import train_phone_lm
 
-    check_output(output)
+    check_output(output, force=force)
     if (ngrams is None) != (dictionary is None):
         raise UserError("--ngrams needs --dictionary; give both or neither")
     inventory = load_inventory(language)
@@ -108,11 +109,12 @@ def gmm(
     seed: Seed = 0,
     mixtures: Annotated[int, typer.Option(help="Gaussians per state, a power of two.")] = 32,
     any_license: AnyLicense = False,
+    force: Force = False,
 ) -> None:
     """Train the Gaussian mixture recognizer, and write its model card."""
     from kouxing.training.gmm.recipe import train_gmm
 
-    check_output(output)
+    check_output(output, force=force)
     train_gmm(
         corpus,
         output,
@@ -135,9 +137,10 @@ def neural(
     seed: Seed = 0,
     steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 800,
     any_license: AnyLicense = False,
+    force: Force = False,
 ) -> None:
     """Train the neural recognizer, and write its model card."""
-    with _neural_training(output):
+    with _neural_training(output, force=force):
         from kouxing.training.neural.recipe import train_neural
 
     train_neural(
@@ -166,12 +169,13 @@ def blocks(
     ] = 450,
     steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 450,
     any_license: AnyLicense = False,
+    force: Force = False,
 ) -> None:
     """Train the block model, and write its model card.
 
     Repeat the command to resume an interrupted run.
     """
-    with _neural_training(output):
+    with _neural_training(output, force=force):
         from kouxing.training.blocks.recipe import train_blocks
 
     train_blocks(
@@ -192,11 +196,12 @@ def visemes(
     clips: Clips,
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
     any_license: AnyLicense = False,
+    force: Force = False,
 ) -> None:
     """Train the parameters of the dynamic visemes on tracked lips."""
     from kouxing.training.visemes.recipe import train_visemes
 
-    check_output(output)
+    check_output(output, force=force)
     train_visemes(clips, output, any_license=any_license)
 
 
@@ -218,9 +223,10 @@ def lips(
     ] = None,
     seed: Seed = 0,
     any_license: AnyLicense = False,
+    force: Force = False,
 ) -> None:
     """Train the lip model on tracked lips, and write its model card."""
-    with _neural_training(output):
+    with _neural_training(output, force=force):
         from kouxing.training.lips.recipe import train_lips
 
     train_lips(
@@ -234,9 +240,10 @@ def ferguson(
     corpus: Corpora,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
     any_license: AnyLicense = False,
+    force: Force = False,
 ) -> None:
     """Train the table of the ferguson lip model: openings, durations and influence factors."""
     from kouxing.training.ferguson.recipe import train_ferguson
 
-    check_output(output)
+    check_output(output, force=force)
     train_ferguson(clips, corpus, output, print_message, any_license=any_license)

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from kouxing.services.cli.options import Assignments, ConfigFile
-from kouxing.shared.terminal import JsonFile, check_output, print_message, write_json
+from kouxing.shared.terminal import Force, JsonFile, check_output, print_message, write_json
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="Run listening tests: people rate videos."
@@ -71,6 +71,7 @@ def report(
     folder: Folder,
     picture: Annotated[Path | None, typer.Option(help="File for box plots (.png).")] = None,
     json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Print mean opinion scores with 95 % confidence intervals."""
     from kouxing.corpora.figures import save_figure
@@ -78,7 +79,7 @@ def report(
     from kouxing.evaluation.mos.store import read_answers
     from kouxing.evaluation.mos.study import load_study
 
-    check_output(picture, json_file)
+    check_output(picture, json_file, force=force)
     study, answers = load_study(folder), read_answers(folder)
     results = make_report(study, answers)
     print_report(study, results, Console())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +83,7 @@ def animate(
     Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """
     reading = progress.add_task("reading", total=None)
-    model = load_live_model()
-    predictor = _load_lip_predictor(model, mouth)
+    model, predictor = _load_models(mouth)
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
     settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
     models = [load_lip_model(name=name) for name in lip_models]
@@ -124,6 +123,13 @@ def animate(
         samples,
         _spoken_phones(events, model.inventory.silence),
     )
+
+
+@lru_cache(maxsize=1)
+def _load_models(mouth: Path | None) -> tuple[AcousticModel, LipPredictor | None]:
+    """Load the models once for all files of a command."""
+    model = load_live_model()
+    return model, _load_lip_predictor(model, mouth)
 
 
 def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) -> list[film.Frame]:

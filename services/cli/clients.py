@@ -20,7 +20,15 @@ from kouxing.shared.config import ServiceConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
-from kouxing.shared.terminal import CONSOLE, JsonFile, print_message, write_json
+from kouxing.shared.terminal import (
+    CONSOLE,
+    Force,
+    JsonFile,
+    check_output,
+    plural,
+    print_message,
+    write_json,
+)
 
 SHOWN_METRICS = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
@@ -100,7 +108,8 @@ def speak(
         mouth_profile=profile,
     )
     print_message(
-        f"session {summary.session}: {summary.num_phones} phones in {summary.duration_s:.1f} s"
+        f"session {summary.session}: {plural(summary.num_phones, 'phone')} in"
+        f" {summary.duration_s:.1f} s"
     )
     if summary.video:
         print_message(f"wrote {summary.video}")
@@ -135,11 +144,13 @@ def listen(
         CurveForm,
         typer.Option("--as", help="Values of the frames. Shapes are printed as JSON lines."),
     ] = CurveForm.FAPS,
+    force: Force = False,
     control: Control = "",
 ) -> None:
     """Print or record the output of a session until it ends."""
     from kouxing.services.cli.follow import follow
 
+    check_output(output, force=force)
     follow(_session_name(session), output, show, form, control_address(control))
 
 
@@ -201,10 +212,11 @@ def _parse_strength(text: str) -> tuple[str, float]:
         raise UserError(f"{text!r}: write NAME=STRENGTH, for example joy=0.4") from None
 
 
-def status(control: Control = "", json_file: JsonFile = None) -> None:
+def status(control: Control = "", json_file: JsonFile = None, force: Force = False) -> None:
     """Show services, sessions, rates and latencies."""
     from kouxing.shared.control_client import connect
 
+    check_output(json_file, force=force)
     with connect(control_address(control), timeout_s=3.0) as client:
         report = client.status()
     out = Console()

@@ -94,6 +94,11 @@ EXPORTERS: dict[str, type[Exporter]] = {
 }
 
 
+def is_output(path: Path) -> bool:
+    """Return whether a path is a file or a folder that an exporter writes."""
+    return is_sequence(path) or path.suffix.lower() in EXPORTERS
+
+
 def open_exporter(output: Path, options: ExportOptions) -> Exporter:
     """Return the exporter for a file, a folder or a numbered name.
 

@@ -26,7 +26,7 @@ from kouxing.shared.face.faps import FAPS
 from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
-from kouxing.shared.terminal import CONSOLE, check_output, print_message
+from kouxing.shared.terminal import CONSOLE, plural, print_message
 
 OPEN_POLL_S = 0.2
 PRINTED_FAPS = (3, 4, 5, 6, 16, 17)  # jaw, lips, lip corner, protrusion
@@ -58,8 +58,8 @@ def follow(
             frames = _iter_until_interrupt(followed.results(FapFrame, keep_all=True), followed.name)
             rows = map(_row, frames)
             count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
-    unit = "frames" if shown is ListenOutput.FAPS else shown.value
-    print_message(f"session {followed.name} ended: {count} {unit}")
+    unit = "frame" if shown is ListenOutput.FAPS else shown.value.removesuffix("s")
+    print_message(f"session {followed.name} ended: {plural(count, unit)}")
     if output is not None:
         print_message(f"wrote {output}")
 
@@ -70,7 +70,6 @@ def _open_exporter(output: Path, form: CurveForm) -> CurveExporter:
         raise UserError(
             f"{output}: unknown format; give a name that ends in {', '.join(CURVE_EXPORTERS)}"
         )
-    check_output(output)
     return exporter(output, ExportOptions(form=form))
 
 

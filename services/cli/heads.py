@@ -17,7 +17,7 @@ import typer
 from kouxing.services.cli.options import DEFAULT_HEAD, HeadName
 from kouxing.shared.errors import UserError
 from kouxing.shared.page_heads import page_heads_folder
-from kouxing.shared.terminal import print_message
+from kouxing.shared.terminal import Force, check_output, print_message
 
 _DRIVER_HEADS = Path(str(resources.files("kouxing.services.driver"))) / "head"
 _PAGE = Path(str(resources.files("kouxing.services.gateway"))) / "page"
@@ -38,6 +38,7 @@ def export_head(
     all_heads: Annotated[
         bool, typer.Option("--all", help="Export all built-in heads, for the page.")
     ] = False,
+    force: Force = False,
 ) -> None:
     """Write a head for a game engine: a GLB with FAPs and ARKit shapes, or a VRM 1.0 avatar."""
     from kouxing.services.driver.head.glb_export import export_glb
@@ -47,6 +48,7 @@ def export_head(
         export_page_heads(glb)
         print_message(f"wrote the heads to {glb}")
         return
+    check_output(glb, inputs=[Path(head)], force=force)
     export_glb(load_head(head), glb)
     print_message(f"wrote {glb} ({glb.stat().st_size / 1e6:.1f} MB)")
 
@@ -62,10 +64,12 @@ def import_mesh(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Head to write (.npz).")],
+    force: Force = False,
 ) -> None:
     """Convert a mesh to a head that FAPs can move, for the option --head."""
     from kouxing.services.driver.head.import_head import import_head
 
+    check_output(output, inputs=[mesh, points], force=force)
     for remark in import_head(mesh, points, output):
         print_message(remark)
     print_message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")

@@ -40,13 +40,7 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.terminal import (
-    check_output,
-    open_progress,
-    print_message,
-    write_error,
-    write_text,
-)
+from kouxing.shared.terminal import open_progress, print_message, write_error, write_text
 
 Span = tuple[float, float, str]  # start and end in seconds, and the label
 
@@ -104,7 +98,6 @@ def draw_mouth(
         raise UserError("give either a text or --speech-to-text, not both")
     if text is None and speech_to_text is None and timing is not None:
         raise UserError("--timing needs a text; give the spoken text before the output file")
-    check_output(output)
     samples = read_mono_16k(source, track)
     inventory = load_inventory()
     if speech_to_text is not None:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.options import (
     DEFAULT_HEAD,
     AudioTrack,
@@ -21,7 +22,14 @@ from kouxing.services.cli.options import (
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
-from kouxing.shared.terminal import open_progress, print_message, write_output
+from kouxing.shared.terminal import (
+    Force,
+    check_output,
+    open_progress,
+    plural,
+    print_message,
+    write_output,
+)
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
 Acoustic = Annotated[
@@ -49,25 +57,29 @@ _FORMAT_OF_SUFFIX = {
     ".json": PhoneFormat.JSON,
     ".textgrid": PhoneFormat.TEXTGRID,
 }
+_SUFFIX_OF_FORMAT = {form: suffix for suffix, form in _FORMAT_OF_SUFFIX.items()}
 
 
 def render(
-    source: Annotated[
-        Path,
+    files: Annotated[
+        list[Path],
         typer.Argument(
-            metavar="SOUND|CURVES",
-            help="Audio or video file, or curves (.fap, .csv, .jsonl) of kouxing or of the app Live"
-            " Link Face.",
+            metavar="SOUND|CURVES... [OUTPUT]",
+            help="Audio or video files, or curves (.fap, .csv, .jsonl) of kouxing or of the app"
+            " Live Link Face; '-' is standard input. Then, for a single file, the output: a video"
+            " (.mp4, .mov, .webm, or .webp without sound), one picture (.png), numbered pictures"
+            " (a folder, or a pattern such as face%05d.png), curves (.fap, .csv, .jsonl) or an"
+            " animated head (.glb).",
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Argument(
-            help="File to write: a video (.mp4, .mov, .webm, or .webp without sound), one picture"
-            " (.png), numbered pictures (a folder, or a pattern such as face%05d.png), curves"
-            " (.fap, .csv, .jsonl) or an animated head (.glb)."
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder for the videos of several files. Default: next to each file.",
         ),
-    ],
+    ] = None,
     lips: Annotated[
         list[str] | None,
         typer.Option(
@@ -115,43 +127,58 @@ def render(
         float | None,
         typer.Option(min=0.5, max=2, help="Size of the mouth movements; not for curves."),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Make a video, pictures or curves from sound, or from curves."""
-    from kouxing.services.cli.animation import animate, has_motion, read_motion
-    from kouxing.services.cli.exporters import open_exporter
+    from kouxing.services.cli.exporters import is_output
 
     if live and text is not None:
         raise UserError("a live stream has no text in advance; use either --live or --text")
-    if has_motion(source):
-        _check_no_sound_options(
-            source, lips=lips, live=live or None, text=text, mouth=mouth,
-            expressiveness=expressiveness, track=track,
-        )  # fmt: skip
-    elif sound is not None:
-        raise UserError(f"--sound applies to curves; {source} has its own sound")
     models = tuple(lips or [DEFAULT_LIP_MODEL])
     if mouth is not None and "learnt" not in models:
         raise UserError("--mouth applies to learnt lips; add --lips learnt")
+    *sources, last = files
+    if output is None and len(sources) == 1 and is_output(last):
+        pairs = [(sources[0], last)]
+    else:
+        pairs = pair_outputs(files, output, ".mp4")
+    for source, target in pairs:
+        is_folder = target.is_dir()  # of numbered pictures
+        check_output(None if is_folder else target, inputs=[source, sound, mouth], force=force)
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
         yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,
     )  # fmt: skip
-    exporter = open_exporter(output, options)
-    with open_progress() as progress:
+
+    def render_file(source: Path, target: Path) -> None:
+        from kouxing.services.cli.animation import animate, has_motion, read_motion
+        from kouxing.services.cli.exporters import open_exporter
+
         if has_motion(source):
-            motion = read_motion(source, sound)
-        else:
-            motion = animate(
-                source, models, progress, live=live, text=text, mouth=mouth,
+            _check_no_sound_options(
+                source, lips=lips, live=live or None, text=text, mouth=mouth,
                 expressiveness=expressiveness, track=track,
             )  # fmt: skip
-        if not motion.frames:
-            raise UserError(f"{source}: the file contains no frames; export it again")
-        count = exporter.export(motion, progress)
-    if motion.phones == []:
-        print_message(f"{source}: no speech was found; the mouth stays closed")
-    phones = "" if motion.phones is None else f", {_plural(len(motion.phones), 'phone')}"
-    print_message(f"wrote {output}: {_plural(count, exporter.unit)}{phones}")
+        elif sound is not None:
+            raise UserError(f"--sound applies to curves; {source} has its own sound")
+        exporter = open_exporter(target, options)
+        with open_progress() as progress:
+            if has_motion(source):
+                motion = read_motion(source, sound)
+            else:
+                motion = animate(
+                    source, models, progress, live=live, text=text, mouth=mouth,
+                    expressiveness=expressiveness, track=track,
+                )  # fmt: skip
+            if not motion.frames:
+                raise UserError(f"{source}: the file contains no frames; export it again")
+            count = exporter.export(motion, progress)
+        if motion.phones == []:
+            print_message(f"{source}: no speech was found; the mouth stays closed")
+        phones = "" if motion.phones is None else f", {plural(len(motion.phones), 'phone')}"
+        print_message(f"wrote {target}: {plural(count, exporter.unit)}{phones}")
+
+    process_all(pairs, render_file)
 
 
 def _check_no_sound_options(source: Path, **options: object) -> None:
@@ -160,34 +187,47 @@ def _check_no_sound_options(source: Path, **options: object) -> None:
             raise UserError(f"--{name} applies to sound; {source} already contains the lip motion")
 
 
-def _plural(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def phones(
-    audio: Audio,
+    audio: Annotated[
+        list[Path], typer.Argument(help="Audio or video files; '-' is standard input.")
+    ],
     acoustic: Acoustic = "blocks",
     form: Form = None,
-    output: Output = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write; a folder for many files.")
+    ] = None,
     track: AudioTrack = None,
+    force: Force = False,
 ) -> None:
-    """Recognize the phones of an audio file, with their times."""
+    """Recognize the phones of audio files, with their times."""
     from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.offline import recognize
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.phone_files import format_phones
 
-    style = _format(form, output)
-    samples = read_mono_16k(audio, track)
-    duration_s = len(samples) / MEDIA_RATE_HZ
+    if len(audio) > 1 and output is None:
+        raise UserError(f"{len(audio)} files need a folder for their phones; add -o FOLDER")
+    is_folder = output is not None and (len(audio) > 1 or output.is_dir())
+    style = _format(form, None if is_folder else output)
+    pairs: list[tuple[Path, Path | None]] = [(audio[0], output)]
+    if is_folder:
+        pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
+    for source, target in pairs:
+        check_output(target, inputs=[source], force=force)
     model = load_model(model_path(acoustic))
-    with open_progress() as progress:
-        with_progress = partial(progress.track, description="recognizing")
-        recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
-    if not recognized:
-        print_message(f"{audio}: no speech was found")
-    write_output(format_phones(recognized, style, duration_s), output)
+
+    def recognize_file(source: Path, target: Path | None) -> None:
+        samples = read_mono_16k(source, track)
+        duration_s = len(samples) / MEDIA_RATE_HZ
+        with open_progress() as progress:
+            with_progress = partial(progress.track, description="recognizing")
+            recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+        if not recognized:
+            print_message(f"{source}: no speech was found")
+        write_output(format_phones(recognized, style, duration_s), target)
+
+    process_all(pairs, recognize_file)
 
 
 def align(
@@ -199,6 +239,7 @@ def align(
     form: Form = None,
     output: Output = None,
     track: AudioTrack = None,
+    force: Force = False,
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import read_mono_16k
@@ -209,6 +250,7 @@ def align(
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
+    check_output(output, inputs=[audio, Path(text)], force=force)
     model = load_model(model_path(acoustic))
     transcript = read_text(text, model.inventory)
     samples = read_mono_16k(audio, track)
@@ -252,6 +294,7 @@ def lips(
         typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text."),
     ] = None,
     track: AudioTrack = None,
+    force: Force = False,
 ) -> None:
     """Draw the mouth in two dimensions, for cartoons, teaching and papers."""
     from kouxing.services.cli.mouth_drawing import draw_mouth
@@ -259,6 +302,7 @@ def lips(
     *text, output = text_and_output
     if len(text) > 1:
         raise UserError("give one text and one output file; put a text with spaces in quotes")
+    check_output(Path(output), inputs=[audio, *map(Path, text)], force=force)
     draw_mouth(
         audio,
         text[0] if text else None,
@@ -271,11 +315,11 @@ def lips(
     )
 
 
-def _format(form: PhoneFormat | None, output: Path | None) -> str:
+def _format(form: PhoneFormat | None, output: Path | None) -> PhoneFormat:
     if form is None and output is not None:
         form = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
         if form is None:
             raise UserError(
                 f"{output}: unknown format; give a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
             )
-    return (form or PhoneFormat.TABLE).value
+    return form or PhoneFormat.TABLE

@@ -27,7 +27,7 @@ from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import control_endpoint
-from kouxing.shared.terminal import CONSOLE, command_name, print_message
+from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 
 if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource
@@ -190,7 +190,9 @@ def _play_sample(sample: AudioSource, control: str) -> None:
     from kouxing.services.cli.streaming import stream
 
     summary = stream(sample, control, CONSOLE, session=_SAMPLE_SESSION, record=True)
-    print_message(f"spoke {sample.name}: {summary.num_phones} phones in {summary.duration_s:.1f} s")
+    print_message(
+        f"spoke {sample.name}: {plural(summary.num_phones, 'phone')} in {summary.duration_s:.1f} s"
+    )
     if not summary.video:
         raise UserError("no video was written; see the messages above")
     print_message(f"wrote {summary.video}")

@@ -71,7 +71,7 @@ class Supervisor:
                 f"{log_folder}: cannot be written: {error.strerror}; start kouxing in a folder that"
                 " you can write to, or add --set driver.out=FOLDER"
             ) from None
-        check_output(*(self._log_file(name) for name in self._names))
+        check_output(*(self._log_file(name) for name in self._names), force=True)
 
     def start(self) -> None:
         """Start every service."""

@@ -14,7 +14,7 @@ from PIL import Image
 
 from kouxing.services.cli import heads as page_heads
 from kouxing.services.cli.heads import import_mesh
-from kouxing.services.cli.offline import render
+from kouxing.services.cli.offline import render as render_files
 from kouxing.services.cli.options import CurveForm
 from kouxing.services.cli.run import head_environment
 from kouxing.services.driver.config import DriverConfig, Framing
@@ -36,6 +36,10 @@ from tests.meshes import meshes
 from tests.system import VOWELS_FILE, System, kouxing
 
 SENTENCE = VOWELS_FILE
+
+
+def render(source: Path, output: Path, **options: Any) -> None:
+    render_files([source, output], force=True, **options)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +105,7 @@ def test_reports_the_line_of_a_bad_fap_file(tmp_path: Path) -> None:
         ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to sound"),
         ("a.mp4", {"live": True}, "--live applies to sound"),
         ("a.csv", {"text": "你好"}, "--text applies to sound"),
-        ("no/a.png", {"size": "64x48"}, "cannot write"),
+        ("no/a.png", {"size": "64x48"}, "cannot be written"),
     ],
 )
 def test_rejects_options_that_do_not_fit(

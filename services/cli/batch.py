@@ -1,0 +1,58 @@
+"""Commands that take many files: their outputs, and errors that do not stop the other files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import print_message, write_error
+
+T = TypeVar("T", Path, Path | None)
+
+
+def pair_outputs(
+    sources: Sequence[Path], output: Path | None, suffix: str
+) -> list[tuple[Path, Path]]:
+    """Return each source with its output, whose name ends in ``suffix``.
+
+    ``output`` is the file for a single source, or a folder, which is created. None: the outputs are
+    next to their sources. Raises ``UserError`` if several sources need a folder, the folder cannot
+    be created, or two sources would have the same output.
+    """
+    if output is not None and len(sources) == 1 and not output.is_dir():
+        return [(sources[0], output)]
+    if output is not None and not output.is_dir():
+        if output.suffix:
+            raise UserError(f"{output} is a file for {len(sources)} inputs; give a folder")
+        try:
+            output.mkdir()
+        except OSError as error:
+            raise write_error(output, error) from None
+    pairs: dict[Path, Path] = {}
+    for source in sources:
+        target = (output or source.parent) / source.with_suffix(suffix).name
+        if target in pairs:
+            raise UserError(f"{pairs[target]} and {source} would both be written to {target}")
+        pairs[target] = source
+    return [(source, target) for target, source in pairs.items()]
+
+
+def process_all(pairs: Sequence[tuple[Path, T]], process: Callable[[Path, T], None]) -> None:
+    """Process pairs of a source and its output.
+
+    A source with an error does not stop the others. Raises the error of a single source, or
+    ``UserError`` if any of several sources failed.
+    """
+    num_failed = 0
+    for source, output in pairs:
+        try:
+            process(source, output)
+        except UserError as error:
+            if len(pairs) == 1:
+                raise
+            num_failed += 1
+            print_message(str(error))
+    if num_failed:
+        raise UserError(f"{num_failed} of {len(pairs)} files failed; see the messages above")

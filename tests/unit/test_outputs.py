@@ -1,0 +1,56 @@
+"""Commands never overwrite an input, or ask before they overwrite a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from kouxing.services.cli.batch import pair_outputs, process_all
+from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import check_output
+
+
+def test_an_existing_output_needs_force(tmp_path: Path) -> None:
+    path = tmp_path / "face.mp4"
+    check_output(path)
+    assert not path.exists()
+    path.write_text("mine")
+    with pytest.raises(UserError, match=r"face\.mp4 exists; add --force to overwrite it"):
+        check_output(path)
+    check_output(path, force=True)
+    assert path.read_text() == "mine"
+
+
+def test_an_output_is_never_an_input(tmp_path: Path) -> None:
+    source, link = tmp_path / "me.mp4", tmp_path / "link.mp4"
+    source.touch()
+    link.symlink_to(source)
+    with pytest.raises(UserError, match="the output is also an input"):
+        check_output(link, inputs=[None, source, Path("a" * 5000)], force=True)
+
+
+def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) -> None:
+    sources = [tmp_path / "a.wav", tmp_path / "b.m4a"]
+    targets = [target for _, target in pair_outputs(sources, None, ".mp4")]
+    assert targets == [tmp_path / "a.mp4", tmp_path / "b.mp4"]
+    assert pair_outputs(sources, tmp_path / "out", ".csv")[1][1] == tmp_path / "out" / "b.csv"
+    assert (tmp_path / "out").is_dir()
+    with pytest.raises(UserError, match=r"a\.wav and .*a\.mp3 would both be written to"):
+        pair_outputs([tmp_path / "a.wav", tmp_path / "a.mp3"], None, ".mp4")
+    with pytest.raises(UserError, match=r"one\.csv is a file for 2 inputs; give a folder"):
+        pair_outputs(sources, tmp_path / "one.csv", ".csv")
+
+
+def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    done = []
+
+    def process(source: Path, _: Path) -> None:
+        if source.name == "bad":
+            raise UserError("bad: no sound")
+        done.append(source.name)
+
+    with pytest.raises(UserError, match="1 of 3 files failed"):
+        process_all([(Path(name), Path("x")) for name in ("a", "bad", "c")], process)
+    assert done == ["a", "c"]
+    assert "bad: no sound" in capsys.readouterr().err
