@@ -7,6 +7,7 @@ Interpolation gives R(t), and R(t) gives the contour.
 from __future__ import annotations
 
 import csv
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -232,7 +233,9 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
 
 
 def _label_at(time_s: float, spans: Sequence[Span]) -> str:
-    return next((label for start_s, end_s, label in spans if start_s <= time_s < end_s), "")
+    """Return the label at a time; the spans are in order."""
+    index = bisect_right(spans, time_s, key=lambda span: span[0]) - 1
+    return spans[index][2] if index >= 0 and time_s < spans[index][1] else ""
 
 
 def _write_csv(output: Path, mouth: _Mouth) -> str:
