@@ -125,17 +125,31 @@ class Chromium:
         return result["result"].get("value")
 
     def click(self, name: str) -> None:
-        """Click on an element with the mouse, so that the page may play sound."""
+        """Click on an element with the mouse, as a user does; see ``place_of``."""
+        x, y = self.place_of(name)
+        press: dict[str, object] = {"x": x, "y": y, "button": "left", "clickCount": 1}
+        for event in ("mousePressed", "mouseReleased"):
+            self.command("Input.dispatchMouseEvent", type=event, **press)
+
+    def place_of(self, name: str) -> tuple[float, float]:
+        """Scroll to an element, and return its center in pixels of the window.
+
+        ``name`` is the element's ID, which the rest of a CSS selector may follow. Raises
+        RuntimeError if the element is covered or does not react to the mouse.
+        """
         x, y = self.evaluate(
             "(async () => {"
             "const drawn = () => new Promise((done) => requestAnimationFrame(done));"
             "await drawn(); await drawn();"
-            f"const box = document.getElementById('{name}').getBoundingClientRect();"
-            "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+            f"const target = document.querySelector('#{name}');"
+            "target.scrollIntoView({ block: 'nearest' });"
+            "const { x, y, width, height } = target.getBoundingClientRect();"
+            "const place = [x + width / 2, y + height / 2];"
+            "const hit = document.elementFromPoint(...place);"
+            "if (!target.contains(hit)) throw Error(`at ${place}: ${hit?.outerHTML}`);"
+            "return place; })()"
         )
-        press: dict[str, object] = {"x": x, "y": y, "button": "left", "clickCount": 1}
-        for event in ("mousePressed", "mouseReleased"):
-            self.command("Input.dispatchMouseEvent", type=event, **press)
+        return x, y
 
     def wait_for(self, condition: str, limit_s: float = _TIMEOUT_S) -> None:
         """Wait until an expression becomes true."""

@@ -51,12 +51,12 @@ class ServiceProcess(subprocess.Popen[bytes]):
         self._hang_limit_s = hang_limit_s
         self._stall = StallDetector(time.monotonic(), limit_s=2 * POLL_S)
         self._silent_s = 0.0
-        self._is_ready = False  # it has sent a heartbeat
+        self.is_ready = False  # it has sent a heartbeat
 
     def hangs(self) -> bool:
         """Return whether the service's loop hangs. Call this about every ``POLL_S``."""
         self._silent_s += self._stall.elapsed_s(time.monotonic())
         with contextlib.suppress(BlockingIOError):
             if os.read(self._pulse, 65536):
-                self._silent_s, self._is_ready = 0.0, True
-        return self._is_ready and self._silent_s > self._hang_limit_s
+                self._silent_s, self.is_ready = 0.0, True
+        return self.is_ready and self._silent_s > self._hang_limit_s

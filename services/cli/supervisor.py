@@ -60,6 +60,7 @@ class Supervisor:
         self._started_s: dict[str, float] = {}
         self._backoff_s = dict.fromkeys(self._names, 0.0)
         self._restart_at_s: dict[str, float] = {}
+        self._restarted: set[str] = set()  # services that are not ready again
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
         self._process_ended = threading.Event()
@@ -128,6 +129,9 @@ class Supervisor:
                 if process.hangs():
                     self._warn(f"{name} hangs; killing it")
                     process.kill()
+                elif process.is_ready and name in self._restarted:
+                    self._restarted.remove(name)
+                    self._console.print(f"[green]{name} is running again")
             elif status == USER_ERROR:
                 raise UserError(f"{name} cannot start; see the message above")
             else:
@@ -135,6 +139,7 @@ class Supervisor:
         for name, restart_at_s in list(self._restart_at_s.items()):
             if now_s >= restart_at_s:
                 del self._restart_at_s[name]
+                self._restarted.add(name)
                 self._start(name)
 
     def process(self, name: str) -> ServiceProcess:

@@ -9,13 +9,13 @@ After a restart, control learns the sessions from the services that serve them.
 from __future__ import annotations
 
 import heapq
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.faults import Faults
 from kouxing.services.control.kind import KIND
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.refusal import Refusal
@@ -73,6 +73,7 @@ class ControlService(Service):
         placement = Placement(self._registry, config.max_load)
         self._sessions = Sessions(self._registry, placement, config.max_sessions)
         self._status = Status(self._registry, self._sessions)
+        self._faults = Faults()
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
         self._num_events = 0
@@ -124,6 +125,7 @@ class ControlService(Service):
                 self._on_service_lost(instance, "its connection closed")
         for instance in self._registry.overdue(now_s):
             self._on_service_lost(instance, "no heartbeat")
+        self._faults.report(now_s)
         while self._moves_to_repeat and self._moves_to_repeat[0][0] <= now_s:
             self._repeat_move(heapq.heappop(self._moves_to_repeat)[2])
         for record in self._sessions.pending():
@@ -236,6 +238,7 @@ class ControlService(Service):
 
         A worker that was declared lost by mistake keeps the sessions that have not moved.
         """
+        self._faults.end(heartbeat.instance, time.monotonic())
         self._publish(EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}")
         if replaced is not None:
             self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
@@ -296,8 +299,10 @@ class ControlService(Service):
     def _on_service_lost(self, instance: str, reason: str) -> None:
         self._registry.remove(instance)
         self._requests.key_versions.pop(instance, None)
-        level = logging.INFO if reason == STOPPED else logging.WARNING
-        LOG.log(level, "lost %s: %s", instance, reason)
+        if reason == STOPPED:
+            LOG.info("%s stopped", instance)
+        else:
+            self._faults.begin(instance, reason, time.monotonic())
         self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
         for record in self._sessions.mark_worker_lost(instance, time.monotonic()):
             self._move_session(record)

@@ -26,11 +26,18 @@ function track(...symbols) {
 
 test("the phone at a media time is shown with the phones before it", () => {
   const phones = track("sil", "n", "i", "h", "ao");
-  assert.deepEqual(phones.at(-1), { current: "", past: [] });
-  assert.deepEqual(phones.at(0), { current: "", past: ["·"] });
-  assert.deepEqual(phones.at(3300), { current: "i", past: ["·", "n"] });
+  assert.deepEqual(phones.at(-1), { current: "", past: [], opacity: 0 });
+  assert.deepEqual(phones.at(0), { current: "", past: ["·"], opacity: 0 });
+  assert.deepEqual(phones.at(3300), { current: "i", past: ["·", "n"], opacity: 1 });
   phones.add({ index: 1, symbol: "sil", media_time: 1600, duration: 0, final: true });
-  assert.deepEqual(phones.at(3300), { current: "i", past: ["·"] }, "a phone was removed");
+  assert.deepEqual(phones.at(3300).past, ["·"], "a phone was removed");
+});
+
+test("the last phone stays during a pause and then fades", () => {
+  const phones = track("a", "sil");
+  assert.deepEqual(phones.at(17000), { current: "a", past: [], opacity: 1 });
+  assert.deepEqual(phones.at(25600), { current: "a", past: [], opacity: 0.5 });
+  assert.deepEqual(phones.at(34000), { current: "", past: ["a", "·"], opacity: 0 });
 });
 
 test("the level is that of the sound that is audible", () => {

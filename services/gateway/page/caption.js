@@ -4,7 +4,8 @@ import { element } from "./elements.js";
 
 const MAX_PHONES = 100;
 const MAX_PAST = 8; // shown before the current phone
-const SHOWN_AFTER_END = 8 * 16000; // samples for which the last phone is still shown
+const SHOWN_AFTER_END = 16000; // samples for which the last phone stays after its end
+const FADE = 16000; // samples in which it then fades
 const SILENCE = "sil";
 const SILENCE_SIGN = "·";
 
@@ -29,17 +30,19 @@ export class PhoneTrack {
     if (this.#phones.length > MAX_PHONES) this.#phones.shift();
   }
 
-  /** Return { current: symbol at a media time or "", past: the symbols before it }. */
+  /**
+   * Return { current: symbol at a media time or the last one before it, past: the symbols before it,
+   * opacity: 0 to 1; at 0 nothing is current }.
+   */
   at(mediaTime) {
-    const current = this.#phones.findLastIndex((phone) => phone.begin <= mediaTime);
-    const phone = this.#phones[current];
-    const isOver =
-      phone === undefined || phone.symbol === SILENCE || mediaTime > phone.end + SHOWN_AFTER_END;
-    const numPast = isOver ? current + 1 : current;
-    const past = this.#phones.slice(Math.max(0, current - MAX_PAST), Math.max(0, numPast));
+    const begun = this.#phones.filter(({ begin }) => begin <= mediaTime);
+    const last = begun.findLastIndex(({ symbol }) => symbol !== SILENCE);
+    const left = last === -1 ? 0 : begun[last].end + SHOWN_AFTER_END + FADE - mediaTime;
+    const past = left > 0 ? begun.slice(0, last) : begun;
     return {
-      current: isOver ? "" : phone.symbol,
-      past: past.map(({ symbol }) => (symbol === SILENCE ? SILENCE_SIGN : symbol)),
+      current: left > 0 ? begun[last].symbol : "",
+      past: past.slice(-MAX_PAST).map(({ symbol }) => (symbol === SILENCE ? SILENCE_SIGN : symbol)),
+      opacity: Math.max(0, Math.min(1, left / FADE)),
     };
   }
 }
@@ -76,7 +79,9 @@ export class Caption {
 
   /** Show the caption of a media time. */
   show(mediaTime) {
-    const { current, past } = (this.#showsPhones ? this.#phones : this.#syllables).at(mediaTime);
+    const track = this.#showsPhones ? this.#phones : this.#syllables;
+    const { current, past, opacity } = track.at(mediaTime);
+    for (const name of ["spoken", "past"]) element(name).style.opacity = opacity;
     if (this.text !== current) element("spoken").value = current;
     const key = past.join(" ");
     if (element("past").dataset.key !== key) {

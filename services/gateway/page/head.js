@@ -22,7 +22,7 @@ const PORTRAIT_ASPECT = 0.66; // in narrower windows the camera moves back, so t
 
 export class Head {
   #renderer;
-  #overlay;
+  #overlays;
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
@@ -40,9 +40,9 @@ export class Head {
   #isFilmed = false;
   #size = [0, 0]; // on the page, pixels
 
-  /** @param canvas to draw on; @param overlay element that covers its lower edge */
-  constructor(canvas, overlay) {
-    this.#overlay = overlay;
+  /** @param canvas to draw on; @param overlays { controls, panel } that may cover its lower part */
+  constructor(canvas, overlays) {
+    this.#overlays = overlays;
     // Edges are smoothed by drawing more pixels than the screen has. Multisampling would speckle a
     // mesh whose triangles are as small as pixels.
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
@@ -59,10 +59,12 @@ export class Head {
     this.#controls.minPolarAngle = 1.1;
     this.#controls.maxPolarAngle = 1.9;
     this.#controls.addEventListener("change", () => (this.#needsDrawing = true));
-    new ResizeObserver(() => {
+    const observer = new ResizeObserver(() => {
       this.#resize();
       this.#render();
-    }).observe(canvas);
+    });
+    observer.observe(canvas);
+    observer.observe(overlays.panel); // it opens and closes
   }
 
   /** Load a head and replace the current one. */
@@ -204,7 +206,10 @@ export class Head {
     const [width, height] = this.#size;
     if (width === 0 || height === 0) return;
     // The head fits into the area above the controls, with a small overlap.
-    const covered = this.#overlay.offsetHeight * OVERLAY_SHARE;
+    const { controls, panel } = this.#overlays;
+    const { left, right, height: panelHeight } = panel.getBoundingClientRect();
+    const isBelow = left < width / 2 && width / 2 < right; // otherwise the panel is at one side
+    const covered = isBelow ? panelHeight : controls.offsetHeight * OVERLAY_SHARE;
     const free = Math.max(0.5 * height, height - covered);
     const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
     const widened = half * Math.max(height / free, PORTRAIT_ASPECT * (height / width));

@@ -38,7 +38,7 @@ const speech = new SpeechControls(sound, {
   lips: chosenLipModel,
   level: (value) => meter.raise(value),
   error: showError,
-  news: (text) => notice.showNews(text, "hint"),
+  news: showNews,
   session(name) {
     if (name !== null) {
       showLipModel();
@@ -53,6 +53,7 @@ const player = new Player(sound, (nowMs, mediaTime) =>
 const stage = new Stage(player.faps, sound, {
   loaded: () => player.playout.reset(),
   failed: (text) => showError({ text }),
+  news: showNews,
 });
 const senders = new SendersPanel(element("settings"));
 const statusBar = new StatusBar({ gateway, player, speech, sound, notice, senders });
@@ -99,7 +100,7 @@ function handleMessage(message) {
 
 function showSession(message) {
   const { isOther, isRestart } = gateway.setSession(message);
-  if (isRestart) notice.showNews(say("serviceRestarted"), "hint");
+  if (isRestart) showNews(say("serviceRestarted"));
   if (isOther) statusBar.reset();
   if (gateway.session !== null) {
     // A session that has ended stays visible and audible to its end.
@@ -110,6 +111,10 @@ function showSession(message) {
   if (isOwnSession()) sendExpressiveness();
   showLipModel();
   statusBar.show();
+}
+
+function showNews(text) {
+  notice.showNews(text, "hint");
 }
 
 function showError(error) {

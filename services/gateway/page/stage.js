@@ -7,8 +7,8 @@ import { drawingText, turnText } from "./status.js";
 
 const BACKGROUND = "#e9e8ea"; // the page's own background is not on the canvas
 const VIDEO_RATE_HZ = 30;
-// The first type that the browser supports is used.
-const VIDEO_TYPES = ["video/mp4;codecs=avc1.42E01F,mp4a.40.2", "video/mp4", "video/webm"];
+// The first type that the browser supports is used. Other codecs in MP4 play in fewer programs.
+const VIDEO_TYPES = ["video/mp4;codecs=avc1.42E01F,mp4a.40.2", "video/webm"];
 const TURN_DEGREES = {
   ArrowLeft: [10, 0],
   ArrowRight: [-10, 0],
@@ -17,7 +17,7 @@ const TURN_DEGREES = {
   Home: [], // to the front
 };
 
-/** Records the canvas and the sound with the browser's recorder. The video is saved as a download. */
+/** Records the canvas and the sound with the browser's recorder. */
 class VideoRecorder {
   #recorder = null;
 
@@ -25,24 +25,25 @@ class VideoRecorder {
     return this.#recorder !== null;
   }
 
-  /** Start recording a canvas and an audio stream. */
-  start(canvas, sound) {
+  /** Start recording a canvas and an audio stream; onVideo(blob) receives the video. */
+  start(canvas, sound, onVideo) {
     const mimeType = VIDEO_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
     const tracks = [...canvas.captureStream(VIDEO_RATE_HZ).getTracks(), ...sound.getTracks()];
     this.#recorder = new MediaRecorder(new MediaStream(tracks), { mimeType });
     const chunks = [];
     this.#recorder.ondataavailable = ({ data }) => chunks.push(data);
-    this.#recorder.onstop = () => save(new Blob(chunks, { type: mimeType }));
+    this.#recorder.onstop = () => onVideo(new Blob(chunks, { type: mimeType }));
     this.#recorder.start(1000);
   }
 
-  /** Stop recording and save the video. */
+  /** Stop recording. */
   stop() {
     this.#recorder.stop();
     this.#recorder = null;
   }
 }
 
+/** Save a video as a download; return its name. */
 function save(video) {
   const link = document.createElement("a");
   const suffix = video.type.startsWith("video/mp4") ? "mp4" : "webm";
@@ -50,6 +51,7 @@ function save(video) {
   link.href = URL.createObjectURL(video);
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+  return link.download;
 }
 
 export class Stage {
@@ -63,7 +65,7 @@ export class Stage {
   /**
    * @param faps 68 values that are updated before each call of draw
    * @param {Sound} sound for videos
-   * @param handlers { loaded(), failed(text) }
+   * @param handlers { loaded(), failed(text), news(text) }
    */
   constructor(faps, sound, handlers) {
     this.#faps = faps;
@@ -137,7 +139,10 @@ export class Stage {
       this.#head.film(null);
     } else if (this.#head !== null) {
       this.#head.film(BACKGROUND);
-      this.#recorder.start(element("head"), await this.#sound.tap());
+      this.#recorder.start(element("head"), await this.#sound.tap(), (video) => {
+        const file = save(video);
+        this.#handlers.news(say(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
+      });
     }
     element("record").setAttribute("aria-pressed", this.#recorder.isRecording);
   }
@@ -145,7 +150,8 @@ export class Stage {
 
 function makeHead() {
   try {
-    return new Head(element("head"), document.querySelector("footer"));
+    const overlays = { controls: document.querySelector("footer"), panel: element("settings") };
+    return new Head(element("head"), overlays);
   } catch {
     throw new UserError(say("webGlMissing"));
   }

@@ -14,6 +14,11 @@ export const TEXTS = {
   fileHelp: { en: "Play an audio file; you can also drop it on the page", zh: "播放音频文件，也可直接拖到页面上" },
   record: { en: "Record", zh: "录制" },
   recordHelp: { en: "Record the face and its sound as a video", zh: "把人脸和声音录成视频" },
+  videoSaved: { en: "Saved {file}.", zh: "已保存 {file}。" },
+  webmSaved: {
+    en: "Saved {file}. This browser records only WebM. QuickTime does not play it; VLC and browsers do. To convert it: ffmpeg -i {file} face.mp4",
+    zh: "已保存 {file}。此浏览器只能录制 WebM，QuickTime 无法播放；可用 VLC 或浏览器播放，或转换：ffmpeg -i {file} face.mp4",
+  },
   learn: { en: "Learn my mouth", zh: "学我的口型" },
   learnHelp: { en: "Teach the head to move its lips like yours", zh: "让头像学会你的口型" },
   sound: { en: "Sound", zh: "声音" },

@@ -1,0 +1,47 @@
+"""Faults of services: short ones are only in the log, others are reported, and so is their end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kouxing.shared.logs import LOG
+
+SHORT_S = 1.0  # the fault of a service that is back within this time is not reported
+MAX_FAULTS = 1000
+
+
+@dataclass(slots=True)
+class _Fault:
+    begin_s: float
+    text: str
+    is_reported: bool = False
+
+
+class Faults:
+    """Services that are lost. A warning also reaches the supervisor's console."""
+
+    def __init__(self) -> None:
+        self._faults: dict[str, _Fault] = {}  # by instance, oldest first
+
+    def begin(self, instance: str, reason: str, now_s: float) -> None:
+        """Record that a service is lost."""
+        text = f"lost {instance}: {reason}"
+        LOG.info(text)
+        self._faults[instance] = _Fault(now_s, text)
+        if len(self._faults) > MAX_FAULTS:
+            del self._faults[next(iter(self._faults))]
+
+    def report(self, now_s: float) -> None:
+        """Report faults that have become long."""
+        for fault in self._faults.values():
+            if not fault.is_reported and now_s - fault.begin_s > SHORT_S:
+                fault.is_reported = True
+                LOG.warning(fault.text)
+
+    def end(self, instance: str, now_s: float) -> None:
+        """Record that a service has registered; report it if its loss was reported."""
+        fault = self._faults.pop(instance, None)
+        if fault is not None:
+            lasted_s = now_s - fault.begin_s
+            log = LOG.warning if fault.is_reported else LOG.info
+            log("%s is back after %.1f s", instance, lasted_s)
