@@ -146,7 +146,8 @@ def problem(set_name):
         keys = shape_keys(name)
         needed = [shape for shape, _, is_needed in entries if is_needed]
         missing[name] = [shape for shape in needed if shape not in keys]
-        share[name] = len(missing[name]) / len(needed)
+        # between equals, the number of known shapes decides
+        share[name] = len(missing[name]) / len(needed) - len(keys) / 1000
         if needed[0] in keys:
             speaking.append(name)
     if set_name in speaking:

@@ -76,11 +76,12 @@ static func choose_set(names: Array) -> Array:
 			if entry["is_needed"]:
 				needed.append(entry["shape"])
 		missing[set_name] = needed.filter(func(shape: String) -> bool: return not shape in found)
-		share[set_name] = float(missing[set_name].size()) / needed.size()
+		# between equals, the number of known names decides
+		share[set_name] = float(missing[set_name].size()) / needed.size() - found.size() / 1000.0
 		if needed[0] in found:
 			speaking.append(set_name)
 	for set_name: String in speaking:
-		if share[set_name] == 0.0:
+		if missing[set_name].is_empty():
 			return [set_name, ""]
 	speaking.reverse()
 	var nearest := _nearest(share, speaking if speaking else share.keys())

@@ -19,21 +19,19 @@ public sealed class KouxingFace : MonoBehaviour
     void OnEnable()
     {
         _shapes.Clear();
-        var names = new List<(SkinnedMeshRenderer mesh, List<string> names)>();
-        foreach (var mesh in GetComponentsInChildren<SkinnedMeshRenderer>())
-            names.Add((mesh, Enumerable.Range(0, mesh.sharedMesh.blendShapeCount)
-                .Select(mesh.sharedMesh.GetBlendShapeName).ToList()));
+        var names = GetComponentsInChildren<SkinnedMeshRenderer>().ToDictionary(mesh => mesh, mesh =>
+            Enumerable.Range(0, mesh.sharedMesh.blendShapeCount).Select(mesh.sharedMesh.GetBlendShapeName).ToList());
         string set;
-        try { set = KouxingShapeNames.ChooseSet(names.SelectMany(pair => pair.names).ToList()); }
+        try { set = KouxingShapeNames.ChooseSet(names.Values.SelectMany(list => list).ToList()); }
         catch (InvalidOperationException error)
         {
             Debug.LogError($"kouxing: {error.Message}", this);
             enabled = false;
             return;
         }
-        foreach (var (mesh, meshNames) in names)
-            foreach (var pair in KouxingShapeNames.FindShapes(set, meshNames))
-                _shapes.Add((mesh, meshNames.IndexOf(pair.Key), pair.Value));
+        foreach (var mesh in names)
+            foreach (var shape in KouxingShapeNames.FindShapes(set, mesh.Value))
+                _shapes.Add((mesh.Key, mesh.Value.IndexOf(shape.Key), shape.Value));
         _stream = new KouxingStream(gateway, session, set);
     }
 
@@ -46,12 +44,13 @@ public sealed class KouxingFace : MonoBehaviour
     void LateUpdate() // after the Animator
     {
         if (_stream == null) return;
-        var (names, weights) = (_stream.Names, _stream.Weights);
+        IReadOnlyList<string> names = _stream.Names;
+        float[] weights = _stream.Weights;
         if (weights.Length != names.Count) return;
         var face = new Dictionary<string, float>();
         for (int i = 0; i < weights.Length; i++) face[names[i]] = weights[i];
-        foreach (var (mesh, shape, name) in _shapes)
-            if (face.TryGetValue(name, out float weight))
-                mesh.SetBlendShapeWeight(shape, fullWeight * weight);
+        foreach (var target in _shapes)
+            if (face.TryGetValue(target.name, out float weight))
+                target.mesh.SetBlendShapeWeight(target.shape, fullWeight * weight);
     }
 }

@@ -74,10 +74,12 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
             var found = new HashSet<string>(FindShapes(set, names).Values);
             var needed = Sets[set].Where(entry => entry.IsNeeded).Select(entry => entry.Shape).ToList();
             var missing = needed.Where(shape => !found.Contains(shape)).ToList();
-            return new { set, missing, speaks = found.Contains(needed[0]), share = (double)missing.Count / needed.Count };
+            double share = (double)missing.Count / needed.Count - found.Count / 1000.0; // between equals, known shapes decide
+            return new { set, missing, speaks = found.Contains(needed[0]), share };
         }).ToList();
         var speaking = options.Where(option => option.speaks).ToList();
-        if (speaking.Any(option => option.share == 0)) return speaking.First(option => option.share == 0).set;
+        var complete = speaking.FirstOrDefault(option => option.missing.Count == 0);
+        if (complete != null) return complete.set;
         if (speaking.Count > 0) return Enumerable.Reverse(speaking).OrderBy(option => option.share).First().set;
         var nearest = options.OrderBy(option => option.share).First();
         throw new InvalidOperationException(

@@ -23,6 +23,7 @@ MESHES = [
     "A I U E O Blink_L Fcl_MTH_A Fcl_EYE_Close Face.M_F00_000_Fcl_MTH_I \u3042",
     "A I happy",
     "I U E O",
+    "happy Blink",
     "jawOpen",
     "0 1 2",
 ]

@@ -56,6 +56,7 @@ def test_a_shape_is_the_sum_of_its_parts_or_its_first_name() -> None:
         ("jawOpen A I U E O", "vrm"),
         ("mouthPucker eyeBlinkLeft", "it has no shape jawOpen of ARKit"),
         ("I U E O", "it has no shape aa of VRM"),
+        ("happy Blink", "it has no shape aa, ih, ou, ee, oh of VRM"),
         ("0 1 2", "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit"),
         ("", "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit"),
     ],

@@ -70,6 +70,7 @@ export class Head {
   /** Load a head and replace the current one. */
   async load(url) {
     const gltf = await new GLTFLoader().loadAsync(url);
+    if (!gltf.scene.getObjectByName("kouxing")?.userData.kouxing) throw new Error("it is not an exported head");
     if (this.#isSoftware) await coarsen(gltf);
     this.#model?.removeFromParent();
     this.#model?.traverse(({ geometry, material }) => {
