@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, BinaryIO, NamedTuple, cast
 
 import av
@@ -64,15 +65,17 @@ class MediaSound:
         self.notices: list[str] = []
         self._name = name
         self._mixers: dict[tuple[str, str, int], list[Any]] = {}
+        self._file = _GuardedFile(file, can_seek=not is_pipe)
         try:
             self._container: Any = av.open(
-                file,
+                self._file,
                 mode="r",
                 options=_PIPE_OPTIONS if is_pipe else _OPTIONS,
                 buffer_size=4096 if is_pipe else 65536,
                 metadata_errors="replace",
             )
         except (av.error.FFmpegError, ValueError) as error:
+            self._file.check()
             raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
         try:
             self._stream = self._choose(track, begin)
@@ -131,11 +134,11 @@ class MediaSound:
             try:
                 packet = next(packets, None)
             except (av.error.FFmpegError, ValueError):
+                self._file.check()
                 self._on_damage(self._read_end_s)
                 self._is_stopped = True
                 return
-            except OSError as error:
-                raise UserError(f"{self._name}: cannot read on: {error.strerror}") from None
+            self._file.check()
             if packet is None:
                 return
             end_s = _end_s(packet)
@@ -277,6 +280,33 @@ def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
             return bool(has_pictures and container.streams.audio)
     except (av.error.FFmpegError, ValueError) as error:
         raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
+
+
+class _GuardedFile:
+    """A file that keeps an exception, such as Ctrl-C. FFmpeg would take it for the end."""
+
+    def __init__(self, file: BinaryIO, *, can_seek: bool) -> None:
+        self.name = str(getattr(file, "name", ""))
+        self._failure: BaseException | None = None
+        self._read = file.read
+        self.read = partial(self._call, self._read)
+        if can_seek:
+            self.seek, self.tell = partial(self._call, file.seek), partial(self._call, file.tell)
+
+    def check(self) -> None:
+        """Raise the exception, if any; ``UserError`` if the system cannot read the file."""
+        if isinstance(self._failure, OSError):
+            raise UserError(f"{self.name}: cannot be read to its end: {self._failure.strerror}")
+        if self._failure is not None:
+            raise self._failure
+
+    def _call(self, function: Callable[..., Any], *arguments: int) -> Any:
+        if self._failure is None:
+            try:
+                return function(*arguments)
+            except BaseException as failure:
+                self._failure = failure
+        return b"" if function is self._read else -1
 
 
 def pcm_of_wav(begin: bytes) -> WavPcm | None:

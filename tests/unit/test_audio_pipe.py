@@ -150,3 +150,22 @@ def test_reads_raw_audio_in_odd_pieces() -> None:
     source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), RawFormat(16000, 2), "x")
     read = np.concatenate(list(source.blocks))
     np.testing.assert_allclose(read.ravel() * 32768, values)
+
+
+@pytest.mark.parametrize("num_bytes", [0, 300, 3000, 9000])
+@pytest.mark.parametrize("name", ["a.mp3", "a.flac", "a.wav", "a.ogg"])
+def test_ctrl_c_ends_reading_at_any_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, num_bytes: int
+) -> None:
+    class InterruptedPipe(Pipe):
+        def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+            size = super().readinto(buffer)
+            if size == 0:
+                raise KeyboardInterrupt
+            return size
+
+    soundfile.write(tmp_path / name, SPEECH, RATE_HZ)
+    pipe = InterruptedPipe((tmp_path / name).read_bytes()[:num_bytes])
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(pipe)))
+    with pytest.raises(KeyboardInterrupt):
+        [*open_audio(Path("-")).blocks]
