@@ -79,8 +79,8 @@ def open_audio(
     The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
     is read as raw samples; ``raw`` is their format. ``is_raw``: the content is raw samples.
 
-    Raises ``UserError`` if the file is missing, empty, not audio, or below 8 kHz, or ``raw`` is
-    given and another format fits; while reading, if samples are not finite.
+    Raises ``UserError`` if the file is missing, empty, not audio, or below 8 kHz, or if ``raw`` is
+    given and another format fits. While reading, raises it if samples are not finite.
     """
     try:
         if path.is_dir():
@@ -251,7 +251,7 @@ def clipping_remarks(name: str, share: float) -> list[str]:
 def raw_audio(
     stream: Readable, raw: RawFormat, name: str, num_bytes: int | None = None
 ) -> AudioSource:
-    """Read raw samples until the end of a stream, or only ``num_bytes`` of it."""
+    """Read raw samples until the end of a stream, or only ``num_bytes`` bytes."""
     rate_hz, num_channels = min(raw.sample_rate_hz, MAX_RATE_HZ), raw.num_channels
     _check_rate(name, raw.sample_rate_hz)
     remarks: list[str] = []
