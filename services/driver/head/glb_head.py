@@ -93,7 +93,7 @@ def _recognize(pieces: list[Primitive]) -> Names:
             raise BadGlbError(str(error)) from error
         for kind, standard in _SETS.items():
             for name, row in zip(standard.names, standard.basis, strict=True):
-                is_wanted = set_name != "arkit" and _NOT_MOUTH.match(name)
+                is_wanted = set_name != "arkit" and _NOT_MOUTH.search(name)
                 if row.any() and (kind == set_name or is_wanted):
                     table[name] = row.astype(float)
     for piece in pieces:
@@ -118,7 +118,7 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
     _check_single_face(pieces, known)
     eyes = _eyes(glb, pieces, names)
     turn = _upright(
-        eyes, _moved_center(pieces, [name for name in known if not _NOT_MOUTH.match(name)])
+        eyes, _moved_center(pieces, [name for name in known if not _NOT_MOUTH.search(name)])
     )
     for piece in pieces:
         piece.vertices = piece.vertices @ turn.T
