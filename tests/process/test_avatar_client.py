@@ -14,8 +14,6 @@ import pytest
 from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
 from tests.system import ROOT
 
-pytestmark = pytest.mark.process
-
 CLIENT = ROOT / "clients" / "javascript"
 ARKIT = ["jawOpen", "mouthPucker", "eyeBlinkLeft", "eyeBlinkRight"]
 VRCHAT = [f"vrc.v_{viseme}" for viseme in ("sil", "pp", "aa", "ih", "oh", "ou")]

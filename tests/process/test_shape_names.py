@@ -7,13 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from tests.system import ROOT
-
-pytestmark = pytest.mark.process
 
 MESHES = [
     "Face.jawOpen mouthPucker mouthSmile.L mouthSmileR BROWINNERUP eyeLookOut_L head_A",

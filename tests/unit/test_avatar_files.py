@@ -20,8 +20,6 @@ from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
 from tests.glb_writer import read_chunks, write_chunks, write_glb
 from tests.meshes import meshes
 
-pytestmark = pytest.mark.unit
-
 JAW, AA = (shapes.basis[shapes.names.index(n)] for shapes, n in ((ARKIT, "jawOpen"), (VRM, "aa")))
 SHAPES = dict(zip(ARKIT.names, ARKIT.basis, strict=True))
 

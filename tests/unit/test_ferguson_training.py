@@ -11,16 +11,13 @@ from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.key_frames import key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.ferguson.recipe import (
-    AlignedSpeech,
     fit_openings,
-    phone_table,
     relative_openings,
     travel_of,
 )
-from tests.lips import clip_of, phone, utterance
+from tests.lips import clip_of, utterance
 
 INVENTORY = load_inventory()
 TABLE = load_table(INVENTORY)
@@ -45,28 +42,3 @@ def test_recovers_openings() -> None:
     travel = faps_of([5.0])[0] / scale
     np.testing.assert_allclose(travel_of([clip]), travel, rtol=0.05, atol=1e-9)
     assert len(travel_of([clip])) == len(MOUTH_FAPS)
-
-
-def aligned(lengths_s: list[tuple[str, float]]) -> list[Phone]:
-    phones, onset_s = [], 0.0
-    for index, (symbol, length_s) in enumerate(lengths_s):
-        phones.append(phone(index, symbol, onset_s, length_s))
-        onset_s += length_s
-    return phones
-
-
-def test_computes_durations_crossings_and_influence() -> None:
-    phones = aligned([("s", 0.1), ("a", 0.1), ("m", 0.04), ("i", 0.16)] * 30)
-    slices = [
-        Progress(
-            time_s=0.02 * number, level_db=-20.0, zero_crossing_rate=0.8 * ((number - 1) % 20 < 5)
-        )
-        for number in range(1, 601)
-    ]
-    speech = AlignedSpeech(slices, [("s", "a"), ("m", "i")] * 30, phones)
-    usual = phone_table({}, [speech], INVENTORY)
-    assert usual.duration_s["s"] == pytest.approx(0.1, abs=0.01)
-    assert usual.duration_s["m"] == pytest.approx(0.04, abs=0.01)
-    assert usual.crossings["s"] > usual.crossings["m"]
-    assert usual.influence["a"] > usual.influence["ei"] > usual.influence["i"]
-    assert usual.level["a"] == 1

@@ -16,8 +16,6 @@ from kouxing.services.recognizer.search.forced_path import (
 )
 from tests.languages import MANDARIN, SIL
 
-pytestmark = pytest.mark.unit
-
 FIRST_STATE = np.arange(len(MANDARIN) + 1) * 3
 HALF = np.full(len(MANDARIN) * 3, np.log(0.5), np.float32)
 

@@ -5,30 +5,18 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import soundfile
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.four_schemes import (
-    Condition,
-    RecognizerOutput,
     delay_by_one_phone,
-    face_input,
     without_corrections,
 )
-from kouxing.evaluation.lips.schemes import drop_first_hypotheses
-from kouxing.evaluation.mos.commands import app as mos
-from kouxing.services.driver.video import film
-from kouxing.services.lip_models import lip_model_info
-from kouxing.services.recording_chain import AnalyzedRecording
-from kouxing.services.synthesizer.face_animator import Frame
 from kouxing.shared.audio_file import check_video
-from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
-from tests.videos import write_video
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
@@ -86,19 +74,6 @@ def test_scheme_4_delays_each_phone_by_one() -> None:
     assert isinstance(told[-1], SpeechChange)
 
 
-def test_live_schemes_use_the_recognizers_rule() -> None:
-    lips = "dynamic-visemes"
-    nothing = AnalyzedRecording(duration_s=0.0, events=[], is_text_known=False)
-    for has_paper_rule, live, next_phone in (
-        (True, without_corrections(LIVE), delay_by_one_phone(LIVE)),
-        (False, LIVE, drop_first_hypotheses(LIVE)),
-    ):
-        events = {lip_model_info(lips).delay_ms / 1e3: LIVE}
-        output = RecognizerOutput(nothing, events, has_paper_rule)
-        assert face_input(Condition(3, lips, "gmm"), output) == live
-        assert face_input(Condition(4, lips, "gmm"), output) == next_phone
-
-
 def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
     samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=11_200)
     soundfile.write(tmp_path / "hello.wav", samples, rate_hz)
@@ -132,61 +107,3 @@ def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
         score["jerk"] > 0.0 and score["like_real_lips"] is None for score in figures["scores"]
     )
     assert [order["reference"] for order in figures["orders"]] == ["scheme 1"]
-
-
-def write_clip(folder: Path, name: str, transcript: str) -> None:
-    """Write a syllable or two with lips that are 100 units further apart than at rest."""
-    samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=8_000)
-    soundfile.write(folder / f"{name}.flac", samples, rate_hz)
-    about = {"language": "zh", "speaker": name, "transcript": transcript}
-    (folder / f"{name}.json").write_text(json.dumps(about), encoding="utf-8")
-    rows = "".join(f"{number / 25},{number % 2},{-100 + number % 2}\n" for number in range(13))
-    (folder / f"{name}.csv").write_text("t,F4_lower_t_midlip,F5_raise_b_midlip\n" + rows)
-
-
-def test_videos_of_clips_form_a_listening_test(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clips, videos = tmp_path / "clips", tmp_path / "videos"
-    clips.mkdir()
-    write_clip(clips, "told", "你好")
-    write_clip(clips, "untold", "")
-    (clips / "held.txt").write_text("told untold\n")
-    drawn: dict[str, list[Frame]] = {}
-
-    def render_video(frames: list[Frame], path: Path, *_: object, **__: object) -> None:
-        drawn.setdefault(path.parent.name, frames)
-        write_video(path)
-
-    monkeypatch.setattr(film, "render_video", render_video)
-    arguments = ["schemes", "--clips", str(clips), "--acoustic", "neural", "--lips", "learnt"]
-    outputs = ["--videos", str(videos), "--anchor"]
-    for more in ([], ["--sound-at-once"]):
-        result = CliRunner().invoke(app, [*arguments, *outputs, *more], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-    live = [f"scheme{number}-learnt-neural" for number in (3, 4)]
-    late = [f"{name}-sound-at-once" for name in live]
-    assert set(drawn) == {"anchor", "tracked", "scheme2-learnt-neural", *live, *late}, (
-        "scheme 1 cannot be made of all"
-    )
-    made = CliRunner().invoke(
-        mos, ["new", str(videos), "--reference", "tracked", "--anchor", "anchor"]
-    )
-    assert made.exit_code == 0, made.output
-
-    delay_s = lip_model_info("learnt").delay_ms / 1e3
-    for in_time, as_made in zip(live, late, strict=True):
-        shown_s = [time_s for time_s, _ in drawn[as_made]]
-        assert shown_s == pytest.approx([time_s + delay_s for time_s, _ in drawn[in_time]])
-    mouth, lower_lip = np.array(MOUTH_FAPS) - 1, 4
-    own, still, real = (
-        np.array([faps for _, faps in drawn[name]])
-        for name in ("scheme2-learnt-neural", "anchor", "tracked")
-    )
-    assert np.ptp(own[:, mouth]) > 0.0
-    assert not still[:, mouth].any()
-    assert real[:, lower_lip] == pytest.approx(-100.0, abs=1.0)
-    rest = np.delete(np.arange(own.shape[1]), mouth)
-    assert np.ptp(own[:, rest]) > 0.0, "the head moves"
-    for other in (still, real):
-        assert np.array_equal(other[:, rest], own[:, rest])

@@ -16,8 +16,6 @@ from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from tests import heads
 from tests.lips import viseme_faps
 
-pytestmark = pytest.mark.unit
-
 VISEMES = "a i u o e v f b".split()
 SIZE_PX = (640, 480)
 MIN_PIXELS = 300  # that differ between two mouths,

@@ -8,25 +8,19 @@ import pytest
 import soundfile
 import torch
 
-from kouxing.corpora.feature_cache import as_floats
-from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.network import WINDOW
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks import batches as blocks
-from kouxing.training.neural import augmentation, recipe, teacher
-from kouxing.training.neural.augmentation import augment_samples, scale_level
-from kouxing.training.neural.batches import Recording, Targets, augment
+from kouxing.training.neural import teacher
 from kouxing.training.neural.export import onnx_of
 from kouxing.training.neural.initial_network import load_whisper
 from kouxing.training.neural.network import Network, Shape
 from kouxing.training.neural.optimizer import cross_entropy
-from kouxing.training.neural.recipe import train_network, train_neural
-from kouxing.training.training_set import load_untranscribed
-from tests.tones import burst, tones
+from kouxing.training.neural.recipe import train_neural
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -102,62 +96,7 @@ def test_rejects_files_of_other_kinds_and_sizes(tmp_path: Path) -> None:
     refused("not a Whisper model")
 
 
-def test_rejects_a_file_that_is_cut(tmp_path: Path) -> None:
-    write_whisper(tmp_path, encoder_arrays(num_layers=2))
-    path = tmp_path / "model.bin"
-    content = path.read_bytes()
-    for size in (*range(1, 90, 7), len(content) // 2, len(content) - 5):
-        path.write_bytes(content[:size])
-        with pytest.raises(UserError, match="not a Whisper model"):
-            load_whisper(Network(SHAPE), tmp_path)
-
-
 # --- augmentation
-
-
-def test_augmentation_is_reproducible() -> None:
-    results = []
-    for seed in (*range(40), *range(40)):
-        rng = np.random.default_rng(seed)
-        sound, speed = augment_samples(HELLO, rng)
-        results.append(scale_level(sound, rng))
-        assert len(sound) == pytest.approx(len(HELLO) / speed, abs=1)
-        assert np.isfinite(results[-1]).all()
-        assert 10 ** (-36.1 / 20) < np.abs(results[-1]).max() <= 1.001
-    for first, second in zip(results[:40], results[40:], strict=True):
-        np.testing.assert_array_equal(first, second)
-    assert len({len(sound) for sound in results}) == 8  # speeds
-    silence = np.zeros(4000, np.float32)
-    for seed in range(40):
-        assert np.abs(augment_samples(silence, np.random.default_rng(seed))[0]).max() < 1e-3
-
-
-def test_targets_stay_aligned_under_augmentation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a tone begins and ends, its targets do, whatever the speed and the tempo."""
-    for share in ("_ROOM_PROB", "_NOISE_PROB"):
-        monkeypatch.setattr(augmentation, share, 0.0)
-    sound = burst(1.0, 1.8, 3.0)
-    middle_s = (np.arange(298) * 160 + 200) / 16_000
-    inside = (middle_s >= 1.0) & (middle_s < 1.8)
-    tone = Targets(
-        np.outer(inside, [3, 5]).astype(np.uint16), np.full((298, 2), [0.75, 0.25], np.float16)
-    )
-    targets = Targets.hard(inside.astype(np.int64)).averaged_with(tone)
-    samples = np.rint(32767 * sound).astype(np.int16)
-    recording = Recording(samples=samples, targets=targets, weight=1.0)
-    lengths = []
-    for seed in range(60):
-        frames, changed = augment(recording, np.random.default_rng(seed))
-        assert frames.shape == (len(changed), NUM_MELS)
-        loud = frames.max(axis=1) > frames.max() - 0.5
-        at, target = np.flatnonzero(loud), np.flatnonzero(changed.states[:, 0])
-        np.testing.assert_array_equal(changed.states, changed.states[:, :1] * np.array([1, 3, 5]))
-        np.testing.assert_array_equal(changed.probs[7], [0.5, 0.375, 0.125])
-        assert abs(at[0] - target[0]) <= 2
-        assert abs(at[-1] - target[-1]) <= 2
-        lengths.append(len(frames))
-    assert min(lengths) < 250
-    assert max(lengths) > 350
 
 
 def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
@@ -181,23 +120,6 @@ def random_frames(num_frames: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(
         np.random.default_rng(seed).normal(0, 0.5, (1, num_frames, NUM_MELS)).astype(np.float32)
     )
-
-
-@torch.no_grad()
-def test_the_network_is_causal() -> None:
-    torch.manual_seed(0)
-    network = Network(SHAPE).eval()
-    frames = random_frames(41)
-    hidden = network(frames)
-    assert hidden.shape == (1, 20, 32)
-    for position in (0, 7, 18):
-        last_seen = 2 * position + 2
-        changed = frames.clone()
-        changed[:, last_seen + 1 :] = 3.0
-        torch.testing.assert_close(network(changed)[:, : position + 1], hidden[:, : position + 1])
-        changed = frames.clone()
-        changed[:, last_seen] += 3.0
-        assert (network(changed)[0, position] - hidden[0, position]).abs().max() > 1e-3
 
 
 def test_onnxruntime_computes_what_pytorch_does() -> None:
@@ -232,30 +154,6 @@ def test_the_loss_is_the_cross_entropy_of_soft_targets() -> None:
     assert float(cross_entropy(posteriors.log(), states, 0 * probs)) == 0.0
 
 
-def test_the_network_learns_tones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its first output layer recognizes the tones of an unseen recording."""
-    monkeypatch.setattr(recipe, "_RATE", 5e-3)
-    monkeypatch.setattr(recipe, "_NEW_RATE", 5e-3)
-    monkeypatch.setattr(recipe, "_WARM_UP_STEPS", 2)
-    monkeypatch.setattr(blocks, "BATCH_S", 3)
-    monkeypatch.setattr(blocks, "_LENGTHS", (40,))
-    for prob in ("_DISTURB_PROB", "_TEMPO_PROB", "_HURRY_PROB"):
-        monkeypatch.setattr(blocks, prob, 0.0)
-    torch.manual_seed(0)
-    network = Network(SHAPE)
-    with torch.no_grad():  # trained convolutions differ more than new ones
-        network.first.weight *= 6
-        network.second.weight *= 6
-    recordings = [tones(seed) for seed in range(8)]
-    trained = train_network(network, recordings, seed=0, num_steps=100, report=lambda _: None)
-    unseen = tones(100)
-    frames = torch.from_numpy(WhisperMel().accept_waveform(as_floats(unseen.samples)))[None]
-    with torch.no_grad():
-        states = trained.log_posteriors(trained(frames), 0)[0].flatten(0, 1).argmax(dim=1).numpy()
-    truth = unseen.targets.states[1 : 1 + len(states), 0]  # a look-ahead of one frame
-    assert np.mean(states[: len(truth)] == truth) > 0.9
-
-
 # --- the recipe
 
 
@@ -285,22 +183,3 @@ def test_trains_and_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.Mo
     card = output.with_suffix(".md").read_text()
     assert "CC0-1.0" in card
     assert "aligned by `gmm.npz`, on 3 recordings" in card
-
-
-def test_trims_and_cuts_recordings_without_text(tmp_path: Path) -> None:
-    silence = np.zeros(20_000, np.float32)
-    long = np.concatenate([silence, *[HELLO] * 20, silence])
-    soundfile.write(tmp_path / "a.flac", long, 16_000)
-    soundfile.write(tmp_path / "b.wav", HELLO[:2000], 16_000)
-    (tmp_path / "c.ogg").write_bytes(b"no sound")
-    (tmp_path / "d.txt").write_text("no sound")
-    (tmp_path / "MOSS-TTSD_kept_back.ogg").write_bytes(b"not read")
-    errors = RowErrors()
-    first, second = load_untranscribed([tmp_path], errors)
-    assert len(first) == 2000 * 160 + 240
-    assert 8 * 16_000 < len(second) < 11 * 16_000
-    np.testing.assert_array_equal(first[2000 * 160 :], second[:240])
-    assert [message.split(": ", 1)[1] for message in errors.messages] == [
-        f"no audio in {tmp_path / 'c.ogg'}; row skipped",
-        "it is too short; row skipped",
-    ]

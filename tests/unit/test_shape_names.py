@@ -9,8 +9,6 @@ from kouxing.shared.face.shape_names import TABLE, choose_set, find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.system import ROOT
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize(
     ("set_name", "shape", "names"),

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.evaluation.lips.speaking_rates import (
-    BEST_OPENING,
-    STILL,
     accuracy_of,
-    bounds,
-    scale_openings,
 )
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -34,18 +30,3 @@ def test_accuracy_ignores_unmeasured_points_and_other_faps() -> None:
     made[:, MOUTH_FAPS.index(3)] = 1e4  # the jaw is no lip
     made[:, MOUTH_FAPS.index(6)] = 1e4  # the paper moves lips vertically
     assert accuracy_of(made, real) == pytest.approx(0.5)
-
-
-def test_scales_every_speaker_to_the_same_opening() -> None:
-    real = faps_of(OPENINGS)
-    scaled = scale_openings(["a", "b", "a"], [3.0 * real, 0.2 * real, 1.5 * real])
-    assert np.nanmax(scaled[0][:, MOUTH_FAPS.index(52)]) == pytest.approx(0.0)
-    np.testing.assert_allclose(scaled[0], 2.0 * scaled[2])
-    assert scaled[1][4] == pytest.approx(real[4], rel=0.1)
-
-
-def test_bounds_of_one_opening_and_of_a_still_mouth() -> None:
-    real = faps_of(OPENINGS)
-    scores = bounds(real)
-    assert scores[BEST_OPENING] == pytest.approx(1.0)
-    assert scores[STILL] < 0.6

@@ -6,16 +6,11 @@ import torch
 from scipy.special import erf, softmax
 
 from kouxing.services.recognizer.acoustic.network import position_table
-from kouxing.services.recognizer.front_end.features import frames_in
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.training.neural import teacher
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import (
-    Teacher,
     WholeEncoder,
-    train_teacher,
 )
-from tests.tones import tones
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
@@ -73,41 +68,3 @@ def test_the_encoder_computes_its_formulas() -> None:
     with torch.no_grad():
         found = encoder(torch.from_numpy(bands)[None])[0].numpy()
     np.testing.assert_allclose(found, np.hstack(after[1:]), atol=1e-4)
-
-
-@pytest.mark.parametrize("num_frames", [1, 20, 45])
-def test_cuts_long_recordings_into_pieces(num_frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(teacher, "_PIECE_FRAMES", 20)
-    encoder = whole_encoder()
-    samples = tones(0).samples[8000 : 8000 + 240 + 160 * num_frames]
-    assert frames_in(len(samples)) == num_frames
-    features = encoder.features(samples)
-    assert features.shape == ((num_frames + 1) // 2, 96)
-    for start in range(0, num_frames, 20):
-        alone = encoder.features(samples[160 * start : 160 * (start + 20) + 240])
-        np.testing.assert_array_equal(features[start // 2 : start // 2 + 10], alone)
-
-
-# --- the readout
-
-
-def taught(num_steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Teacher, list[str]]:
-    monkeypatch.setattr(teacher, "_NUM_CROPS", 7)
-    monkeypatch.setattr(teacher, "_CROP_POSITIONS", 30)
-    monkeypatch.setattr(teacher, "_NUM_STEPS", num_steps)
-    lines: list[str] = []
-    recordings = [tones(seed) for seed in range(12)]
-    return train_teacher(whole_encoder(), recordings, seed=0, report=lines.append), lines
-
-
-def test_the_teacher_learns_tones(monkeypatch: pytest.MonkeyPatch) -> None:
-    learnt, lines = taught(100, monkeypatch)
-    unseen = tones(100)
-    targets = learnt.targets_of(unseen.samples)
-    assert targets.states.shape == targets.probs.shape == (98, 6)
-    np.testing.assert_allclose(targets.probs.sum(axis=1, dtype=np.float32), 1.0, atol=2e-3)
-    assert (np.diff(targets.probs, axis=1) <= 0).all()
-    # a frame early or late would be 0.95
-    assert np.mean(targets.states[:, 0] == unseen.targets.states[:, 0]) > 0.97
-    assert "12 of 12 recordings encoded for the teacher" in lines
-    assert lines[-1].startswith("teacher, step 100: ")

@@ -17,7 +17,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.visemes.fit import estimate, frames_of
-from kouxing.training.visemes.recipe import closure_reach, train_visemes
+from kouxing.training.visemes.recipe import train_visemes
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
 
 INVENTORY = load_inventory()
@@ -55,16 +55,6 @@ def test_estimates_the_parameters_behind_curves() -> None:
     )
     assert found.target[VISEME_INDEX["b"], LOWER_LIP] == 0.0
     assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
-
-
-def test_closures_last_as_long_as_in_the_clips() -> None:
-    phones = utterance(3, 80)
-    time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.02)
-    for reach_s in (0.05, 0.1):
-        curve = blend(
-            replace(START, closure_reach_s=reach_s), build_timeline(phones, INVENTORY), time_s
-        )
-        assert closure_reach(START, [clip_of(time_s, curve)], [phones], INVENTORY) == reach_s
 
 
 def write_clip(
