@@ -59,6 +59,18 @@ class AnalyzedRecording:
         return [event for event in self.events if isinstance(event, Phone)]
 
 
+def recognize_recording(
+    model: AcousticModel, samples: NDArray[np.float32], with_progress: WithProgress = iter
+) -> list[Phone]:
+    """Return the phones of ``analyze_recording``, which has the parameters."""
+    return decode_offline(
+        model,
+        score_recording(
+            model, samples, MEDIA_RATE_HZ, silence_s=MAX_DELAY_S, with_progress=with_progress
+        ),
+    )
+
+
 def analyze_recording(
     model: AcousticModel,
     samples: NDArray[np.float32],

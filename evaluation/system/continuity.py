@@ -37,9 +37,7 @@ class Continuity:
     late_p95_ms: float
 
 
-def compare(
-    seen: Seen, undisturbed: Seen, silence: str, delay_s: float, *, fault_s: float
-) -> Continuity:
+def compare(seen: Seen, undisturbed: Seen, delay_s: float, *, fault_s: float) -> Continuity:
     """Compare results with a fault at ``fault_s`` with those without; ``delay_s`` is the face's."""
     arrived_s = np.array([arrival_s for arrival_s, _ in seen.frames])
     times = np.array([frame.media_time for _, frame in seen.frames], np.int64)
@@ -47,7 +45,7 @@ def compare(
     is_new = times > newest
     is_rest = np.diff(times, prepend=-1) == 0
     said, heard = (
-        [phone.symbol for phone in record.final_phones(silence)] for record in (undisturbed, seen)
+        [phone.symbol for phone in record.spoken_phones()] for record in (undisturbed, seen)
     )
     errors = count_errors(said, heard)
     due_s = seen.start_s + delay_s + times / MEDIA_RATE_HZ

@@ -38,7 +38,6 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
-from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
 NUM_SESSIONS = 16
 SPIN = """
@@ -307,7 +306,6 @@ def _outcome(
         if not undisturbed:
             undisturbed.append(speak_undisturbed(client, sound))
         sessions, num_refused = _open_all(client, fault.num_sessions)
-        silence = load_inventory(sessions[0].info["facts"]["language"] or DEFAULT_LANGUAGE).silence
         actions = fault.actions(system, sessions[0].name, timing)
         start_s = time.monotonic()
 
@@ -323,9 +321,7 @@ def _outcome(
     failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
     fault_s = start_s + timing.fault_at_s
     faces = [
-        compare(seen, undisturbed[0], silence, delay_s, fault_s=fault_s)
-        for seen in all_seen
-        if seen.frames
+        compare(seen, undisturbed[0], delay_s, fault_s=fault_s) for seen in all_seen if seen.frames
     ]
     return Outcome(
         fault=name,

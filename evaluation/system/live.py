@@ -49,23 +49,21 @@ class Seen:
             and {frame.epoch for _, frame in self.frames} == {1}
         )
 
-    def final_phones(self, silence: str) -> list[Phone]:
-        """Return the final phones of all epochs in order, without silence and withdrawn phones.
+    def spoken_phones(self) -> list[Phone]:
+        """Return the spoken phones of all epochs in order.
 
         A new recognizer starts with a speech message. From there on, the phones of earlier epochs
         are invalid.
         """
-        last = {(phone.epoch, phone.index): phone for phone in self.phones}
-        final = [phone for phone in last.values() if phone.final and phone.duration > 0]
+        spoken = [phone for phone in self.phones if phone.is_spoken]
         starts = {speech.epoch: speech.media_time for speech in self.speech if speech.sequence == 1}
         for epoch, start in starts.items():
-            final = [
+            spoken = [
                 phone
-                for phone in final
+                for phone in spoken
                 if phone.epoch >= epoch or phone.media_time + phone.duration / 2 < start
             ]
-        final.sort(key=lambda phone: phone.media_time)
-        return [phone for phone in final if phone.symbol != silence]
+        return sorted(spoken, key=lambda phone: phone.media_time)
 
 
 def speak(

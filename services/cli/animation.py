@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -121,7 +121,7 @@ def animate(
         settings[0].frame_rate_hz,
         _IMAGE_RATE_HZ,
         samples,
-        _spoken_phones(events, model.inventory.silence),
+        [event for event in events if isinstance(event, Phone) and event.is_spoken],
     )
 
 
@@ -150,10 +150,3 @@ def _load_lip_predictor(model: AcousticModel, mouth: Path | None) -> LipPredicto
         return predictor.with_mouth_profile(profile)
     except UserError as error:
         raise UserError(f"--mouth {mouth}: {error}") from None
-
-
-def _spoken_phones(events: Iterable[SoundEvent], silence: str) -> list[Phone]:
-    """Return the last version of each phone, without silence and withdrawn phones."""
-    newest = {event.index: event for event in events if isinstance(event, Phone)}
-    spoken = [phone for phone in newest.values() if phone.symbol != silence]
-    return sorted(spoken, key=lambda phone: (phone.onset_s, phone.index))

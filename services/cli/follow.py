@@ -51,9 +51,12 @@ def follow(
     with connect(control) as client:
         followed = _wait_for_session(session, client)
         if shown is not ListenOutput.FAPS:
-            language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
             phones = _iter_until_interrupt(followed.results(Phone, keep_all=True), followed.name)
-            count = _print(_phone_lines(phones, shown, load_inventory(language)))
+            if shown is ListenOutput.SYLLABLES:
+                language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
+                count = _print(_syllable_lines(phones, load_inventory(language)))
+            else:
+                count = _print(_phone_lines(phones))
         else:
             frames = _iter_until_interrupt(followed.results(FapFrame, keep_all=True), followed.name)
             rows = map(_row, frames)
@@ -99,25 +102,34 @@ def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
         yield from results
 
 
-def _phone_lines(
-    messages: Iterable[Phone], shown: ListenOutput, inventory: PhoneInventory
-) -> Iterator[str]:
-    """Yield a line for each phone or syllable when it is final. Pauses have no line."""
+def _phone_lines(phones: Iterable[Phone]) -> Iterator[str]:
+    """Yield a line for each spoken phone."""
+    for phone in phones:
+        if phone.is_spoken:
+            yield _line(phone.time_s, to_seconds(phone.duration), phone.symbol)
+
+
+def _syllable_lines(phones: Iterable[Phone], inventory: PhoneInventory) -> Iterator[str]:
+    """Yield a line for each syllable when it is final. Pauses have no line."""
     track = SyllableTrack(inventory)
-    for message in messages:
-        phone = events.Phone(
-            index=message.index,
-            symbol=message.symbol,
-            onset_s=message.time_s,
-            duration_s=to_seconds(message.duration),
-            confidence=message.confidence,
-            final=message.final,
+    for phone in phones:
+        changed = track.update(
+            events.Phone(
+                index=phone.index,
+                symbol=phone.symbol,
+                onset_s=phone.time_s,
+                duration_s=to_seconds(phone.duration),
+                confidence=phone.confidence,
+                final=phone.final,
+            )
         )
-        changed = track.update(phone) if shown is ListenOutput.SYLLABLES else [phone]
-        for item in changed:
-            text = item.symbol if isinstance(item, events.Phone) else item.text
-            if item.final and item.duration_s > 0 and text != inventory.silence:
-                yield f"{item.onset_s:9.3f} s  {item.duration_s:6.3f} s  {text}"
+        for syllable in changed:
+            if syllable.final and syllable.duration_s > 0 and syllable.text != inventory.silence:
+                yield _line(syllable.onset_s, syllable.duration_s, syllable.text)
+
+
+def _line(onset_s: float, duration_s: float, text: str) -> str:
+    return f"{onset_s:9.3f} s  {duration_s:6.3f} s  {text}"
 
 
 def _row(frame: FapFrame) -> Row:

@@ -23,9 +23,9 @@ from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables
 from kouxing.services.recognizer.front_end.pcm import progress_of
-from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
+from kouxing.services.recording_chain import recognize_recording
 from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
 from kouxing.services.synthesizer.lips.ferguson.key_frames import (
@@ -137,7 +137,7 @@ def _time_phones(
         return time_text(progress_of(samples), transcript.phones, load_table(load_inventory()))
     model = load_live_model()
     if transcript is None:
-        return recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+        return recognize_recording(model, samples, with_progress)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     if not alignment.fits:
         print_message(mismatch_message(source, alignment))

@@ -202,7 +202,7 @@ def phones(
     """Recognize the phones of audio files, with their times."""
     from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
-    from kouxing.services.recognizer.offline import recognize
+    from kouxing.services.recording_chain import recognize_recording
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.phone_files import format_phones
 
@@ -222,7 +222,7 @@ def phones(
         duration_s = len(samples) / MEDIA_RATE_HZ
         with open_progress() as progress:
             with_progress = partial(progress.track, description="recognizing")
-            recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+            recognized = recognize_recording(model, samples, with_progress)
         if not recognized:
             print_message(f"{source}: no speech was found")
         write_output(format_phones(recognized, style, duration_s), target)

@@ -21,7 +21,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from kouxing.shared.audio_file import AudioSource, clipping_remarks, num_clipped
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
 PUSH_TIMEOUT_S = 30.0
 STATUS_S = 1.0  # between status requests
@@ -73,6 +72,7 @@ class _Streaming:
         self._source = source
         self._console = console
         self._duration_s = self._clipped = self._peak = 0.0  # of what was sent
+        self._num_phones = 0
 
     def run(self, *, record: bool, paced: bool, **options: Any) -> StreamSummary:
         """Stream the source and wait for the last frame and the video."""
@@ -88,13 +88,10 @@ class _Streaming:
             paced=paced,
             **options,
         )
-        self._phones: set[int] = set()  # indices of those that are not silence
         try:
             self._events = self._session.events()
             self._frames = self._session.frames()
             self._results = self._session.results(Phone, keep_all=True)
-            language = self._session.info["facts"]["language"] or DEFAULT_LANGUAGE
-            self._silence = load_inventory(language).silence
             with self._progress() as progress:
                 task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
                 self._show_time = functools.partial(progress.update, task)
@@ -105,12 +102,12 @@ class _Streaming:
             with contextlib.suppress(KouxingError):  # closed already, or control is gone
                 self._session.close()
         video = self._wait_for_video(drawn_before_s) if record else ""
-        if not self._phones:
+        if not self._num_phones:
             reason = "it is silent" if self._peak < QUIET_PEAK else "is there a voice in it?"
             self._warn(f"{source.name}: no speech was found; {reason}")
         for remark in (*source.remarks, *clipping_remarks(source.name, self._clipped)):
             self._warn(remark)
-        return StreamSummary(self._session.name, self._duration_s, len(self._phones), video)
+        return StreamSummary(self._session.name, self._duration_s, self._num_phones, video)
 
     def _progress(self) -> Progress:
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -121,9 +118,7 @@ class _Streaming:
         """Process what has arrived, waiting up to the timeout for a frame."""
         for frame in self._frames.available(timeout_s):
             self._show_time(completed=frame.time_s)
-        for phone in self._results.available():
-            if phone.symbol != self._silence:
-                self._phones.add(phone.index)
+        self._num_phones += sum(phone.is_spoken for phone in self._results.available())
 
     def _send_all(self, *, paced: bool) -> None:
         source = self._source

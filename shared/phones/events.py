@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from kouxing_client.messages import SILENCE
 from numpy.typing import NDArray
 
 
@@ -31,6 +32,11 @@ class Phone:
     def is_withdrawn(self) -> bool:
         """Whether the phone was emitted by mistake."""
         return self.final and self.duration_s == 0.0
+
+    @property
+    def is_spoken(self) -> bool:
+        """Whether the phone counts, as ``kouxing_client.Phone.is_spoken``."""
+        return self.final and self.duration_s > 0.0 and self.symbol != SILENCE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

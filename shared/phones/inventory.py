@@ -18,7 +18,7 @@ column          meaning
 =============== ===================================================================================
 phone           symbol, 1 to 4 lower-case letters
 kind            ``initial`` (a consonant that begins a syllable), ``vowel`` (the rest of a syllable)
-                or ``silence`` (exactly one row)
+                or ``silence`` (exactly one row, ``sil``)
 visemes         the phone's mouth shapes in order, ``name:share`` separated by spaces; the shares of
                 its duration add up to 1
 before_rounded  the phone's viseme before a rounded one, if different; may be empty
@@ -36,6 +36,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import resources
 from importlib.metadata import entry_points
+
+from kouxing_client.messages import SILENCE
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
@@ -75,10 +77,11 @@ class PhoneInventory:
             )
         if len(self.phones) > MAX_PHONES:
             raise UserError(f"language {self.language}: more than {MAX_PHONES} phones")
-        if self.kinds.count("silence") != 1 or not set(self.kinds) <= set(KINDS):
+        silent = [p for p, kind in zip(self.phones, self.kinds, strict=True) if kind == "silence"]
+        if silent != [SILENCE] or not set(self.kinds) <= set(KINDS):
             raise UserError(
                 f"language {self.language}: each phone's kind must be one of {', '.join(KINDS)}, "
-                "and exactly one phone must be silence"
+                f"and exactly one phone must be silence: {SILENCE}"
             )
         for phone in self.phones:
             total = sum(share for _, share in self.visemes.get(phone, ()))
@@ -95,24 +98,20 @@ class PhoneInventory:
         """Position of each phone in ``phones``."""
         return {phone: position for position, phone in enumerate(self.phones)}
 
-    @cached_property
+    @property
     def silence(self) -> str:
         """The phone for a pause."""
-        return self.phones[self.kinds.index("silence")]
+        return SILENCE
 
     @cached_property
     def initials(self) -> frozenset[str]:
         """Consonants that begin a syllable."""
-        return frozenset(
-            p for p, kind in zip(self.phones, self.kinds, strict=True) if kind == "initial"
-        )
+        return self._of_kind("initial")
 
     @cached_property
     def vowels(self) -> frozenset[str]:
         """Vowels, including the rest of the syllable."""
-        return frozenset(
-            p for p, kind in zip(self.phones, self.kinds, strict=True) if kind == "vowel"
-        )
+        return self._of_kind("vowel")
 
     def read(self, text: str) -> Transcript:
         """Return a text's syllables with their spelling, and the parts that cannot be read."""

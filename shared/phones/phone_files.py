@@ -10,7 +10,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TypeAlias
 
 from kouxing.shared.errors import UserError
@@ -26,14 +26,16 @@ def format_phones(
     total_s: float,
     syllables: Sequence[TimedSyllable] = (),
 ) -> str:
-    """Write phones in the order of their onsets as ``table``, ``csv``, ``json`` or ``textgrid``.
+    """Write the spoken phones, in order, as ``table``, ``csv``, ``json`` or ``textgrid``.
 
     ``total_s`` is the length of the recording. A TextGrid and JSON also contain the syllables of a
     known text. Raises ``UserError`` if the style is unknown.
     """
     if style not in _STYLES:
         raise UserError(f"unknown format {style!r}; choose from {', '.join(_STYLES)}")
-    return _STYLES[style](phones, total_s, syllables)
+    spoken = (phone for phone in phones if phone.is_spoken)
+    numbered = [replace(phone, index=number) for number, phone in enumerate(spoken)]
+    return _STYLES[style](numbered, total_s, syllables)
 
 
 def _cells(phone: Phone) -> tuple[int, str, float, float, float]:

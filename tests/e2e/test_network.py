@@ -21,7 +21,6 @@ from tests.containers import network_or_skip
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO
 
-SILENCE = "sil"
 CUT_AT_S = 1.0
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 
@@ -78,7 +77,7 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
 
 
 def symbols(seen: Seen, since: int = 0) -> list[str]:
-    return [each.symbol for each in seen.final_phones(SILENCE) if each.media_time >= since]
+    return [each.symbol for each in seen.spoken_phones() if each.media_time >= since]
 
 
 def assert_same(seen: Seen, expected: Seen, since: int = 0) -> None:

@@ -74,7 +74,7 @@ def test_csv_json_table_and_textgrid() -> None:
     assert [line.split() for line in table[1:2]] == [["0.250", "0.100", "n", "1.00"]]
     lines = format_phones(PHONES, "textgrid", 1.0).splitlines()
     assert lines[:2] == ['File type = "ooTextFile"', 'Object class = "TextGrid"']
-    assert [line.split('"')[1] for line in lines if "text =" in line] == ["", "n", "i", "", "sil"]
+    assert [line.split('"')[1] for line in lines if "text =" in line] == ["", "n", "i", ""]
     starts = [float(line.split("=")[1]) for line in lines if line.startswith("            xmin")]
     ends = [float(line.split("=")[1]) for line in lines if line.startswith("            xmax")]
     assert (starts, ends[-1]) == ([0.0, *ends[:-1]], 1.0)
@@ -141,7 +141,7 @@ def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
     assert names == ["characters", "syllables", "phones"]
     texts = [line.split('"')[1] for line in lines if "text =" in line]
     assert texts == [
-        "", "你", "", "好", "", "", "ni3", "", "hao3", "", "sil", "n", "i", "sil", "h", "ao", "",
+        "", "你", "", "好", "", "", "ni3", "", "hao3", "", "", "n", "i", "", "h", "ao", "",
     ]  # fmt: skip
     read = json.loads(format_phones(aligned, "json", 0.7, syllables))
     assert read["syllables"][1] == {

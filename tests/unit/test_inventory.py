@@ -39,6 +39,7 @@ def test_mandarin_has_the_phones_of_the_paper() -> None:
         ({"phones": ("m", "A", "sil")}, "1 to 4 letters a-z"),
         ({"phones": MANY}, "more than 255 phones"),
         ({"kinds": ("initial", "vowel", "vowel")}, "exactly one phone must be silence"),
+        ({"kinds": ("initial", "silence", "vowel")}, "exactly one phone must be silence: sil"),
         ({"kinds": ("initial", "final", "silence")}, "one of initial, vowel, silence"),
         ({"visemes": {"m": (("b", 1.0),), "a": (("a", 0.9),)}}, "viseme shares of a must add up"),
     ],

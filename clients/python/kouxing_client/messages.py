@@ -17,6 +17,7 @@ else:
 VERSION = 3
 MEDIA_RATE_HZ = 16000
 NUM_FAPS = 68
+SILENCE = "sil"  # the phone of a pause, in every language
 Fields = dict[str, Any]
 SHAPE_NAMES: dict[str, tuple[str, ...]] = {
     "arkit": tuple(
@@ -111,6 +112,11 @@ class Phone(Result, frozen=True, kw_only=True):
     """0 to 1"""
     final: bool
     """whether onset and duration are measured; otherwise the duration is an estimate"""
+
+    @property
+    def is_spoken(self) -> bool:
+        """Whether the phone counts: its last version, unless it is a pause or withdrawn."""
+        return self.final and self.duration > 0 and self.symbol != SILENCE
 
 
 class Speech(Result, frozen=True, kw_only=True):
