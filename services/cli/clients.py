@@ -182,12 +182,12 @@ def send(
 
 
 def express(
-    session: Annotated[str, typer.Argument(help="Name of the session.")],
-    expressions: Annotated[
+    arguments: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="NAME=STRENGTH",
-            help=f"Expressions with strengths from 0 to 1: {', '.join(ExpressionName)}.",
+            metavar="[SESSION] [NAME=STRENGTH]...",
+            help="A session, by default the face at rest and every session. Expressions with"
+            f" strengths from 0 to 1: {', '.join(ExpressionName)}.",
         ),
     ] = None,
     hold: Annotated[
@@ -195,13 +195,17 @@ def express(
     ] = DEFAULT_HOLD_S,
     control: Control = "",
 ) -> None:
-    """Show expressions on the face of a session. Without expressions, end those it shows."""
+    """Show expressions on a face. Without expressions, end those it shows."""
     from kouxing.shared.control_client import connect
 
-    strengths = dict(map(_parse_strength, expressions or ()))
+    words = list(arguments or ())
+    session = _session_name(words.pop(0)) if words and "=" not in words[0] else ""
+    strengths = dict(map(_parse_strength, words))
     check_expressions(strengths, hold)
     with connect(control_address(control)) as client:
-        client.set_face(_session_name(session), expressions=strengths, hold_s=hold)
+        all_sessions = [state.session for state in client.status().sessions]
+        for name in [session] if session else ["", *all_sessions]:
+            client.set_face(name, expressions=strengths, hold_s=hold)
 
 
 def _parse_strength(text: str) -> tuple[str, float]:

@@ -169,9 +169,14 @@ class ControlService(Service):
         return Done(session=message.session, request=message.request)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
-        record = self._sessions.find(message.session)
-        record.face.change(message.face, time.monotonic())
-        self._send_to_participants(record, replace(message, epoch=record.epoch, request=None))
+        if message.session == "":  # the face at rest, which only observers show
+            for instance in self._registry.observers():
+                peer = self._registry[instance].peer
+                self._commands.send(replace(message, request=None), to=peer)
+        else:
+            record = self._sessions.find(message.session)
+            record.face.change(message.face, time.monotonic())
+            self._send_to_participants(record, replace(message, epoch=record.epoch, request=None))
         if message.request is None:
             return None
         return Done(session=message.session, request=message.request)

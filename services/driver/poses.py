@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +74,10 @@ class Poses:
             start = names.index(self.shown) if self.shown else (-1 if step > 0 else 0)
             picked = names[(start + step) % len(names)]
             self._switched_to = "" if picked == self._default else picked
+
+    def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
+        """Show expressions on the face at rest."""
+        self._rest.express(strengths, hold_s)
 
     def is_stalled(self, now_s: float) -> bool:
         """Return whether the shown session has stopped sending frames."""

@@ -23,6 +23,7 @@ from kouxing.services.driver.video.recording import Recording
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.idle_motion import STALL_S
+from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
@@ -66,8 +67,13 @@ class DriverService(Service):
         )
 
     def control_handlers(self) -> dict[type[Message], Handler]:
-        """Return the handlers of control's messages; frames already have a face's settings."""
-        return super().control_handlers() | {SetFace: lambda _message, _sender: None}
+        """Return the handlers of control's messages."""
+        return super().control_handlers() | {SetFace: self._on_set_face}
+
+    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+        """Change the face at rest; the frames of a session already have its settings."""
+        if message.session == "" and message.face.expressions is not None:
+            self.poses.express(message.face.expressions, message.face.hold_s)
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""

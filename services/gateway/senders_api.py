@@ -7,7 +7,7 @@ configuration. It cannot make the gateway send to arbitrary hosts.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -35,6 +35,10 @@ class SendersApi:
         """Send a frame: 68 little-endian float32, FAP units."""
         faps = np.frombuffer(values, "<f4").astype(np.float32)
         self._senders.show(to_seconds(media_time), faps)
+
+    def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
+        """Show expressions on the face at rest."""
+        self._senders.express(strengths, hold_s)
 
     def close(self) -> None:
         """Stop all senders."""

@@ -229,7 +229,10 @@ class GatewayService(Service):
         }
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        """Notify a session's viewers that its lip model has changed."""
+        """Change the face at rest, or notify viewers that a session's lip model has changed."""
+        if message.session == "" and (strengths := message.face.expressions) is not None:
+            self._resting_face.express(strengths, message.face.hold_s)
+            self._senders.express(strengths, message.face.hold_s)
         session = self._sessions.get(message.session)
         if session is not None and message.face.lip_model is not None:
             session.start = replace(

@@ -46,7 +46,7 @@ class Viewers:
 
     ``play_sample`` starts the sample sentence with a lip model, unless it is playing, and returns
     its session. This session counts as the newest only if there is no other. ``set_face`` sends
-    control the settings of a session's face.
+    control the settings of a session's face, or of the face at rest ("").
     """
 
     def __init__(
@@ -194,9 +194,9 @@ class Viewers:
                     raise UserError("a viewer can choose lips only for the sample sentence")
                 self._choose_sample_lip_model(lip_model)
             elif settings is not None:
-                if viewer.shown is None:
+                if viewer.shown is None and settings.expressions is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
-                self._set_face(viewer.shown[0], settings)
+                self._set_face(viewer.shown[0] if viewer.shown else "", settings)
             elif isinstance(session, str) and (not session or _SESSION_NAME.fullmatch(session)):
                 viewer.chosen = session
             else:

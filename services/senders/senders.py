@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -123,6 +123,10 @@ class Senders:
     def show(self, session_time_s: float, faps: Faps) -> None:
         """Queue a frame (68,) of the session; return immediately."""
         self._loop.call_soon_threadsafe(self._add_frame, session_time_s, faps, time.monotonic())
+
+    def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
+        """Show expressions on the face at rest."""
+        self._call(lambda: self._rest.express(strengths, hold_s))
 
     def states(self) -> list[SenderState]:
         """Return the state of each sender, in order of start."""

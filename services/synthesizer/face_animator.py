@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.lip_model import LipModel, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
 from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
-from kouxing.services.synthesizer.modifiers.expression import Expression, mix
-from kouxing.services.synthesizer.modifiers.expressiveness import JAW, Expressiveness
+from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
+from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.services.synthesizer.modifiers.idle_motion import SpeechIdleMotion
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
 from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.expression_motion import JAW, mix
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, SpeechChange
 
@@ -84,7 +85,7 @@ class FaceAnimator:
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s
         self._expressiveness = Expressiveness(expressiveness)
-        self._expression = Expression()
+        self._expression = SpeechExpression()
         self._idle_motion = SpeechIdleMotion(idle_motion_seed) if idle_motion_seed else None
         self._num_frames = 0  # including frames at rest
         self._first_shown = 0  # earlier frames are rehearsals

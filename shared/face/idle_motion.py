@@ -14,11 +14,13 @@ makes the same motion as one that started with the session.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.face.expression_motion import ExpressionMotion
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.smoothing import smooth_step, smoothing_share
 
@@ -168,16 +170,25 @@ class IdleMotion:
 
 
 class RestingFace:
-    """A face with idle motion only; with seed 0 it does not move."""
+    """A face that no session moves: idle motion, unless the seed is 0, and expressions."""
 
     def __init__(self, seed: int) -> None:
         self._motion = IdleMotion(seed) if seed else None
+        self._expression = ExpressionMotion()
         self._start_s: float | None = None
+        self._last_s = 0.0
+
+    def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
+        """Show expressions, strengths 0 to 1 by name, for a time; they replace earlier ones."""
+        self._expression.show(strengths, hold_s)
 
     def faps(self, now_s: float) -> NDArray[np.float32]:
         """Return the FAPs (68,) at a time of any clock; times must not decrease."""
-        self._start_s = now_s if self._start_s is None else self._start_s
+        if self._start_s is None:
+            self._start_s = self._last_s = now_s
         faps = np.zeros(NUM_FAPS, np.float32)
+        self._expression.add(faps, now_s - self._last_s, is_speaking=False)
+        self._last_s = now_s
         if self._motion is not None:
             self._motion.apply(faps, now_s - self._start_s)
         return faps

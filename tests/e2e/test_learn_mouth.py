@@ -65,16 +65,14 @@ def text_of(browser: Browser, name: str) -> str:
     return text
 
 
+def set_min_rate(browser: Browser, rate_hz: float) -> None:
+    module = "import('/face-recording.js')"
+    browser.evaluate(f"{module}.then((it) => {{ it.FaceRecording.minRateHz = {rate_hz} }})")
+
+
 def read_aloud(browser: Browser) -> None:
     """Record for two seconds, also on a busy machine, and wait for the outcome."""
-    browser.evaluate(
-        "(async () => {"
-        " const { FaceRecording } = await import('/face-recording.js');"
-        " const problem = FaceRecording.prototype.problem;"
-        " FaceRecording.prototype.problem = function () {"
-        "   const key = problem.call(this); return key === 'tooSlow' ? null : key; };"
-        "})()"
-    )
+    set_min_rate(browser, 0)
     browser.evaluate("window.kouxing.readingS = 2")
     browser.click("learn")
     browser.click("lesson-start")
@@ -149,6 +147,16 @@ def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Br
     assert browser.evaluate("window.kouxing.state.mouthProfile + localStorage.length") == "0"
     wrong = [text for text in browser.complaints if '"error"' in text or "exception" in text]
     assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
+
+
+def test_a_slow_computer_is_reported_before_reading(browser: Browser) -> None:
+    set_min_rate(browser, 1000)
+    browser.evaluate("window.kouxing.readingS = 600")
+    browser.click("learn")
+    browser.click("lesson-start")
+    browser.wait_for("window.kouxing.state.lesson === 'problem'")
+    assert "too few camera images" in text_of(browser, "lesson-problem")
+    browser.click("learn-mouth [data-step=problem] .close")
 
 
 def test_the_page_records_the_same_landmarks(browser: Browser) -> None:

@@ -510,6 +510,33 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
     assert images[-1][2, 2].min() > 200  # the page's background, not black
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "english", "chinese"),
+    [
+        ("empty.wav", b"", "empty.wav: the file is empty", "empty.wav：文件是空的"),
+        (
+            "text.mp3",
+            b"hello",
+            "text.mp3: cannot read audio: this is text",
+            "无法读取声音：这是文本",
+        ),
+        ("broken.wav", b"RIFF" + bytes(40), "the file is damaged or cut off", "文件损坏或不完整"),
+        ("silent.wav", None, "silent.wav: no speech was found; it is silent", "文件是静音的"),
+    ],
+)
+def test_a_file_without_sound_is_explained_in_both_languages(
+    page: Browser, tmp_path: Path, name: str, content: bytes | None, english: str, chinese: str
+) -> None:
+    if content is None:
+        soundfile.write(tmp_path / name, np.zeros(16000), 16000)
+    else:
+        (tmp_path / name).write_bytes(content)
+    for language, text in (("zh", chinese), ("en", english)):
+        choose(page, "language", language)
+        choose_file(page, tmp_path / name)
+        page.wait_for(f"{NOTICE}.includes('{text}')")
+
+
 def test_a_dropped_file_is_streamed(
     control: PageControl, session: Session, page: Browser, tmp_path: Path
 ) -> None:

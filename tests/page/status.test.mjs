@@ -3,9 +3,11 @@ import test from "node:test";
 import { LevelMeter, SILENT_DB } from "../../services/gateway/page/level.js";
 import { PhoneTrack } from "../../services/gateway/page/caption.js";
 import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
+import { toChinese } from "../../services/gateway/page/gateway-texts.js";
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 import {
   GatewayState,
+  LastingFault,
   delayText,
   drawingText,
   errorText,
@@ -42,6 +44,7 @@ test("the last phone stays during a pause and then fades", () => {
 
 test("the level is that of the sound that is audible", () => {
   const meter = new LevelMeter();
+  meter.push(0, new Int16Array(0)); // the end of a session
   meter.push(320, Int16Array.of(16384, -16384));
   meter.advance(319, true);
   assert.equal(meter.nextDecibels(), SILENT_DB);
@@ -100,7 +103,7 @@ test("the state is shown with the delay", () => {
 });
 
 test("hints say what does not work and what to do", () => {
-  const well = { isConnected: true, wasConnected: true, isMicrophoneInterrupted: false, missing: [] };
+  const well = { isConnected: true, wasConnected: true, missing: [] };
   assert.equal(hintText(well), "");
   assert.match(hintText({ ...well, isConnected: false }), /gateway has stopped.*kouxing run/);
   const starting = { ...well, isConnected: false, wasConnected: false };
@@ -111,9 +114,29 @@ test("hints say what does not work and what to do", () => {
     hintText({ ...well, missing: ["recognizer", "synthesizer"] }),
     /recognizer, synthesizer.*kouxing recognizer; kouxing synthesizer/,
   );
-  assert.match(hintText({ ...well, isMicrophoneInterrupted: true }), /microphone was interrupted/);
   assert.equal(errorText({ code: "refused", text: "no" }), "no");
   assert.match(errorText({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
+});
+
+test("a fault is shown after a second, and its end only if it was shown", () => {
+  const fault = new LastingFault();
+  const nothing = { hint: "", isOver: false };
+  assert.deepEqual(fault.update(0, "lost"), nothing);
+  assert.deepEqual(fault.update(900, "lost"), nothing);
+  assert.deepEqual(fault.update(950, ""), nothing);
+  assert.deepEqual(fault.update(1000, "lost"), nothing);
+  assert.deepEqual(fault.update(2100, "lost"), { hint: "lost", isOver: false });
+  assert.deepEqual(fault.update(2200, ""), { hint: "", isOver: true });
+  assert.deepEqual(fault.update(2300, ""), nothing);
+});
+
+test("texts of the gateway are translated with their values", () => {
+  assert.equal(
+    toChinese("a b.mp3: cannot read audio: this is text, not sound: 'x'"),
+    "a b.mp3：无法读取声音：这是文本，不是声音：'x'",
+  );
+  assert.equal(toChinese("a.wav: the file is empty\n1: unknown: why"), "a.wav：文件是空的\n1：unknown：why");
+  assert.equal(toChinese("ARKit shapes of the mouth"), "嘴部的ARKit 形状");
 });
 
 test("reduced quality and the head's rotation are described", () => {

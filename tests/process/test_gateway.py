@@ -21,7 +21,7 @@ from pythonosc.osc_bundle import OscBundle
 from kouxing.services.gateway.microphone import MAX_MESSAGE_BYTES
 from kouxing.services.gateway.sample import SAMPLE_FILE, SAMPLE_TEXT
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionStarted
@@ -165,7 +165,7 @@ async def test_a_viewer_sets_the_expressions_of_its_face(
     control: FakeControl, gateway: Gateway
 ) -> None:
     async with connected(gateway.page, "viewer?session=seen") as (viewer,):
-        await viewer.send_json({"express": {"joy": 0.5}})
+        await viewer.send_json({"expressiveness": 2})
         assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
         control.start("seen")
         await receive_json(viewer, "session", session="seen")
@@ -180,6 +180,28 @@ async def test_a_viewer_sets_the_expressions_of_its_face(
     assert (faces[0].hold_s, faces[2].expressiveness) == (7, 2.0)
     assert {*control.sessions_of(SetFace)} == {"seen"}
     control.stop_session("seen")
+
+
+@async_test
+async def test_an_expression_shows_on_the_face_at_rest(
+    control: FakeControl, gateway: Gateway
+) -> None:
+    corner = FAP_NUMBER["raise_l_cornerlip"] - 1
+    raised: list[float] = []
+
+    async def watch(viewer: aiohttp.ClientWebSocketResponse) -> float:
+        message = await receive_binary(viewer, REST_TYPE)
+        raised.append(float(np.frombuffer(message, "<f4", offset=16)[corner]))
+        return raised[-1]
+
+    async with connected(gateway.page, "viewer?session=none") as (viewer,):
+        assert await watch(viewer) == 0
+        await viewer.send_json({"express": {"smile": 1}, "hold_s": 1})
+        while await watch(viewer) < 30:
+            pass
+        while await watch(viewer) > 1:
+            pass
+    assert control.sessions_of(SetFace) == [""]
 
 
 # --- microphones and the sample sentence

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.driver.poses import Poses
-from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.idle_motion import FADE_S, IdleMotion
 
 
@@ -50,6 +50,16 @@ def test_waits_for_a_named_session() -> None:
     assert (poses.shown, poses.caption(0.0)) == ("", "waiting for b")
     poses.add("b", 0.0)
     assert poses.shown == "b"
+
+
+def test_an_expression_shows_at_rest_and_fades() -> None:
+    poses = Poses()
+    corner = FAP_NUMBER["raise_l_cornerlip"] - 1
+    assert poses.faps(0.0)[corner] == 0
+    poses.express({"smile": 1.0, "unknown": 1.0}, hold_s=2.0)
+    raised = [float(poses.faps(tick / 25)[corner]) for tick in range(1, 126)]
+    assert raised[0] < 0.2 * raised[40] > 6
+    assert raised[-1] < 0.01 * raised[40]
 
 
 def test_a_stalled_face_fades_to_rest_and_returns() -> None:

@@ -30,6 +30,10 @@ export class PhoneTrack {
     if (this.#phones.length > MAX_PHONES) this.#phones.shift();
   }
 
+  get hasSpeech() {
+    return this.#phones.some(({ symbol }) => symbol !== SILENCE);
+  }
+
   /**
    * Return { current: symbol at a media time or the last one before it, past: the symbols before it,
    * opacity: 0 to 1; at 0 nothing is current }.
@@ -65,6 +69,11 @@ export class Caption {
 
   get text() {
     return element("spoken").value;
+  }
+
+  /** Whether the session has contained speech. */
+  get hasSpeech() {
+    return this.#phones.hasSpeech;
   }
 
   reset() {

@@ -1,10 +1,11 @@
 // Captures the audio of a microphone or a file in chunks, with an audio worklet.
 
 import { pathOf } from "./address.js";
-import { UserError, say } from "./language.js";
+import { UserError, say, sayReceived } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
 const MAX_FILE_BYTES = 200 << 20;
+const QUIET_PEAK = 1e-3; // a file whose peak is lower (-60 dBFS) is called silent
 
 /** Return an audio context with a sample rate of at most 48 kHz. */
 export async function openCaptureContext() {
@@ -36,10 +37,10 @@ export function capture(context, stream, onChunk) {
 }
 
 /**
- * Return { stream, remarks, play(onEnded) } for a sound file or the sound of a video. The gateway
+ * Return { name, stream, remarks, play(onEnded) } for a sound file or the sound of a video. The gateway
  * decodes it, as browsers ignore gaps in timestamps and read fewer formats.
  *
- * @throws {UserError} if the file is too large, too long or cannot be decoded
+ * @throws {UserError} if the file is too large, too long or silent, or cannot be decoded
  */
 export async function openFileSpeech(context, file) {
   if (file.size > MAX_FILE_BYTES) throw new UserError(say("fileTooLarge"));
@@ -52,13 +53,17 @@ export async function openFileSpeech(context, file) {
   if (!response.ok) {
     const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
     const reason = isJson ? (await response.json()).error : await response.text();
-    throw new UserError(say("fileUnreadable", { reason }));
+    throw new UserError(sayReceived(reason));
   }
   const buffer = await context.decodeAudioData(await response.arrayBuffer());
+  if (buffer.getChannelData(0).every((sample) => Math.abs(sample) < QUIET_PEAK)) {
+    throw new UserError(say("noSpeechSilent", { file: file.name }));
+  }
   const source = new AudioBufferSourceNode(context, { buffer });
   const destination = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });
   source.connect(destination);
   return {
+    name: file.name,
     stream: destination.stream,
     remarks: decodeURIComponent(response.headers.get("Kouxing-Remarks") ?? ""),
     play(onEnded) {

@@ -12,9 +12,9 @@ const QUIET_MS = 4000; // of quiet, until the user is advised
 const QUIET_RMS = 0.005; // -46 dB of full scale
 const MIN_LOUD = 0.1; // fraction of the chunks
 const MIN_FACES = 0.7; // fraction of the images that must show a face
-const MIN_RATE_HZ = 10; // of the images; lips move within a tenth of a second
 
 export class FaceRecording {
+  static minRateHz = 10; // of the images; lips move within a tenth of a second
   #rateHz;
   #chunks = [];
   #numSamples = 0;
@@ -61,7 +61,8 @@ export class FaceRecording {
   problem() {
     if (this.#numImages === 0 || this.#frames.length < MIN_FACES * this.#numImages) return "noFace";
     if (this.#numLoud < MIN_LOUD * this.#chunks.length) return "tooQuiet";
-    return this.#numImages < (MIN_RATE_HZ * this.#numSamples) / this.#rateHz ? "tooSlow" : null;
+    const isSlow = this.#numImages < (FaceRecording.minRateHz * this.#numSamples) / this.#rateHz;
+    return isSlow ? "tooSlow" : null;
   }
 
   /** Return the landmark file. */

@@ -26,6 +26,7 @@ const CHINESE = {
     "有 {count} 条音轨：{tracks}。现在播放第 {track} 条；其他音轨可用 kouxing speak --track 播放",
   "the file is cut off after {read} s of {whole} s": "文件不完整：只有 {read} 秒，应有 {whole} 秒",
   "the file cannot be read after {read} s; export it again": "{read} 秒之后无法读取，请重新导出",
+  "cannot be read to its end: {reason}": "无法读到结尾，请重新导出",
   "damaged near {place} s; the damaged part is silent": "{place} 秒附近已损坏，损坏部分无声",
   "mixed, the channels are silent; only channel {channel} is used": "各声道混合后互相抵消，只用第 {channel} 声道",
   "{share} of the samples are clipped; record at a lower level": "{share} 的采样过载失真，请降低录音音量",

@@ -1,5 +1,6 @@
 // The page's language, English or Chinese: the chosen one, else the browser's.
 
+import { toChinese } from "./gateway-texts.js";
 import { TEXTS } from "./texts.js";
 
 const ATTRIBUTES = { title: "title", label: "aria-label" }; // by their data- attributes
@@ -19,6 +20,11 @@ export function languageFor(preferred) {
 export function say(key, values = {}) {
   const text = TEXTS[key]?.[language] ?? key.split(".").at(-1);
   return text.replace(/\{(\w+)\}/g, (_, name) => values[name]);
+}
+
+/** Return a text of the gateway in the page's language. */
+export function sayReceived(text) {
+  return language === "zh" ? toChinese(text) : text;
 }
 
 /** Set the page's language and translate all elements that name a text (data-text etc.). */

@@ -6,11 +6,12 @@ import { capture, openCaptureContext } from "./capture.js";
 import { element } from "./elements.js";
 import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
-import { UserError, say } from "./language.js";
+import { UserError, say, sayReceived } from "./language.js";
 import { curvePath, extent, figures, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
+const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the first image
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
 const CURVES = ["tracked", "before", "after"];
 const BOX = { width: 600, height: 150 };
@@ -144,10 +145,11 @@ export class MouthLesson {
     this.#show("reading");
   }
 
-  /** Record from the first face until the time is over. */
+  /** Record from the first face until the time is over, or fail early if images come too slowly. */
   async #read(recording, { video, tracker, context, stream, signal }) {
     let startMs = null;
     let isOver = false;
+    let numImages = 0;
     const over = new Promise((resolve, reject) => {
       this.#finish = () => {
         isOver = true;
@@ -155,13 +157,21 @@ export class MouthLesson {
       };
       signal.addEventListener("abort", this.#finish);
       for (const track of stream.getTracks()) track.onended = () => reject(new UserError(say("cameraUnplugged")));
+      const { from, to } = RATE_CHECK_MS;
+      setTimeout(() => (numImages = 0), from); // the first images take longer
+      setTimeout(() => {
+        const isSlow = numImages < (FaceRecording.minRateHz * (to - from)) / 1000;
+        if (isSlow) reject(new UserError(say("tooSlow")));
+      }, to);
     });
     let next = nextImage(video);
     while (!isOver) {
       const { takenMs, image } = await Promise.race([next, over]);
       if (isOver) break;
       next = nextImage(video); // taken while the face in this one is being found
-      const landmarks = await tracker.find(image);
+      const landmarks = await Promise.race([tracker.find(image), over]);
+      if (isOver) break;
+      numImages++;
       drawLips(video, tracker.lips, landmarks);
       if (startMs === null && landmarks !== null) {
         startMs = performance.now();
@@ -207,7 +217,7 @@ export class MouthLesson {
     }
     if (signal.aborted) return;
     if (answer.error !== undefined) {
-      this.#fail(answer.error);
+      this.#fail(sayReceived(answer.error));
       return;
     }
     const { mouth_profile: profile, before, after } = answer;

@@ -40,9 +40,9 @@ export class LevelMeter {
   }
 }
 
-/** Return the root mean square of int16 samples, 0 to 1. */
+/** Return the root mean square of int16 samples, 0 to 1; 0 without samples, as at the end of a session. */
 export function rms(samples) {
   let squares = 0;
   for (const sample of samples) squares += sample * sample;
-  return Math.sqrt(squares / samples.length) / 32768;
+  return Math.sqrt(squares / (samples.length || 1)) / 32768;
 }

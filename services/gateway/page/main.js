@@ -38,6 +38,10 @@ const speech = new SpeechControls(sound, {
   lips: chosenLipModel,
   level: (value) => meter.raise(value),
   error: showError,
+  fileEnded(file) {
+    const isShown = gateway.session !== null && gateway.session === speech.session;
+    if (isShown && !caption.hasSpeech) showNews(say("noSpeech", { file }));
+  },
   news: showNews,
   session(name) {
     if (name !== null) {

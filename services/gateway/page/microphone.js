@@ -23,7 +23,7 @@ export class Microphone {
   /**
    * @param handlers { mouthProfile(): base64 or "", lips(): lip model to start with or null,
    *   state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
-   *   error({ code, text }) }
+   *   fileEnded(name), error({ code, text }) }
    */
   constructor(handlers) {
     this.#handlers = handlers;
@@ -137,9 +137,14 @@ export class Microphone {
     this.#giveUpMs = null;
     this.#handlers.session(session);
     this.#handlers.state("on");
-    this.#fileSpeech?.play(() => setTimeout(() => this.stop(), TAIL_MS));
+    this.#fileSpeech?.play(() => setTimeout(() => this.#endFile(), TAIL_MS));
     const lips = this.#handlers.lips();
     if (lips !== null) this.chooseLipModel(lips);
+  }
+
+  #endFile() {
+    this.#handlers.fileEnded(this.#fileSpeech?.name);
+    this.stop();
   }
 
   /** Reconnect if it has streamed: a service or the gateway is being restarted. */

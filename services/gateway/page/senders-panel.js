@@ -3,7 +3,7 @@
 
 import { pathOf } from "./address.js";
 import { element, setText } from "./elements.js";
-import { say } from "./language.js";
+import { say, sayReceived } from "./language.js";
 import { roundToTens } from "./status.js";
 
 const PERIOD_MS = 1000; // while the panel is open
@@ -11,9 +11,9 @@ const TOLERANCE_MS = 15; // smaller differences of delays are ignored
 
 /** Return the text of a sender's state: { contents, rate_hz, delay_ms, problem } of the gateway. */
 export function senderText({ contents, rate_hz: rateHz, delay_ms: delay, problem }) {
-  if (problem !== "") return problem;
-  const rate = Math.round(rateHz);
-  return say(delay === 0 ? "senderState" : "senderStateDelayed", { contents, rate, delay });
+  if (problem !== "") return sayReceived(problem);
+  const values = { contents: sayReceived(contents), rate: Math.round(rateHz), delay };
+  return say(delay === 0 ? "senderState" : "senderStateDelayed", values);
 }
 
 /** Return whether a sender's delay differs from this page's, ms; null: the page has no sound. */
@@ -79,7 +79,7 @@ export class SendersPanel {
     const response = await fetch(pathOf("senders"), options).catch(() => null);
     if (response === null) return false; // the notice reports that the gateway has stopped
     const answer = await response.json();
-    setText(element("send-problem"), answer.error ?? "");
+    setText(element("send-problem"), sayReceived(answer.error ?? ""));
     if (response.ok) this.#show(answer);
     return response.ok;
   }

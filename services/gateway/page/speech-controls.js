@@ -1,7 +1,6 @@
 // The buttons that make the face speak or silence it: microphone, file and sound.
 
 import { element, setTextKey } from "./elements.js";
-import { say } from "./language.js";
 import { Microphone } from "./microphone.js";
 
 export class SpeechControls {
@@ -14,7 +13,8 @@ export class SpeechControls {
 
   /**
    * @param {Sound} sound the session's sound
-   * @param handlers { mouthProfile(), lips(), level(rms), error({ code, text }): as of Microphone,
+   * @param handlers { mouthProfile(), lips(), level(rms), fileEnded(name), error({ code, text }): as
+   *   of Microphone,
    *   news(text), session(name): the microphone's session, null when it ends }
    */
   constructor(sound, handlers) {
@@ -85,9 +85,6 @@ export class SpeechControls {
   }
 
   #onState(state) {
-    if (this.state === "interrupted" && state === "on") {
-      this.#handlers.news(say("microphoneResumed"));
-    }
     this.state = state;
     const isOn = state === "on" || state === "interrupted";
     const isBusy = state === "starting" || state === "interrupted";

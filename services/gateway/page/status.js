@@ -1,11 +1,12 @@
 // The page's state: texts, the status line, the sound level, notices, and hints about problems.
 
 import { element, setText } from "./elements.js";
-import { say } from "./language.js";
+import { say, sayReceived } from "./language.js";
 import { SILENT_DB } from "./level.js";
 import { TEXTS } from "./texts.js";
 
 const NEWS_MS = 8000; // for which news is shown
+const SHORT_MS = 1000; // a fault that is over within this time is not shown
 
 /** What the gateway reports: the connection, the session that is shown, missing services. */
 export class GatewayState {
@@ -94,7 +95,7 @@ export function turnText(turned) {
 }
 
 /** Return what does not work and what to do; "" if all is well. */
-export function hintText({ isConnected, wasConnected, isRefused, isMicrophoneInterrupted, missing }) {
+export function hintText({ isConnected, wasConnected, isRefused, missing }) {
   if (!isConnected && wasConnected) return say("gatewayStopped");
   if (isRefused) return say("connectionRefused");
   if (isConnected && missing.includes("control")) return say("controlMissing");
@@ -104,17 +105,38 @@ export function hintText({ isConnected, wasConnected, isRefused, isMicrophoneInt
       commands: missing.map((name) => `kouxing ${name}`).join("; "),
     });
   }
-  return isMicrophoneInterrupted ? say("microphoneInterrupted") : "";
+  return "";
 }
 
 /** Return the text of the gateway's error message. */
 export function errorText({ code, text }) {
-  return TEXTS[`error.${code}`] === undefined ? text : say(`error.${code}`, { text });
+  return TEXTS[`error.${code}`] === undefined ? sayReceived(text) : say(`error.${code}`, { text });
+}
+
+/** A fault that lasts: its hint after some time, and the news that it is over. Time is injected. */
+export class LastingFault {
+  #sinceMs = null;
+  #isShown = false;
+
+  /** Take the current hint, "" without a fault; return { hint: to be shown, isOver }. */
+  update(nowMs, hint) {
+    if (hint === "") {
+      const isOver = this.#isShown;
+      this.#sinceMs = null;
+      this.#isShown = false;
+      return { hint, isOver };
+    }
+    this.#sinceMs ??= nowMs;
+    this.#isShown ||= nowMs - this.#sinceMs > SHORT_MS;
+    return { hint: this.#isShown ? hint : "", isOver: false };
+  }
 }
 
 export class StatusBar {
   #parts;
   #wasLive = false; // in the session that is shown
+  #fault = new LastingFault();
+  #microphoneFault = new LastingFault();
 
   /** @param parts { gateway, player, speech, sound, notice, senders }: where the state is */
   constructor(parts) {
@@ -145,7 +167,13 @@ export class StatusBar {
     setText(element("delay"), isLive ? delayText(voiceToImageMs, soundMs) : "");
     setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
     senders.frameWaitMs = frameMs;
-    notice.showHint(hintText({ ...gateway, isMicrophoneInterrupted }));
+    const nowMs = performance.now();
+    const fault = this.#fault.update(nowMs, hintText(gateway));
+    const pause = isMicrophoneInterrupted ? say("microphoneInterrupted") : "";
+    const microphone = this.#microphoneFault.update(nowMs, pause);
+    if (fault.isOver) notice.showNews(say("recovered"), "hint");
+    if (microphone.isOver && speech.state === "on") notice.showNews(say("microphoneResumed"), "hint");
+    notice.showHint(fault.hint || microphone.hint);
   }
 }
 

@@ -56,6 +56,7 @@ export const TEXTS = {
   },
   microphoneInterrupted: { en: "The microphone was interrupted. It resumes by itself.", zh: "麦克风中断，会自动恢复。" },
   microphoneResumed: { en: "The microphone is on again.", zh: "麦克风已恢复。" },
+  recovered: { en: "Everything is running again.", zh: "已全部恢复运行。" },
   serviceRestarted: { en: "A service crashed and was restarted. The session continues.", zh: "一个服务崩溃后已重启，会话继续。" },
 
   // Errors
@@ -85,18 +86,21 @@ export const TEXTS = {
     zh: "网关关闭了连接。请再按“麦克风”重试。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
-  fileUnreadable: { en: "{reason}", zh: "无法读取文件（{reason}）" },
-  "error.bad-audio": { en: "{text}", zh: "音频有误（{text}）" },
-  "error.busy": { en: "{text}", zh: "人太多了：请稍后再试（{text}）" },
+  noSpeech: { en: "{file}: no speech was found; is there a voice in it?", zh: "{file}：没有找到语音，里面有人说话吗？" },
+  noSpeechSilent: { en: "{file}: no speech was found; it is silent", zh: "{file}：没有找到语音，文件是静音的" },
+  "error.bad-audio": { en: "{text}", zh: "音频有误，请重试" },
   "error.bad-mouth-profile": {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
     zh: "学到的口型不适用于当前版本：请重新“学我的口型”。",
   },
-  "error.no-service": { en: "{text}", zh: "缺少服务：请运行 kouxing run（{text}）" },
-  "error.session-exists": { en: "{text}", zh: "同名会话已存在（{text}）" },
-  "error.too-many-sessions": { en: "{text}", zh: "会话太多：请先关闭一些（{text}）" },
-  "error.unknown-session": { en: "{text}", zh: "会话已不存在（{text}）" },
-  "error.timeout": { en: "{text}", zh: "服务没有及时应答：请重试（{text}）" },
+  "error.busy": { en: "{text}", zh: "系统繁忙，请稍后再试" },
+  "error.no-service": { en: "{text}", zh: "缺少服务，请运行 kouxing run" },
+  "error.not-allowed": { en: "{text}", zh: "网关的密钥没有权限，见 kouxing keys list" },
+  "error.refused": { en: "{text}", zh: "控制服务没有应答，请运行 kouxing run 后重试" },
+  "error.session-exists": { en: "{text}", zh: "同名会话已存在" },
+  "error.too-many-sessions": { en: "{text}", zh: "会话太多，请先关闭一些" },
+  "error.unknown-session": { en: "{text}", zh: "会话已不存在" },
+  "error.timeout": { en: "{text}", zh: "服务没有及时应答，请重试" },
 
   // Settings
   settings: { en: "Settings", zh: "设置" },
@@ -192,8 +196,8 @@ export const TEXTS = {
   noFace: { en: "No face is visible. Sit in front of the camera, with light on your face.", zh: "看不到脸。请正对摄像头，脸部要有光。" },
   tooQuiet: { en: "The sound is too quiet. Speak louder, or turn up the microphone.", zh: "声音太小。请大声一点，或调高麦克风音量。" },
   tooSlow: {
-    en: "This computer analyzes too few camera images per second. Close other programs and try again.",
-    zh: "这台电脑处理画面太慢。请关闭其他程序再试。",
+    en: "This computer analyzes too few camera images per second. Close other programs and try again. Or film yourself and use kouxing track and kouxing adapt.",
+    zh: "这台电脑处理画面太慢。请关闭其他程序再试，或录一段视频，用 kouxing track 和 kouxing adapt 学习。",
   },
   cameraInsecure: {
     en: "The camera needs https. Open this page at an https address or at http://localhost.",

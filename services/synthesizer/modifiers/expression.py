@@ -1,105 +1,17 @@
-"""Requested expressions, mixed with speech.
-
-Expressions ease in, stay for a time and fade, smoothed by a two-pole filter. Brows, lids, cheeks
-and mouth corners are added to those of speech. Lips that are closed for speech stay closed:
-
-======  ====================================================  ========  =====
-symbol  meaning                                               unit      shape
-======  ====================================================  ========  =====
-g       gap between the lips in speech                        FAP       (6,)
-d       change of the gap by the expression                   FAP       (6,)
-c       upward movement of both lips by the expression        FAP       (6,)
-a       freedom of the lips, 0 to 1                           1         (6,)
-======  ====================================================  ========  =====
-
-    g' = g + a d    min(20 - g, 0) <= a d <= max(900 - g, 0)
-    both lips move up by c if c > 0, else by a c
-
-``a`` is 0 where the gap is at most 20 or the lower lip is this close to its closure (f), and 1 from
-80 upwards. Without speech all lips are free; they are bound again when speech starts.
-"""
+"""Requested expressions on a face that speaks."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.modifiers.expressiveness import CLOSED, JAW, LOWER, OPEN, UPPER
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.shared.face.expressions import ExpressionName
-from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
-from kouxing.shared.face.shapes import ARKIT
-from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_share
-
-_EASE_S, _FADE_S = 0.09, 0.3  # time constants of each filter pole
-_FREE_S, _BIND_S = 0.15, 0.04  # time constant of freeing the lips; time for binding them
-_ARKIT_EXPRESSIONS = {
-    ExpressionName.SMILE: ("mouthSmileLeft", "mouthSmileRight"),
-    ExpressionName.BROW_UP: ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"),
-    ExpressionName.BROW_DOWN: ("browDownLeft", "browDownRight"),
-    ExpressionName.SQUINT: ("eyeSquintLeft", "eyeSquintRight"),
-}
-EXPRESSION_FAPS: dict[str, NDArray[np.float32]] = {  # (68,) at full strength
-    **dict(zip(EXPRESSION_NAMES[1:], EXPRESSIONS[1:], strict=True)),
-    **{
-        name: ARKIT.basis[[ARKIT.names.index(shape) for shape in shapes]].sum(axis=0)
-        for name, shapes in _ARKIT_EXPRESSIONS.items()
-    },
-}
-_WIDEST, _WIDEST_JAW = 900.0, 500.0  # limits of opening by an expression, FAP units
-_LIPS = np.concatenate([UPPER, LOWER, [JAW]])
+from kouxing.shared.face.expression_motion import ExpressionMotion
 
 
-class Expression:
-    """The current expressions of the face."""
-
-    def __init__(self) -> None:
-        self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
-        self._shown = TwoPoleFilter(self._goal)
-        self._remaining_s = 0.0  # until the expressions fade
-        self._free = 1.0
-
-    def show(self, strengths: Mapping[str, float], hold_s: float) -> None:
-        """Replace the current expressions for a time; without strengths they fade now."""
-        self._goal = np.zeros(NUM_FAPS, np.float32)
-        for name, strength in strengths.items():
-            self._goal += np.float32(strength) * EXPRESSION_FAPS[name]
-        self._remaining_s = hold_s if strengths else 0.0
-
-    @property
-    def free(self) -> float:
-        """Freedom of the lips: 1 without speech, 0 shortly after speech starts."""
-        return self._free
+class SpeechExpression(ExpressionMotion):
+    """Expressions that leave the lips to speech."""
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the expressions to a frame, FAPs (68,), in place."""
-        is_held = self._remaining_s > 0.0
-        self._remaining_s -= context.step_s
-        goal = is_held * self._goal
-        shown = self._shown.step(goal, context.step_s, _EASE_S if is_held else _FADE_S)
-        if context.is_speaking:
-            self._free = max(self._free - context.step_s / _BIND_S, 0.0)
-        else:
-            self._free += (1.0 - self._free) * smoothing_share(context.step_s, _FREE_S)
-        if shown.any():
-            mix(faps, shown, self._free)
-
-
-def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:
-    """Add an expression (68,) to a face (68,), in place; ``free`` is the minimum of ``a``."""
-    gap = -(faps[UPPER] + faps[LOWER])
-    room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED
-    room = np.tile(np.minimum(room[:3], room[3:]), 2)  # inner and outer lip
-    apart = np.maximum(room / (OPEN - CLOSED), free)
-    change = -(expression[UPPER] + expression[LOWER])
-    change = np.clip(apart * change, np.minimum(CLOSED - gap, 0.0), np.maximum(_WIDEST - gap, 0.0))
-    upwards = (expression[LOWER] - expression[UPPER]) / 2.0
-    upwards = np.where(upwards > 0.0, upwards, apart * upwards)
-    upper, lower = -upwards - change / 2.0, upwards - change / 2.0
-    jaw = min(apart[0] * expression[JAW], max(_WIDEST_JAW - faps[JAW], 0.0))
-    rest = expression.copy()
-    rest[_LIPS] = np.concatenate([upper, lower, [jaw]])
-    faps += rest
+        self.add(faps, context.step_s, is_speaking=context.is_speaking)

@@ -27,18 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.face.expression_motion import CLOSED, JAW, LOWER, OPEN, UPPER
 
-CLOSED = 20.0  # largest gap of a closure, FAP units
-OPEN = 80.0  # from this gap upwards, lips have the width of an open mouth
 _WIDEST = 900.0  # openings of this size do not grow
 _USUAL_WIDTH = -40.0  # FAP of a mouth corner in speech, from the dynamic visemes
 _USUAL_PUSH = 40.0
 _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
-JAW = 3 - 1
-UPPER = np.array([4, 8, 9, 51, 55, 56]) - 1  # positive is down
-LOWER = np.array([5, 10, 11, 52, 57, 58]) - 1  # positive is up; same points as in UPPER
 _WIDTH = np.array([6, 7, 53, 54]) - 1  # positive is outward
 _PUSH = np.array([16, 17]) - 1  # positive is forward
 
