@@ -103,6 +103,31 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
         return key
 
 
+def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
+    """Check the keys of a system on this machine against each other, and create missing ones.
+
+    ``kinds`` has the roles of each kind of service. Raises ``UserError`` with the command that
+    mends the key, or as ``load_key``.
+    """
+    import zmq  # noqa: PLC0415 (slow to import)
+
+    for name, roles in {**kinds, CLIENT: CLIENT_ROLES}.items():
+        key, path = load_key(name, roles), key_folder() / f"{name}.key"
+        if _credential(f"{name}.key"):
+            continue
+        grants = read_grants()
+        is_pair = zmq.curve_public(key.secret.encode()) == key.public.encode()
+        grant = grants.get(key.public)
+        if not is_pair or (name != CONTROL and (grant is None or not {*roles} <= {*grant.roles})):
+            is_named = any(grant.name == name for grant in grants.values())
+            revoke = f"kouxing keys revoke {name}; " if is_named else ""
+            reason = f"{key_folder() / _ALLOWED} does not allow {path}"
+            if not is_pair:
+                reason = f"{path}: the secret key does not belong to the public key"
+            remove = f"rm {key_folder()}/*" if name == CONTROL else f"{revoke}rm {path}"
+            raise UserError(f"{reason}; run: {remove}")
+
+
 def user_key(*, control: str = "") -> Key:
     """Return the key of the user's commands and clients. Parameter and errors as ``load_key``."""
     return load_key(CLIENT, CLIENT_ROLES, control=control)

@@ -26,7 +26,7 @@ from kouxing.services.kinds import (
 from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import control_endpoint
+from kouxing.shared.keys import check_keys, control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 
 if TYPE_CHECKING:
@@ -85,6 +85,8 @@ def run(
         variable(COMMON, "control"): control,
         BOUND_CONTROL: bound_control,
     }
+    if not control_config.insecure:
+        check_keys({kind.name: kind.key_roles for kind in KINDS.values()})
     client_control = control_endpoint(control, insecure=control_config.insecure)
     more = extra_worker_environments(settings, workers)
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment, more=more)

@@ -17,6 +17,7 @@ from typing import IO
 from kouxing_client import KouxingError
 from rich.console import Console
 
+from kouxing.services.cli.log_file import LogFile
 from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
 from kouxing.services.kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.control_client import connect
@@ -72,7 +73,9 @@ class Supervisor:
                 f"{log_folder}: cannot be written: {error.strerror}; start kouxing in a folder that"
                 " you can write to, or add --set driver.out=FOLDER"
             ) from None
-        check_output(*(self._log_file(name) for name in self._names), force=True)
+        paths = {name: log_folder / f"{name}.log" for name in self._names}
+        check_output(*paths.values(), force=True)
+        self._logs = {name: LogFile(path, self._warn) for name, path in paths.items()}
 
     def start(self) -> None:
         """Start every service."""
@@ -161,6 +164,8 @@ class Supervisor:
                 process.kill()
                 process.wait()
         self._processes.clear()
+        for log in self._logs.values():
+            log.close()
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
@@ -207,14 +212,10 @@ class Supervisor:
         process.wait()
         self._process_ended.set()
 
-    def _log_file(self, name: str) -> Path:
-        return self._log_folder / f"{name}.log"
-
     def _copy_log(self, name: str, stream: IO[bytes]) -> None:
-        with stream, self._log_file(name).open("ab") as log:
+        with stream:
             for line in stream:
-                log.write(line)
-                log.flush()
+                self._logs[name].write(line)
                 if text := _console_text(line):
                     self._console.print(with_name(name, text), markup=False, highlight=False)
 

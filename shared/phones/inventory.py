@@ -37,8 +37,6 @@ from functools import cached_property, lru_cache
 from importlib import resources
 from importlib.metadata import entry_points
 
-from kouxing_client.messages import SILENCE
-
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
@@ -47,6 +45,7 @@ DEFAULT_LANGUAGE = "mandarin"
 ENTRY_POINTS = "kouxing.languages"
 KINDS = ("initial", "vowel", "silence")
 MAX_PHONES = 255  # model files count phones in 8 bits
+SILENCE = "sil"  # also in kouxing_client, which is slow to import
 _SYMBOL = re.compile(r"[a-z]{1,4}")
 _WORDS = re.compile(r"[^\W\d_]+(?: +[^\W\d_]+)*")
 

@@ -6,6 +6,7 @@ import os
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from kouxing.shared.keys import (
     MAX_ROLES,
     Grant,
     add_key,
+    check_keys,
     key_folder,
     load_key,
     may_follow,
@@ -129,6 +131,27 @@ def test_creates_no_key_for_control_on_another_machine() -> None:
         load_key("lamp", ("service:lamp",), control="tcp://192.0.2.1:5550")
     assert not list(key_folder().glob("*"))
     assert load_key("lamp", ("service:lamp",), control="tcp://127.0.0.1:5550")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "allowed").write_text(""), r"allowed does not allow .*rm .*lamp"),
+        (
+            lambda folder: (folder / "lamp.key").write_text(
+                (folder / "lamp.key")
+                .read_text()
+                .replace(load_key("lamp", ()).secret, load_key("client", ()).secret)
+            ),
+            r"lamp\.key: the secret key .*run: kouxing keys revoke lamp; rm .*lamp\.key",
+        ),
+    ],
+)
+def test_checks_the_keys_of_a_system(damage: Callable[[Path], object], message: str) -> None:
+    check_keys({"lamp": ("service:lamp",), "control": ()})
+    damage(key_folder())
+    with pytest.raises(UserError, match=message):
+        check_keys({"lamp": ("service:lamp",), "control": ()})
 
 
 def test_names_the_key_of_another_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
