@@ -111,21 +111,26 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     """
     import zmq  # noqa: PLC0415 (slow to import)
 
+    reasons: list[str] = []
+    revoked: list[str] = []
+    removed: list[str] = []
     for name, roles in {**kinds, CLIENT: CLIENT_ROLES}.items():
         key, path = load_key(name, roles), key_folder() / f"{name}.key"
-        if _credential(f"{name}.key"):
+        if _credential(path.name):
             continue
         grants = read_grants()
-        is_pair = zmq.curve_public(key.secret.encode()) == key.public.encode()
-        grant = grants.get(key.public)
-        if not is_pair or (name != CONTROL and (grant is None or not {*roles} <= {*grant.roles})):
-            is_named = any(grant.name == name for grant in grants.values())
-            revoke = f"kouxing keys revoke {name}; " if is_named else ""
-            reason = f"{key_folder() / _ALLOWED} does not allow {path}"
-            if not is_pair:
-                reason = f"{path}: the secret key does not belong to the public key"
-            remove = f"rm {key_folder()}/*" if name == CONTROL else f"{revoke}rm {path}"
-            raise UserError(f"{reason}; run: {remove}")
+        grant = grants.get(key.public, Grant("", ()))
+        if zmq.curve_public(key.secret.encode()) != key.public.encode():
+            reasons.append(f"{path}: the secret key does not belong to the public key")
+        elif name != CONTROL and not {*roles} <= {*grant.roles}:
+            reasons.append(f"{key_folder() / _ALLOWED} does not allow {path}")
+        else:
+            continue
+        removed.append(str(key_folder() / ("*" if name == CONTROL else path.name)))
+        revoked += [f"kouxing keys revoke {name}"] * (name in {g.name for g in grants.values()})
+    if reasons:
+        fix = "; ".join([*revoked, f"rm {' '.join(removed)}"])
+        raise UserError(f"{reasons[0]}; run: {fix}")
 
 
 def user_key(*, control: str = "") -> Key:
