@@ -17,7 +17,8 @@ SOURCES = (
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),
     *("services/senders/connection.py", "services/senders/protocols.py"),
     *("services/senders/senders.py", "services/senders/target.py"),
-    "services/senders/vtube_studio.py",
+    *("services/senders/vtube_studio.py", "clients/python/kouxing_client/base.py"),
+    *("clients/python/kouxing_client/core.py", "clients/python/kouxing_client/session_core.py"),
 )
 # Texts of the command line, of other clients than the page, and of a broken page.
 OTHERS = re.compile(
@@ -59,5 +60,7 @@ def test_the_page_translates_all_texts_of_the_gateway() -> None:
         for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8")))
         if isinstance(node, ast.Constant | ast.JoinedStr)
     )
-    unknown = {key for key in translated if any(part not in everything for part in key.split("{}"))}
+    unknown = {
+        key for key in translated if any(part.strip() not in everything for part in key.split("{}"))
+    }
     assert not unknown, "these texts no longer exist"

@@ -40,6 +40,13 @@ const CHINESE = {
   "the file cannot be decoded; export it again": "文件无法解码，请重新导出",
   "reading the file took too long; use a shorter file": "读取时间太长，请用较短的文件",
 
+  // Sessions
+  "control at {address} does not answer. Start it with 'kouxing run'": "控制服务（{address}）没有应答，请运行 kouxing run",
+  "control at {address} does not accept this key. If it runs on this machine, restart it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here": "控制服务（{address}）不接受网关的密钥，请在两台机器上运行 kouxing doctor",
+  "control has closed the session: {reason}": "控制服务关闭了会话（{reason}）",
+  "the session is closed": "会话已关闭",
+  "another program opened this session, and sends its audio": "另一个程序在使用此会话",
+
   // Learn my mouth
   "the gateway is stopping": "网关正在停止",
   "another mouth is being learned; try again in a minute": "正在学习另一个口型，请一分钟后重试",

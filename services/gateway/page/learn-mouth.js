@@ -36,7 +36,6 @@ export class MouthLesson {
   constructor(profiles, handlers) {
     this.#profiles = profiles;
     this.#handlers = handlers;
-    element("lesson-text").value = document.documentElement.lang;
     for (const [id, act] of Object.entries({
       "lesson-start": () => this.#record(),
       "lesson-finish": () => this.#finish(),
@@ -61,11 +60,13 @@ export class MouthLesson {
 
   open() {
     this.#recording = this.#learned = null;
+    const { lang } = document.documentElement;
+    element("lesson-text").value = lang;
     const { current } = this.#profiles;
     element("lesson-profile").hidden = current === null;
     if (current !== null) {
       const [, before, after] = figures(current)[0];
-      const day = new Date(current.learntOn).toLocaleDateString();
+      const day = new Date(current.learntOn).toLocaleDateString(lang);
       element("lesson-profile").firstElementChild.textContent =
         say("lessonLearned", { day, before, after });
     }

@@ -157,7 +157,7 @@ export class StatusBar {
     const isStalled = this.#wasLive && session !== null && session === speech.session;
     const isInterrupted = isMicrophoneInterrupted || isStalled;
     element("status").dataset.state = stateKind({ isConnected, isLive });
-    element("status").title = session === null ? "" : `session ${session}`;
+    element("status").title = session === null ? "" : say("sessionName", { name: session });
     setText(element("state"), stateText({ isConnected, isLive, isInterrupted }));
 
     const { playout, voiceToImageMs } = player;

@@ -25,6 +25,7 @@ export const TEXTS = {
   turnOnSound: { en: "Turn on sound", zh: "打开声音" },
 
   // Status
+  sessionName: { en: "session {name}", zh: "会话 {name}" },
   connecting: { en: "connecting …", zh: "连接中…" },
   live: { en: "live", zh: "直播" },
   interrupted: { en: "interrupted", zh: "中断" },
@@ -96,7 +97,6 @@ export const TEXTS = {
   "error.busy": { en: "{text}", zh: "系统繁忙，请稍后再试" },
   "error.no-service": { en: "{text}", zh: "缺少服务，请运行 kouxing run" },
   "error.not-allowed": { en: "{text}", zh: "网关的密钥没有权限，见 kouxing keys list" },
-  "error.refused": { en: "{text}", zh: "控制服务没有应答，请运行 kouxing run 后重试" },
   "error.session-exists": { en: "{text}", zh: "同名会话已存在" },
   "error.too-many-sessions": { en: "{text}", zh: "会话太多，请先关闭一些" },
   "error.unknown-session": { en: "{text}", zh: "会话已不存在" },
