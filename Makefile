@@ -32,7 +32,7 @@ PIP := $(BIN)/python -m pip install --quiet
 NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --no-audit --no-fund --loglevel=error --prefix
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-TEST_STAGES := test-python test-alone test-page
+TEST_STAGES := test-python test-page
 CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos javascript compose docker)
 STAGES = $(MAKE) --keep-going --no-print-directory
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
@@ -60,10 +60,7 @@ test: .venv/installed-dev setup $(patsubst %,%/node_modules/.package-lock.json,$
 	$(STAGES) $(TEST_STAGES)
 
 test-python:
-	$(PYTEST) -n 3 --dist loadfile -m "not alone"
-
-test-alone:
-	$(PYTEST) -m alone
+	$(PYTEST) -n 3 --dist loadfile
 
 test-page:
 	$(NPM) $(PAGE) test

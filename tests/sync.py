@@ -1,22 +1,21 @@
-"""Measures how far the page's sound is from its picture.
+"""Measures how far the page's sound is from its picture, in media time.
 
 A click is detected where the sound leaves the page, after its last audio node. It is heard when the
 browser says that the sound card plays that sample. A picture is seen at the display's first refresh
-after it was drawn. Neither relies on the delay that the page itself assumes.
+after it was drawn. Neither relies on the delay that the page itself assumes. A busy machine draws
+pictures late, which cannot be told from a wrong delay. Therefore only the least late picture near a
+click counts.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.chromium import Chromium
 
-AROUND_MS = (500.0, 250.0)  # a click counts if pictures were drawn this long before and after it
-MAX_GAP_MS = 70.0  # between two pictures; a page that the processor draws has one every 50 ms
+NEAR_MS = 500.0  # pictures this long before and after a click count
+MIN_PICTURES = 4
 # Runs before the page's own scripts, and also watches every node connected to the loudspeaker.
 _PROBE = """
 window.probe = { clicks: new Map(), pictures: [] };
@@ -53,15 +52,6 @@ _READ = """
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Offsets:
-    """How long after its picture a sound is heard, ms; negative: before it."""
-
-    mean_ms: float
-    p5_ms: float
-    p95_ms: float
-
-
 def install(browser: Chromium) -> None:
     """Watch the page that is opened next."""
     browser.command("Page.enable")
@@ -72,40 +62,23 @@ def begin(browser: Chromium) -> None:
     """Start to record clicks and pictures."""
     browser.evaluate(
         "window.probe.clicks.clear(); window.probe.pictures = [];"
-        "window.kouxing.onPicture = ({ seenMs, mediaTime, faps }) =>"
-        " void window.probe.pictures.push([seenMs, mediaTime ?? 0, faps[2]])"
+        "window.kouxing.onPicture = ({ seenMs, mediaTime }) => { if (mediaTime)"
+        " window.probe.pictures.push([seenMs, mediaTime / 16]) }"
     )
 
 
-def read(browser: Chromium) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return when clicks were heard, ms, and the pictures, shape (n, 3).
+def offsets_ms(browser: Chromium, period_ms: float, phase_ms: float) -> NDArray[np.float64]:
+    """Return how long after its picture each click is heard; negative: before it.
 
-    A picture's row holds when it was first seen, ms, its media time, and its open_jaw.
+    Clicks have the media times ``phase_ms``, ``phase_ms + period_ms``, ….
     """
     result = browser.evaluate(_READ)
-    clicks_ms = np.sort([np.median(readings) for readings in result["clicks"]])
-    return clicks_ms, np.array(result["pictures"]).reshape(-1, 3)
-
-
-def with_pictures(
-    clicks_ms: NDArray[np.float64], seen_ms: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the clicks around which no picture was late."""
-    gaps_ms = np.diff(seen_ms)
-    before, after = AROUND_MS
-    return np.array(
-        [
-            click
-            for click in clicks_ms
-            if seen_ms[0] < click - before
-            and seen_ms[-1] > click + after
-            and gaps_ms[(seen_ms[1:] > click - before) & (seen_ms[:-1] < click + after)].max()
-            < MAX_GAP_MS
-        ]
-    )
-
-
-def summary(offsets: Sequence[float]) -> Offsets:
-    """Return the mean and percentiles of at least one offset, ms."""
-    p5, p95 = np.percentile(offsets, [5, 95])
-    return Offsets(float(np.mean(offsets)), float(p5), float(p95))
+    seen_ms, media_ms = np.array(result["pictures"]).reshape(-1, 2).T
+    offsets = []
+    for readings in result["clicks"]:
+        heard_ms = np.median(readings)
+        is_near = np.abs(seen_ms - heard_ms) < NEAR_MS
+        if is_near.sum() >= MIN_PICTURES and seen_ms[-1] > heard_ms + NEAR_MS:
+            shown_ms = (media_ms - seen_ms)[is_near].max() + heard_ms  # the picture at the click
+            offsets.append((shown_ms - phase_ms + period_ms / 2) % period_ms - period_ms / 2)
+    return np.array(offsets)

@@ -29,7 +29,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT, control_endpoint, read_key, user_key
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
-READY_S = 60.0
+READY_S = 180.0
 ON_HOSTS = ("control", "recognizer", "synthesizer")
 PORTS = {  # of services on virtual hosts
     "control": {"control": 5550, "events": 5551},

@@ -77,7 +77,7 @@ function read([topic, body]) {
 
 const { format, pcm, frameBytes } = await readWav(file);
 const control = connect(Dealer, `${controlAddress} ${key.control}`);
-control.receiveTimeout = 5000; // ms
+control.receiveTimeout = 15_000; // ms
 await send(control, "open-session", "", { request: "1", paced: false, ...format });
 const [answer, opened] = read(await control.receive().catch(() => {
   fail(`control does not answer at ${controlAddress}; start it with: kouxing run`);

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgpack
 import zmq
 
-MAX_WAIT_MS = 5000  # for an answer of control
+MAX_WAIT_MS = 15_000  # for an answer of control
 
 if len(sys.argv) < 2:
     sys.exit("usage: client.py FILE.wav [CONTROL-ADDRESS]")

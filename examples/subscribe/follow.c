@@ -241,7 +241,7 @@ int main(int num_arguments, char **arguments) {
   char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1], events[MAX_ENDPOINT + 1];
   snprintf(endpoint, sizeof endpoint, "%s %s", address, key.control);
   void *control = zmq_socket(context, ZMQ_DEALER);
-  int max_wait_ms = 5000, linger_ms = 0;
+  int max_wait_ms = 15000, linger_ms = 0;
   zmq_setsockopt(control, ZMQ_RCVTIMEO, &max_wait_ms, sizeof max_wait_ms);
   zmq_setsockopt(control, ZMQ_LINGER, &linger_ms, sizeof linger_ms);
   connect_to(control, endpoint, &key);

@@ -90,7 +90,7 @@ async function follow(endpoint) {
 }
 
 const control = connect(Dealer, `${controlAddress} ${key.control}`);
-control.receiveTimeout = 5000; // ms
+control.receiveTimeout = 15_000; // ms
 const { session, endpoints } = await find(control);
 const { services } = await ask(control, "status-request", "");
 const { events } = services.find(({ service }) => service === "control").endpoints;

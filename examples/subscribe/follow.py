@@ -27,7 +27,7 @@ key = json.loads(key_file.read_text(encoding="utf-8"))
 context = zmq.Context()
 numbers = itertools.count(1)  # of requests
 JAW_OPEN = 24  # index in ARKit's names
-MAX_WAIT_MS = 5000  # for an answer of control
+MAX_WAIT_MS = 15_000  # for an answer of control
 
 
 def connect(socket, endpoint):

@@ -51,14 +51,11 @@ def with_loss(send: Send, share_lost: float) -> Send:
     return send_most
 
 
-@pytest.mark.parametrize("share_lost", [0.0, 0.05])
-def test_webrtc_streams_sound_and_returns_frames(
-    system: System, expected: list[str], monkeypatch: pytest.MonkeyPatch, share_lost: float
+def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
+    system: System, expected: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
-    monkeypatch.setattr(
-        RTCDtlsTransport, "_send_rtp", with_loss(RTCDtlsTransport._send_rtp, share_lost)
-    )
+    monkeypatch.setattr(RTCDtlsTransport, "_send_rtp", with_loss(RTCDtlsTransport._send_rtp, 0.05))
     opening = {FAP_TYPE: 0.0, SHAPES_TYPE: 0.0}  # largest opening of the jaw, in both formats
     index = {FAP_TYPE: OPEN_JAW, SHAPES_TYPE: ARKIT.names.index("jawOpen")}
     phones: dict[int, str] = {}
@@ -100,7 +97,7 @@ def test_webrtc_streams_sound_and_returns_frames(
     asyncio.run(call())
     received = without_silence([phones[index] for index in sorted(phones)])
     similarity = difflib.SequenceMatcher(None, received, expected[: len(received)]).ratio()
-    assert similarity > (0.4 if share_lost else 0.5)
+    assert similarity > 0.4
     assert opening[SHAPES_TYPE] > 0.2
 
 

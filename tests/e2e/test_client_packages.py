@@ -145,7 +145,6 @@ DOWN = np.array([[0.0, -0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.0]])
 TOWARDS = np.array([[0.0, 0.0, 1.0]] * 3)
 TURNED = np.array([-1.0, 1.0, -1.0])  # VRM 0 looks along -z
 TRIANGLE = np.array([[0, 1, 2]])
-VISEMES = "sil PP FF TH DD kk CH SS nn RR aa E I O U".split()  # as Ready Player Me names them
 BONES = (
     *("hips", "spine", "head"),
     *(side + limb for side in ("left", "right") for limb in ("UpperArm", "LowerArm", "Hand")),
@@ -188,7 +187,6 @@ def write_faces(folder: Path) -> None:
     about = {"name": "kouxing", "extras": {"kouxing": {"faps": faps, "camera": camera}}}
     write_face(folder / "own.glb", ["open_jaw"], about)
     write_face(folder / "arkit.glb", ["Face.jawOpen"])
-    write_face(folder / "oculus.glb", [f"viseme_{name}" for name in VISEMES])
     write_face(folder / "none.glb", [])
     for name, extension, about_vrm in (("vrm", "VRMC_vrm", VRM_1), ("vrm-0", "VRM", VRM_0)):
         write_face(
@@ -221,7 +219,6 @@ def faces(
     live = f'gateway="{gateway.page}" session="seen"'
     attributes = {
         "arkit": 'src="arkit.glb" recording',
-        "oculus": 'src="oculus.glb" recording',
         "vrm": 'src="vrm.vrm" recording',
         "old": 'src="vrm-0.vrm" recording',
         "own": f'src="own.glb" onclick="this.turnSoundOn()" {live}',
@@ -247,8 +244,8 @@ def faces(
 
 
 def test_the_web_component_detects_the_shapes_of_a_model(faces: Browser) -> None:
-    sets = faces.evaluate("[arkit, oculus, vrm, old, own].map((face) => face.set)")
-    assert sets == ["arkit", "oculus", "vrm", "vrm", "faps"]
+    sets = faces.evaluate("[arkit, vrm, old, own].map((face) => face.set)")
+    assert sets == ["arkit", "vrm", "vrm", "faps"]
     faces.wait_for("none.failure?.includes('cannot speak')")
 
 
@@ -256,7 +253,7 @@ def test_the_web_component_plays_recordings_on_models_of_all_kinds(
     faces: Browser, project: Path
 ) -> None:
     closed = faces.steady_image()
-    for face, shape in (("arkit", "jawOpen"), ("oculus", "ou"), ("vrm", "aa"), ("old", "aa")):
+    for face, shape in (("arkit", "jawOpen"), ("vrm", "aa"), ("old", "aa")):
         name = f"{face}.jsonl"
         write_recording(project / name, faces.evaluate(f"{face}.set"), shape)
         faces.evaluate(f"{face}.setAttribute('recording', '{name}')")

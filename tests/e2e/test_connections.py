@@ -18,7 +18,6 @@ from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
-from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Progress
 from tests.system import LIMIT_S, wait_until
 
@@ -153,72 +152,6 @@ def has_ended(connection: socket.socket) -> bool:
         return False
     except OSError:
         return True
-
-
-def test_disconnects_a_peer_whose_message_does_not_end(bus: Bus) -> None:
-    phones = bus.bind_router(LOCAL, "phones")
-    with connected(port_of(phones)) as hostile:
-        hostile.sendall(frame(b"", more=True) * 50_000)
-        assert is_cut(hostile, phones)
-
-
-def test_disconnects_a_peer_that_sends_only_bad_messages(bus: Bus) -> None:
-    audio = bus.bind_router(LOCAL, "audio")
-    with connected(port_of(audio)) as hostile:
-        hostile.settimeout(0.001)
-        bad = 10 * (frame(b"nothing/s/", more=True) + frame(b"\x80"))  # budget recovers
-        unsent = bad
-        end_s = time.monotonic() + LIMIT_S
-        while time.monotonic() < end_s:
-            try:
-                unsent = unsent[hostile.send(unsent) :] or bad
-            except TimeoutError:
-                pass
-            except OSError:
-                return
-            for received in audio.receive():
-                audio.send(Error(code="bad-message", text="no"), to=received.sender)
-    raise AssertionError("it was not cut")
-
-
-def test_reports_the_end_of_a_connection(bus: Bus) -> None:
-    audio = bus.bind_router(LOCAL, "audio")
-    port = port_of(audio)
-    with connected(port) as lasting:
-        for _ in range(3):  # a descriptor is used again
-            with connected(port) as connection:
-                connection.sendall(wire_bytes(chunk(1, 10)))
-                (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
-                assert not list(audio.ended())
-            ended: list[int] = []
-            wait_until(ended.copy, step=lambda: ended.extend(audio.ended()))  # noqa: B023
-            assert ended == [received.sender.connection]
-        lasting.sendall(wire_bytes(chunk(1, 10)))
-        assert collect(bus, audio, lambda all_: len(all_) == 1)
-
-
-def test_a_disconnected_address_is_blocked_for_a_while(
-    bus: Bus, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("kouxing.shared.sockets.LONG_PENALTY_S", 600.0)
-    audio = bus.bind_router(LOCAL, "audio")
-    talker = bus.connect_dealer(audio.endpoint)
-    talker.send(chunk(1, 10))
-    collect(bus, audio, lambda all_: len(all_) == 1)
-    with connected(port_of(audio)) as hostile:
-        hostile.sendall(frame(b"", more=True) * 2 * MAX_DROPPED + frame(b""))
-        assert is_cut(hostile, audio)
-    for host in ("127.0.0.1", "127.0.0.9"):  # the same host
-        with contextlib.suppress(ConnectionError), connected(port_of(audio), host=host) as other:
-            assert is_cut(other, audio, num_looks=50)
-    late = bus.connect_dealer(audio.endpoint)
-    for sequence in range(10, 20):  # the existing connection stays
-        time.sleep(0.02)
-        talker.send(chunk(sequence, 10))
-        received = collect(bus, audio, lambda all_: len(all_) >= 1)
-        assert received[-1].message == chunk(sequence, 10)
-    monkeypatch.setattr(connections, "BUDGET_PER_S", 1e9)  # recovered
-    collect(bus, audio, lambda all_: late.send(chunk(3, 10)) and bool(all_))
 
 
 def test_drops_a_message_of_very_many_parts_step_by_step(

@@ -17,7 +17,7 @@ from kouxing.shared.wire.speech import Phone
 from tests.e2e.following import Stream, samples_of_file, stream
 from tests.system import CHAIN, DEMO, LIMIT_S, System
 
-SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:88000]
+SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 LOST_AT = 24000  # samples
 ONSET_TOLERANCE = 480  # samples: another recognizer has processed less audio before
 LARGEST_STEP = 1.25  # relative to the largest undisturbed step
@@ -55,13 +55,13 @@ def test_the_only_recognizer_keeps_its_session_after_it_stood_still(system: Syst
     assert num_missing_samples(sent, len(samples)) == 0
 
 
-@pytest.mark.parametrize("blow", [signal.SIGSTOP, signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("blow", [signal.SIGSTOP, signal.SIGTERM])
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
 def test_a_session_continues_without_its_worker(
     system: System, undisturbed: Stream, bus: Bus, service: str, blow: signal.Signals
 ) -> None:
     if sum(name.startswith(service) for name in system.running) < 2:
-        system.add(f"{service}-{2 + (blow == signal.SIGTERM)}")
+        system.add(f"{service}-2")
     with Client(system.control) as client, client.open_session(encoding="f32le") as session:
         sent = Stream(session)
         sent.send(SAMPLES[:LOST_AT], paced=True)
@@ -83,7 +83,7 @@ def test_a_session_continues_without_its_worker(
             lost.send_signal(signal.SIGCONT)
             system.running.add(name)
         else:
-            assert lost.wait(LIMIT_S) == (0 if blow == signal.SIGTERM else -blow)
+            assert lost.wait(LIMIT_S) == 0
         sent.send(unsent, paced=True)
         sent.finish()
         after = session.info

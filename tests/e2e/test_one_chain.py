@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from kouxing_client import Client
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, live_scheme, recognize_clip
@@ -17,17 +14,15 @@ from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import to_samples
-from kouxing.shared.config import variable
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
 from tests.e2e.following import Stream, samples_of_file, stream
 from tests.lips import LIPS, clip_of
-from tests.system import CHAIN, DEMO, VOWELS_FILE, System
+from tests.system import DEMO, VOWELS_FILE, System
 
 MOUTH = np.array(MOUTH_FAPS) - 1
-JAW = 2  # column of FAP 3
 
 
 def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
@@ -45,7 +40,7 @@ def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
 def test_services_send_the_frames_of_the_chain(
     system: System, name: str, rate_hz: int, chunk: int
 ) -> None:
-    samples = at_rate(samples_of_file(DEMO / f"{name}.wav"), rate_hz)
+    samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:48000], rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
     sent = stream(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
     chain = LiveChain(load_live_model(), load_lip_model(), sample_rate_hz=rate_hz)
@@ -75,26 +70,6 @@ def test_services_send_the_frames_of_the_chain(
     ]
 
 
-@pytest.mark.parametrize(
-    "settings", [{"lips": "dynamic-visemes"}, {"lips": "learnt", "delay_ms": 160.0}]
-)
-def test_services_send_the_frames_of_the_chain_with_other_settings(
-    tmp_path: Path, settings: dict[str, Any]
-) -> None:
-    samples = samples_of_file(VOWELS_FILE)
-    environment = {variable("synthesizer", key): str(value) for key, value in settings.items()}
-    with System(CHAIN, tmp_path, environment) as system:
-        sent = stream(system.control, samples, chunk=997)
-    chain = LiveChain(
-        load_live_model(),
-        load_lip_model(name=settings["lips"]),
-        synthesizer=SynthesizerConfig(**settings),
-    )
-    frames = chain.accept_waveform(samples) + chain.input_finished()
-    np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
-    assert sent.faps[:, JAW].max() > 50.0
-
-
 def lips_of(sent: Stream) -> list[speech.LipPositions]:
     """Lip frames without session, epoch and sequence."""
     return [
@@ -107,29 +82,6 @@ def lips_of(sent: Stream) -> list[speech.LipPositions]:
         )
         for lips in sent.lips
     ]
-
-
-def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
-    samples = samples_of_file(VOWELS_FILE)
-    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"))
-    frames = chain.accept_waveform(samples) + chain.input_finished()
-    settings = {
-        "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",
-        "KOUXING_SYNTHESIZER_DELAY_MS": str(SynthesizerConfig(lips="learnt").delay_ms),
-    }
-    with (
-        System(CHAIN, tmp_path, settings) as system,
-        Client(system.control) as client,
-        client.open_session(encoding="f32le", paced=False) as session,
-    ):
-        session.set_face(lip_model="muscles")  # is reported and ignored
-        session.set_face(lip_model="learnt")
-        sent = Stream(session)
-        sent.send(samples)
-        sent.finish()
-    # the choice may overtake the start of the audio; the face is at rest there
-    np.testing.assert_allclose(sent.faps, np.array([faps for _, faps in frames]), atol=0.5)
-    assert sent.faps[:, JAW].max() > 50.0
 
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:

@@ -61,7 +61,6 @@ def test_shows_the_measured_delay(browser: Browser) -> None:
     ("service", "text"),
     [
         ("recognizer", "A service crashed"),
-        ("synthesizer", "A service crashed"),
         ("gateway", "The gateway has stopped"),
     ],
 )

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser import READY, Browser, serve_folder
+from tests.browser import READY, Browser
 from tests.fake_control import FakeControl
-from tests.system import DEMO, Gateway, free_port, wait_until
+from tests.system import DEMO, Gateway
 
 TOKEN = "#token=a%2Bsecret"  # noqa: S105 - of the test
 CONTROLS = [
@@ -131,35 +131,3 @@ def test_the_bare_view_shows_only_the_face_on_a_transparent_background(
     assert alpha[height // 2, width // 2] == 255
     assert 0.1 < (alpha == 255).mean() < 0.8
     assert browser.evaluate("document.body.innerText.trim()") == ""
-
-
-@pytest.fixture(scope="module")
-def framing_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Serve a page that frames the face on green."""
-    folder, port = tmp_path_factory.mktemp("other"), free_port()
-    gateway = Gateway("tcp://127.0.0.1:9", frame_ancestors=f"http://localhost:{port}")
-    (folder / "index.html").write_text(
-        "<!doctype html><style>body { margin: 0 } iframe { width: 100vw; height: 100vh; border: 0 }"
-        f"</style><iframe src='{gateway.page}?view=bare&background=%2300ff00'></iframe>",
-        encoding="utf-8",
-    )
-    with serve_folder(folder, port):
-        yield port
-    assert gateway.stop() == 0
-
-
-def test_only_an_allowed_page_can_frame_the_face(browser: Browser, framing_port: int) -> None:
-    def has_face_on_green() -> bool:
-        image = browser.image().astype(int)
-        height, width, _ = image.shape
-        red, green, _ = image[height // 2, width // 2]
-        return bool((image[0, 0] == (0, 255, 0)).all() and red > green)
-
-    visit(browser, f"http://localhost:{framing_port}/")
-    browser.wait_for("document.readyState === 'complete'")
-    wait_until(has_face_on_green)
-    browser.complaints.clear()
-    visit(browser, f"http://127.0.0.1:{framing_port}/")
-    browser.wait_for("document.readyState === 'complete'")
-    wait_until(lambda: browser.image().any() and "frame-ancestors" in "".join(browser.complaints))
-    assert not (browser.image() == (0, 255, 0)).all(axis=2).any()

@@ -107,19 +107,3 @@ def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
         assert other.next_media_time == 8000 * num_long
         assert other.num_gaps == 0  # no audio was dropped
     assert not service.warned
-
-
-def test_unpaced_audio_waits_at_its_sender_while_live_audio_continues(
-    service: Recognizer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    service.start_session(UNPACED)
-    session = service._sessions["s"]
-    monkeypatch.setattr(service._audio, "wait", lambda _timeout_s: True)
-    num_sent = 0
-    with Bus() as bus:
-        unpaced = bus.connect_dealer(service.endpoints["unpaced_audio"], queue_length=10)
-        for _ in range(500):
-            num_sent += unpaced.send(chunk(num_sent, MAX_AUDIO_BYTES))
-            service.step(0.001)
-    assert num_sent < 250, "the socket must be full"
-    assert (session.order.last, session.stream.media_time) == (1, 0)

@@ -11,7 +11,6 @@ import pytest
 from kouxing_client import Client
 from rich.console import Console
 
-from kouxing.evaluation.system.faults import SPIN
 from kouxing.services.cli.supervisor import Supervisor
 from kouxing.shared.errors import UserError
 from tests.e2e.following import Stream, samples_of_file, stream
@@ -22,10 +21,7 @@ SERVICES = ("control", "recognizer", "synthesizer", "driver")
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    folder = tmp_path_factory.mktemp("supervised")
-    (folder / "sitecustomize.py").write_text(SPIN.format(seconds=600), encoding="utf-8")
-    settings = {"PYTHONPATH": str(folder)}
-    with System(SERVICES, folder, settings, restarts=True) as running:
+    with System(SERVICES, tmp_path_factory.mktemp("supervised"), restarts=True) as running:
         yield running
 
 
@@ -33,7 +29,6 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     ("service", "blow", "text"),
     [
         ("recognizer", signal.SIGSTOP, "recognizer hangs"),
-        ("synthesizer", signal.SIGUSR1, "synthesizer hangs"),
         ("synthesizer", signal.SIGKILL, "synthesizer ended with status -9"),
     ],
 )

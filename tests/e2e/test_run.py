@@ -1,21 +1,41 @@
-"""``kouxing run``: everything at once, as ``make demo`` and ``make run`` do it."""
+"""``kouxing run``, as ``make demo`` and ``make run`` start it, and Ctrl-C at several stages."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import av
 import pytest
 
-from tests.system import LIMIT_S, VOWELS_FILE, kouxing, own_environment, start_python
+from tests.system import (
+    LIMIT_S,
+    ONE_THREAD,
+    ROOT,
+    VOWELS_FILE,
+    kouxing,
+    own_environment,
+    start_python,
+    wait_until,
+)
 
 SENTENCE = VOWELS_FILE
+# A shell's background processes ignore Ctrl-C, and so do their children.
+COMMAND = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from kouxing.__main__ import main
+main()
+"""
 
 
 def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
@@ -77,7 +97,6 @@ def test_reports_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     [
         (["--play", "nowhere.wav"], "no such file"),
         (["--set", "recognizer.acustic=gmm"], "recognizer.acoustic"),
-        (["--set", "synthesizer.delay_ms=5000"], "300"),
     ],
 )
 def test_reports_a_mistake_before_anything_starts(
@@ -87,3 +106,36 @@ def test_reports_a_mistake_before_anything_starts(
     assert result.returncode == 2
     assert result.stderr.startswith("kouxing: ")
     assert word in result.stderr
+
+
+def interrupt(arguments: list[str], folder: Path, is_due: Callable[[], bool]) -> tuple[int, str]:
+    """Press Ctrl-C when it is due; return the command's status and what it printed."""
+    environment = {**ONE_THREAD, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(folder)}
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *arguments],
+        env=os.environ | environment,
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            wait_until(is_due)
+            process.send_signal(signal.SIGINT)
+            _, log = process.communicate(timeout=LIMIT_S)
+        finally:
+            process.kill()
+    assert "Traceback" not in log
+    return process.returncode, log
+
+
+def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
+    arguments = ["run", "--no-browser", "--port", "0", "--play", str(SENTENCE)]
+    status, log = interrupt(arguments, tmp_path, (tmp_path / "out/logs/control.log").exists)
+    assert (status, "stopping" in log) == (0, True)
+
+
+def test_an_interrupted_render_leaves_no_file(tmp_path: Path) -> None:
+    arguments = ["render", str(SENTENCE), "face.mp4", "--size", "1920x1080"]
+    status, _ = interrupt(arguments, tmp_path, lambda: any(tmp_path.glob("*face*")))
+    assert status == 130
+    assert not list(tmp_path.glob("*face*"))

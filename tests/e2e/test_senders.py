@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import socket
 import threading
 import time
@@ -119,29 +118,6 @@ def test_an_unknown_host_does_not_delay_other_targets(
     wait_until(lambda: "cannot reach nowhere.invalid" in problem(senders, lost))
 
 
-def test_recovers_after_a_network_change(
-    senders: Senders, receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened: list[socket.socket] = []
-
-    class Counted(socket.socket):
-        def connect(self, address: object) -> None:
-            opened.append(self)
-            super().connect(address)  # type: ignore[arg-type]
-
-        def send(self, data: bytes) -> int:  # type: ignore[override]
-            if self is opened[0]:
-                raise OSError(errno.ENETUNREACH, "Network is unreachable")
-            return super().send(data)
-
-    monkeypatch.setattr(socket, "socket", Counted)
-    url = f"osc://127.0.0.1:{receiver.getsockname()[1]}"
-    senders.start(parse_target(url))
-    wait_until(lambda: "Network is unreachable" in problem(senders, url))
-    assert receiver.recv(2000)
-    wait_until(lambda: problem(senders, url) == "")
-
-
 def test_sends_over_ipv6(senders: Senders) -> None:
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as program:
         try:
@@ -253,13 +229,3 @@ def test_two_senders_share_one_permission(senders: Senders) -> None:
         shown = len(stub.frames)
         wait_until(lambda: len(stub.frames) > shown + 5)
         assert "EyeOpenLeft" not in stub.frames[-1]
-
-
-def test_reports_a_program_that_is_not_vtube_studio(senders: Senders) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:  # accepts connections and does not answer
-        url = f"vts://127.0.0.1:{other.getsockname()[1]}"
-        senders.start(parse_target(url))
-        accepted, _ = other.accept()
-        accepted.sendall(b"220 mail\r\n")
-        accepted.close()
-        wait_until(lambda: "VTube Studio" in problem(senders, url))

@@ -1,34 +1,131 @@
-"""Settings that change what a running system does."""
+"""Settings that change what a running system does, and its end."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import asyncio
+import signal
+from collections.abc import Iterator
 
+import aiohttp
+import aioice
 import numpy as np
 import pytest
-from kouxing_client import Client, KouxingError
+from aiortc import RTCConfiguration, RTCPeerConnection
+from kouxing_client import Client, KouxingError, Refused
+from numpy.typing import NDArray
 
-from tests.e2e.following import samples_of_file, stream
-from tests.system import CHAIN, VOWELS_FILE, System
+from kouxing.evaluation.system.live import Seen, speak
+from kouxing.services.control.load import MIN_SESSIONS, RETRY_AFTER_S
+from kouxing.services.kinds import KINDS
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.config import variable
+from tests.e2e.following import Stream, samples_of_file, stream
+from tests.system import LIMIT_S, VOWELS_FILE, System, wait_until
 
+FACE = SynthesizerConfig(
+    lips="dynamic-visemes", delay_ms=160.0, frame_rate_hz=30.0, idle_motion_seed=0
+)
 SETTINGS = {
-    "KOUXING_SYNTHESIZER_FRAME_RATE_HZ": "30",
-    "KOUXING_SYNTHESIZER_DELAY_MS": "0",
-    "KOUXING_SYNTHESIZER_IDLE_MOTION_SEED": "0",
-    "KOUXING_CONTROL_IDLE_LIMIT_S": "1",
+    **{
+        variable("synthesizer", key): str(getattr(FACE, key))
+        for key in ("lips", "delay_ms", "frame_rate_hz", "idle_motion_seed")
+    },
+    "KOUXING_CONTROL_MAX_LOAD": "0.1",  # less than one session needs
+    "KOUXING_CONTROL_IDLE_LIMIT_S": "15",
 }
+SAMPLES = samples_of_file(VOWELS_FILE)
 
 
-def test_settings_change_the_frames_and_the_time_limit_of_sessions(tmp_path: Path) -> None:
-    with System(CHAIN, tmp_path, SETTINGS) as system, Client(system.control) as client:
+@pytest.fixture(scope="module")
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    with System(KINDS, tmp_path_factory.mktemp("settings"), SETTINGS) as running:
+        yield running
+
+
+def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
+    chain = LiveChain(load_live_model(), load_lip_model(name=lips), synthesizer=FACE)
+    frames = chain.accept_waveform(SAMPLES) + chain.input_finished()
+    return np.array([faps for _, faps in frames])
+
+
+def test_the_face_has_the_frames_of_the_chain_with_these_settings(system: System) -> None:
+    sent = stream(system.control, SAMPLES, chunk=997)
+    np.testing.assert_allclose(np.diff(np.array(sent.times) / 16000), 1 / 30, atol=1e-4)
+    np.testing.assert_array_equal(sent.faps, frames_of_the_chain("dynamic-visemes"))
+    assert np.abs(sent.faps[:, 2]).max() > 50.0
+
+
+def test_lips_are_switched_while_a_session_runs(system: System) -> None:
+    with (
+        Client(system.control) as client,
+        client.open_session(encoding="f32le", paced=False) as session,
+    ):
+        session.set_face(lip_model="muscles")  # is reported and ignored
+        session.set_face(lip_model="learnt")
+        sent = Stream(session)
+        sent.send(SAMPLES)
+        sent.finish()
+    # the choice may overtake the start of the audio; the face is at rest there
+    np.testing.assert_allclose(sent.faps, frames_of_the_chain("learnt"), atol=0.5)
+
+
+def test_refuses_one_session_too_many_and_the_others_continue(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
+    monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
+    samples = SAMPLES[:24000]
+    with Client(system.control) as client:
+        alone = stream(system.control, samples)
+        sessions = [client.open_session(encoding="f32le") for _ in range(MIN_SESSIONS)]
+        with pytest.raises(Refused, match="every recognizer is busy") as caught:
+            client.open_session(encoding="f32le")
+        all_seen = speak(sessions, samples)
+        message, answer = asyncio.run(_refused(system.page))
+        for session in sessions:
+            session.close()
+
+    assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
+    assert (message["code"], message["retry_after_s"]) == ("busy", RETRY_AFTER_S)
+    assert (answer.status, answer.headers["Retry-After"]) == (503, f"{RETRY_AFTER_S:.0f}")
+    expected = Seen(phones=alone.phones, speech=alone.speech).spoken_phones()
+    for seen in all_seen:
+        assert (seen.ended, seen.error) == (True, "")
+        assert {*alone.times} <= {frame.media_time for _, frame in seen.frames}
+        phones = seen.spoken_phones()
+        assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
+
+
+async def _refused(page: str) -> tuple[dict[str, object], aiohttp.ClientResponse]:
+    """Return the gateway's answers to a microphone and to a WebRTC client."""
+    peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+    peer.addTransceiver("audio")
+    await peer.setLocalDescription(await peer.createOffer())
+    sdp, headers = peer.localDescription.sdp, {"Content-Type": "application/sdp"}
+    async with aiohttp.ClientSession() as http:
+        async with http.ws_connect(f"{page}microphone") as microphone:
+            await microphone.send_str('{"sample_rate_hz": 16000}')
+            message = await microphone.receive_json(timeout=60)
+        async with http.post(f"{page}whip", data=sdp, headers=headers) as answer:
+            await answer.read()
+    await peer.close()
+    return message, answer
+
+
+def test_control_closes_a_session_without_audio(system: System) -> None:
+    with Client(system.control) as client:
         idle = client.open_session(encoding="f32le")
-        events = idle.events()
-        sent = stream(system.control, samples_of_file(VOWELS_FILE))
-        (event,) = (event for event in events.available(60.0) if event.detail)
+        (event,) = (event for event in idle.events().available(60.0) if event.detail)
+        assert (event.name, "no audio" in event.detail) == ("session-closed", True)
         with pytest.raises(KouxingError, match=r"control has closed the session: .*no audio"):
             list(idle.frames())
-    assert (event.name, "no audio" in event.detail) == ("session-closed", True)
-    np.testing.assert_allclose(np.diff(np.array(sent.times) / 16000), 1 / 30, atol=1e-4)
-    assert np.abs(sent.faps[:, 2]).max() > 100
-    assert np.abs(sent.faps[:, 18:42]).max() == 0, "no idle motion"
-    assert np.abs(sent.faps[:, 47:50]).max() == 0
+
+
+def test_every_service_stops_cleanly_on_sigterm(system: System) -> None:
+    processes = [system.lose(name, signal.SIGTERM) for name in KINDS]
+    assert [process.wait(LIMIT_S) for process in processes] == [0] * len(processes)
+    wait_until(lambda: all('"message": "stopped"' in system.log(name) for name in KINDS))
+    assert not any("traceback" in system.log(name).lower() for name in KINDS)

@@ -64,24 +64,6 @@ def test_pages_contain_everything_once(
     assert sessions == names == [state.session for state in whole.sessions]
 
 
-def test_a_session_that_ends_between_pages_hides_no_other(
-    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = open_sessions(stage, 4)
-    monkeypatch.setattr(control_status, "PAGE_BYTES", 0)
-    after, seen = control_status.FIRST_SESSION, []
-    while True:
-        page = ask(stage, client, after=after)
-        assert isinstance(page, StatusReport)
-        if not page.sessions:
-            break
-        seen += [state.session for state in page.sessions]
-        if seen == names[:2]:
-            stage.control._end_session(stage.control._sessions.find(names[0]), "over")
-        after = page.next or 0
-    assert seen == names
-
-
 def test_reports_one_session_and_its_services(stage: Stage, client: Socket) -> None:
     open_sessions(stage, 3)
     report = ask(stage, client, session="s1")
@@ -90,24 +72,6 @@ def test_reports_one_session_and_its_services(stage: Stage, client: Socket) -> N
     assert {state.instance for state in report.services} == {"recognizer", "synthesizer"}
     stage.control._requests.defers = False
     assert getattr(ask(stage, client, session="none"), "code", "") == "unknown-session"
-
-
-def test_the_first_page_contains_a_service_of_every_kind(
-    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(20):
-        beat = Heartbeat(
-            service="a-lamp", instance=f"a{number}", role="observer", state="ready", sent_ns=0
-        )
-        client.send(beat)
-    while len(stage.control._registry.sorted()) < 22:
-        stage.control.step(0.01)
-        list(client.receive())
-    monkeypatch.setattr(control_status, "PAGE_BYTES", 1000)
-    page = ask(stage, client)
-    assert isinstance(page, StatusReport)
-    assert page.next
-    assert {state.service for state in page.services} >= {"a-lamp", "recognizer", "synthesizer"}
 
 
 def test_only_clients_and_services_see_the_token_of_the_web_page(

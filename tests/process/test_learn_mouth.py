@@ -15,7 +15,6 @@ import aiohttp
 import pytest
 from aiohttp import web
 
-from kouxing.services.gateway import learn_mouth
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.http import MAX_UPLOAD_BYTES, make_application
 from kouxing.services.gateway.learn_mouth import MouthLearner
@@ -134,19 +133,6 @@ async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
         await wait_until_ended(process)
         assert not gateway.learner.is_learning
         assert await gateway.post() == (503, {"error": "the gateway is stopping"})
-
-
-@async_test
-async def test_stops_learning_at_the_time_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(learn_mouth, "LEARNING_LIMIT_S", 0.5)
-    async with serve(hang) as gateway:
-        recording = str(tmp_path / "process").encode()
-        assert await gateway.post(recording) == (
-            422,
-            {"error": "learning took longer than 0.5 s; try again later"},
-        )
 
 
 @async_test

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import re
 import urllib.request
-from collections.abc import Iterator
 
-import numpy as np
 import pytest
 from kouxing_client import Client, FapFrame
 from prometheus_client import Metric
@@ -16,39 +14,35 @@ from prometheus_client.parser import text_string_to_metric_families
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.config import variable
 from tests.raw_bytes import pour
-from tests.system import ROOT, VOWELS_FILE, System, free_port
+from tests.system import ROOT, VOWELS_FILE, System
 
 SERVICES = ("control", "recognizer", "synthesizer")
 ELSEWHERE = {"frames_missed", "videos", "video_seconds"}  # metrics of services that do not run here
-NUM_CHUNKS = 8  # each fits into one message
 SUFFIXES = ("_total", "_bucket", "_count", "_sum")
 
 
 @pytest.fixture(scope="module")
-def families(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Metric]]]:
+def families(system: System) -> dict[str, list[Metric]]:
     """Metrics of each service while a session is open."""
-    ports = {service: free_port() for service in SERVICES}
-    settings = {variable(name, "metrics_port"): str(port) for name, port in ports.items()}
-    folder = tmp_path_factory.mktemp("metrics")
-    with System(SERVICES, folder, settings) as system, Client(system.control) as client:
+    ports = [int(system.environment[variable(name, "metrics_port")]) for name in SERVICES]
+    with Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)
         session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz, paced=False)
         output = session.results(FapFrame, keep_all=True)
-        for part in np.array_split(samples, NUM_CHUNKS):
-            session.push(part)
+        session.push(samples)
         session.finish()
         assert list(output)
         before = _heartbeats(client)
-        system.wait_until(lambda _: _heartbeats(client) > before + 2)  # they set the gauges
-        for port in ports.values():
+        system.wait_until(lambda _: _heartbeats(client) > before + 5)  # they set the gauges
+        for port in ports:
             pour(port, 0.2)  # which the pages outlast
-        yield {
-            name: list(text_string_to_metric_families(_page(port))) for name, port in ports.items()
-        }
+        pages = [[*text_string_to_metric_families(_page(port))] for port in ports]
+    return dict(zip(SERVICES, pages, strict=True))
 
 
 def _heartbeats(client: Client) -> float:
-    return client.status().services[0].metrics["in_heartbeat"]
+    (control,) = (state for state in client.status().services if state.service == "control")
+    return control.metrics["in_heartbeat"]
 
 
 def _page(port: int) -> str:
@@ -75,17 +69,16 @@ def test_a_session_appears_in_all_metrics(
     families: dict[str, list[Metric]],
 ) -> None:
     for service in SERVICES:
-        assert _value(families[service], "kouxing_sessions", service=service) == 1
+        assert _value(families[service], "kouxing_sessions", service=service) >= 1
         assert 0 <= _value(families[service], "kouxing_load") <= 1
     recognizer, synthesizer = families["recognizer"], families["synthesizer"]
-    chunks = _value(recognizer, "kouxing_messages_received_total", kind="audio-chunk")
-    assert chunks == NUM_CHUNKS + 1, "the last message ends the audio"
+    assert _value(recognizer, "kouxing_messages_received_total", kind="audio-chunk") > 1
     assert _value(recognizer, "kouxing_chunk_seconds_count") > 0
     assert _value(recognizer, "kouxing_unacknowledged_messages") == 0
     frames = _value(synthesizer, "kouxing_messages_published_total", kind="fap-frame")
     assert frames > 100
-    assert _value(families["control"], "kouxing_events_total", event="session-opened") == 1
-    assert _value(families["control"], "kouxing_services") == len(SERVICES)
+    assert _value(families["control"], "kouxing_events_total", event="session-opened") >= 1
+    assert _value(families["control"], "kouxing_services") >= len(SERVICES)
 
 
 def test_every_metric_is_documented(families: dict[str, list[Metric]]) -> None:

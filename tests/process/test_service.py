@@ -17,7 +17,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.service import RESYNC_AFTER_S, SESSIONS_PER_HEARTBEAT, Service
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted, StartSession
-from kouxing.shared.wire.session import Done, SessionFacts
+from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
@@ -77,19 +77,6 @@ def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
         (answer,) = [received.message for received in sender.receive()]
     assert getattr(answer, "code", "") == "bad-message"
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
-
-
-def test_a_paused_socket_keeps_its_messages(slow: Slow) -> None:
-    with Bus() as bus:
-        sender = bus.connect_dealer(slow.input.endpoint)
-        slow.pause(slow.input, paused=True)
-        sender.send(Progress(level_db=0.0))
-        sender.send(Done(request="r"))
-        for _ in range(10):
-            slow.step(0.01)
-        assert slow.num_handled == 0
-        slow.pause(slow.input, paused=False)
-        handle(slow, 1)
 
 
 def test_drops_a_message_when_no_file_can_be_opened(
@@ -186,17 +173,6 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     assert worker.happened[after : after + 3] == ["input", "stop s0", "tick"]
 
 
-def test_continues_after_a_stall_without_control() -> None:
-    worker = Worker("tcp://127.0.0.1:9")
-    with worker.bus, Bus() as bus:
-        sender = bus.connect_dealer(worker.input.endpoint)
-        sender.send(Progress(level_db=0.0))
-        time.sleep(RESYNC_AFTER_S + 0.1)
-        for _ in range(100):
-            worker.step(0.01)
-    assert worker.happened == ["input"]
-
-
 def test_a_restarted_control_learns_the_sessions(
     monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker
 ) -> None:
@@ -235,19 +211,6 @@ def test_registers_at_an_address_where_another_program_answered_before(
     wait_until(lambda: worker.instance in control._registry, step=step)
     for service in (worker, control):
         service.bus.close()
-
-
-def test_keeps_messages_for_a_control_that_hangs(
-    monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker
-) -> None:
-    monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.0)
-    monkeypatch.setattr(Service, "_warn_about_control", lambda self: None)
-    connected = worker.control
-    for _ in range(3):
-        worker._heartbeat_due_s = 0.0
-        worker.send_heartbeat_if_due()
-    assert worker.control is connected
-    run_until(worker, lambda: len(control.heartbeats) >= 3)
 
 
 def test_reports_draining_before_it_finishes_its_sessions(control: FakeControl) -> None:

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.kinds import KINDS
 from kouxing.shared.config import variable
 from tests.system import (
     LIMIT_S,
     ROOT,
-    System,
     can_connect,
     own_addresses,
     start_python,
@@ -28,18 +26,6 @@ def ended(*arguments: str, **environment: str) -> tuple[int, str]:
     process = start_python("-m", *arguments, **environment)
     _, log = process.communicate(timeout=LIMIT_S)
     return process.returncode, log
-
-
-def test_every_service_stops_cleanly_on_sigterm(tmp_path: Path) -> None:
-    with System(KINDS, tmp_path) as system:
-        processes = {name: system.process(name) for name in KINDS}
-        for process in processes.values():
-            process.send_signal(signal.SIGTERM)
-        statuses = {service: process.wait(LIMIT_S) for service, process in processes.items()}
-    assert statuses == dict.fromkeys(processes, 0)
-    wait_until(lambda: all('"message": "stopped"' in system.log(name) for name in processes))
-    for service in processes:
-        assert "traceback" not in system.log(service).lower()
 
 
 def test_ctrl_c_during_startup_prints_no_traceback() -> None:
@@ -65,24 +51,24 @@ def test_ctrl_c_in_imports_prints_nothing(tmp_path: Path, module: str, slow_impo
 
 @pytest.mark.parametrize(
     ("service", "key"),
-    [("control", "control"), ("recognizer", "audio"), ("synthesizer", "phone_input")],
+    [("recognizer", "audio"), ("gateway", "port")],
 )
 def test_reports_a_port_in_use(service: str, key: str) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        setting = {variable(service, key): f"tcp://127.0.0.1:{taken.getsockname()[1]}"}
-        status, log = ended(f"kouxing.services.{service}", **setting)
+        port = taken.getsockname()[1]
+        value = str(port) if service == "gateway" else f"tcp://127.0.0.1:{port}"
+        status, log = ended(f"kouxing.services.{service}", **{variable(service, key): value})
     assert status == 2
     assert f"{service}.{key}" in log
     assert "Traceback" not in log
 
 
-@pytest.mark.parametrize("service", KINDS)
-def test_reports_a_wrong_setting_before_it_binds_anything(service: str) -> None:
-    status, log = ended(f"kouxing.services.{service}", "--set", "log_level=loud")
+def test_reports_a_wrong_setting_before_it_binds_anything() -> None:
+    status, log = ended("kouxing.services.driver", "--set", "log_level=loud")
     assert status == 2
-    assert f"{service}.log_level" in log
+    assert "driver.log_level" in log
     assert "Traceback" not in log
 
 

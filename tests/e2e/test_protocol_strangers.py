@@ -1,4 +1,4 @@
-"""Each service on an address of its own; strangers that know only PROTOCOL.md."""
+"""Strangers that know only PROTOCOL.md."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgpack
-import pytest
 import zmq
 from kouxing_client.keys import Key
 
@@ -24,18 +22,6 @@ from tests.system import ROOT, VOWELS_FILE, System
 EXAMPLES = ROOT / "examples" / "stream"
 NODE = str(Path(sys.executable).with_name("node"))
 KEY_FILE = "~/.local/state/kouxing/client.key"
-HOSTS = {
-    "control": "127.0.0.11",
-    "recognizer": "127.0.0.12",
-    "synthesizer": "127.0.0.13",
-    "driver": "127.0.0.14",
-}
-
-
-@pytest.fixture(scope="module")
-def spread(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    with System([*HOSTS], tmp_path_factory.mktemp("spread"), hosts=HOSTS) as running:
-        yield running
 
 
 class Stranger:
@@ -65,15 +51,12 @@ def receive(socket: zmq.Socket[bytes]) -> tuple[str, dict[str, Any]]:
     return topic.decode().split("/")[0], msgpack.unpackb(body)
 
 
-def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> None:
+def test_a_stranger_streams_audio_and_another_reads_the_faps(system: System) -> None:
     speaker, watcher = Stranger(), Stranger()
-    control = speaker.socket(zmq.DEALER, spread.control)
+    control = speaker.socket(zmq.DEALER, system.control)
     send(control, "open-session", "stranger", request="1", encoding="s16le", paced=False)
     kind, opened = receive(control)
     assert kind == "session-opened", opened
-    for key, service in (("audio", "recognizer"), ("faps", "synthesizer"), ("events", "control")):
-        assert opened[key].startswith(f"tcp://{HOSTS[service]}:")
-
     faps = watcher.socket(zmq.SUB, opened["faps"])
     for wanted in ("fap-frame", "end-of-faps", "joined"):
         faps.setsockopt(zmq.SUBSCRIBE, f"{wanted}/stranger/".encode())
@@ -111,9 +94,9 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> 
     watcher.close()
 
 
-def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: System) -> None:
+def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(system: System) -> None:
     stranger = Stranger()
-    lamp = stranger.socket(zmq.DEALER, spread.control, load_key("lamp", ("service:lamp",)))
+    lamp = stranger.socket(zmq.DEALER, system.control, load_key("lamp", ("service:lamp",)))
     heartbeat: dict[str, Any] = {
         "service": "lamp",
         "instance": "lamp-1",
@@ -125,11 +108,11 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: Sys
     send(lamp, "heartbeat", "", **heartbeat)
     assert receive(lamp)[0] == "heartbeat-reply"
 
-    client = stranger.socket(zmq.DEALER, spread.control)
+    client = stranger.socket(zmq.DEALER, system.control)
     send(client, "open-session", "lit", request="1", paced=False)
     kind, start = receive(lamp)
     assert kind == "start-session"
-    assert start["endpoints"]["faps"].startswith(f"tcp://{HOSTS['synthesizer']}:")
+    assert "faps" in start["endpoints"]
     assert not client.poll(300), "the session opens once the lamp is ready for it"
     send(lamp, "session-started", "lit", request=start["request"])
     _, opened = receive(client)
@@ -149,9 +132,9 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: Sys
     stranger.close()
 
 
-def test_a_client_of_another_version_is_answered_in_its_version(spread: System) -> None:
+def test_a_client_of_another_version_is_answered_in_its_version(system: System) -> None:
     stranger = Stranger()
-    control = stranger.socket(zmq.DEALER, spread.control)
+    control = stranger.socket(zmq.DEALER, system.control)
     control.send_multipart([b"open//", msgpack.packb({"version": 1, "request": "r"})])
     kind, answer = receive(control)
     assert (kind, answer["version"], answer["code"]) == ("error", 1, "bad-message")
@@ -159,9 +142,9 @@ def test_a_client_of_another_version_is_answered_in_its_version(spread: System) 
     stranger.close()
 
 
-def test_the_example_in_the_readme_follows_a_face(spread: System, tmp_path: Path) -> None:
+def test_the_example_in_the_readme_follows_a_face(system: System, tmp_path: Path) -> None:
     (example,) = code_blocks(ROOT / "README.md", "python")
-    faps = spread.endpoints()["faps"].partition(" ")[0]
+    faps = system.endpoints()["faps"].partition(" ")[0]
     for default, own in (
         ("tcp://127.0.0.1:5571", faps),
         (str(Path(KEY_FILE).parent), key_folder()),
@@ -174,6 +157,6 @@ def test_the_example_in_the_readme_follows_a_face(spread: System, tmp_path: Path
         heard = threading.Thread(target=program.stdout.readline)
         heard.start()
         while heard.is_alive():  # it subscribes at some time
-            stream(spread.control, samples_of_file(VOWELS_FILE)[:8000], session="demo")
+            stream(system.control, samples_of_file(VOWELS_FILE)[:8000], session="demo")
         assert program.poll() is None
         program.terminate()
