@@ -9,17 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import zmq
 from kouxing_client import Client, KouxingError
 
-from kouxing.evaluation.system.attackers import connect
 from kouxing.services.kinds import KINDS
-from kouxing.shared import connections, kernel_sockets
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key
+from kouxing.shared.keys import key_folder, load_key
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
@@ -120,29 +117,6 @@ def test_rejects_a_key_of_another_system(
         assert bus.probe(with_key(router.endpoint, control.public)) is Reach.REFUSED
 
 
-def test_one_key_cannot_use_all_connections(
-    server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-    monkeypatch.setattr(kernel_sockets, "network_of", lambda host: host)  # each is one of its own
-    router, endpoint = server.router("recognizer.audio")
-    key = load_key("grant", ("client",))
-    with zmq.Context() as context:
-        grants = [context.socket(zmq.DEALER) for _ in range(7)]
-        ends = [grant.get_monitor_socket(zmq.EVENT_DISCONNECTED) for grant in grants]
-        for number, grant in enumerate(grants, start=2):
-            connect(grant, endpoint.replace("tcp://", f"tcp://127.0.0.{number}:0;"), key)
-            grant.send_multipart(encode(StatusRequest(request="1")))
-            assert router.wait(LIMIT_S)
-            list(router.receive())
-        assert ends[-1].poll(60_000)
-        assert not any(end.poll(0) for end in ends[:-1])
-        for grant, end in zip(grants, ends, strict=True):
-            grant.disable_monitor()
-            end.close()
-            grant.close(linger=0)
-
-
 def test_a_hung_control_does_not_answer() -> None:
     program = (
         "import time; from tests.e2e.test_bus_keys import Server;"
@@ -202,30 +176,6 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
             publisher.send(FapFrame(session=session, values=bytes(272), mask=bytes(9)))
         kinds = [(type(each), each.session) for each in messages_of(subscriber)]
         assert kinds == [(Joined, "mine"), (FapFrame, "mine")]
-
-
-def test_allows_and_revokes_a_key_while_running(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    router, endpoint = server.router("control.commands")
-    add_key("laptop", ("client",), tmp_path / "laptop.key")
-    (tmp_path / "other" / "kouxing").mkdir(parents=True, mode=0o700)
-    (tmp_path / "other" / "kouxing").chmod(0o700)
-    (tmp_path / "laptop.key").rename(tmp_path / "other" / "kouxing" / "client.key")
-    with monkeypatch.context() as there:
-        there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-        key = load_key("client", ())
-    with Bus(key) as bus:
-        dealer = bus.connect_dealer(endpoint)
-        dealer.send(StatusRequest(request="1"))
-        assert router.wait(LIMIT_S)
-        assert len(list(router.receive())) == 1
-        revoke_key("laptop")
-        assert server.bus.zap is not None
-        server.bus.zap.refresh()
-        dealer.send(StatusRequest(request="2"))
-        assert messages_of(router) == []
-        assert bus.probe(endpoint) is Reach.REFUSED
 
 
 class Recognizer(Service):

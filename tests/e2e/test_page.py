@@ -558,7 +558,8 @@ def test_reports_a_browser_without_webgl(browser: Browser, gateway: Gateway, vie
     browser.command("Page.disable")
 
 
-def test_reports_missing_services(control: PageControl, page: Browser) -> None:
+def test_reports_missing_services(control: PageControl, page: Browser, gateway: Gateway) -> None:
+    page.open(gateway.page)
     page.wait_for(f"{NOTICE} === ''")
     control.shown, control.running, control.refuse = None, ["synthesizer"], True
     page.wait_for(f"{NOTICE}.includes('Not running: recognizer')")
