@@ -149,4 +149,4 @@ $(BLENDER)/installed:
 	touch $@
 
 $(HEADS): $(HEAD_SOURCES) | .venv/installed
-	$(BIN)/kouxing head export --all $(PAGE)
+	$(BIN)/kouxing head export --all --force $(PAGE)

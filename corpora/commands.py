@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from kouxing.services.cli.options import AudioTrack
 from kouxing.shared.errors import UserError
@@ -18,6 +17,7 @@ from kouxing.shared.terminal import (
     JsonFile,
     check_output,
     print_message,
+    print_table,
     write_json,
 )
 
@@ -45,11 +45,12 @@ def adapt(
     check_output(output, json_file, inputs=sources, force=force)
     learned = learn_mouth_profile([_read(source) for source in sources])
     output.write_bytes(learned.content)
-    table = Table("correlation with the tracked lips", "without the profile", "with it")
-    for measure, *figures in zip(MEASURES, learned.gain.before, learned.gain.after, strict=True):
-        cells = ("-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures)
-        table.add_row(measure, *cells)
-    Console().print(table)
+    columns = ("correlation with the tracked lips", "without the profile", "with it")
+    rows = [
+        (measure, *("-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures))
+        for measure, *figures in zip(MEASURES, learned.gain.before, learned.gain.after, strict=True)
+    ]
+    print_table(Console(), "", columns, rows)
     write_json(json_file, learned.figures())
     print_message(
         f"wrote {output}, learned from {learned.speech_s:.0f} s of speech; the table compares the "

@@ -22,6 +22,7 @@ from kouxing.shared.audio_file import check_video
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.media_file import start_of
+from kouxing.shared.terminal import plural
 
 MAX_DURATION_S = 1200.0
 MAX_SIDE_PX = 960  # larger images are reduced
@@ -88,8 +89,8 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
     seen = np.array([landmarks is not None for landmarks in tracked])
     if seen.sum() < MIN_FRAMES:
         raise UserError(
-            f"{video}: a face was found in only {seen.sum()} images; film the face from the front "
-            "in good light, for 20 s or more"
+            f"{video}: a face was found in only {plural(seen.sum(), 'image')}; film the face "
+            "from the front in good light, for 20 s or more"
         )
     time_s = np.array(times)
     faps = np.full((len(seen), len(MOUTH_FAPS)), np.nan)

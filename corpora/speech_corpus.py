@@ -31,6 +31,7 @@ from pathlib import Path
 from kouxing.shared.audio_file import read_duration_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
+from kouxing.shared.terminal import plural
 
 # Licenses that allow distributing a model trained on the data.
 _FREE_LICENSE = re.compile(
@@ -80,7 +81,7 @@ class RowErrors:
         for message in self.messages:
             report(message)
         if self.messages:
-            report(f"{len(self.messages)} rows skipped")
+            report(f"{plural(len(self.messages), 'row')} skipped")
 
     def no_recording_error(self, where: str) -> UserError:
         """Make the error that no recording can be used, with the reason for the last one."""

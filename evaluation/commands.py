@@ -16,6 +16,7 @@ from kouxing.shared.terminal import (
     Force,
     JsonFile,
     check_output,
+    plural,
     print_message,
     write_json,
 )
@@ -159,7 +160,7 @@ def schemes(
         Path | None, typer.Option(help="Manifest or corpus folder; 20 sentences are used.")
     ] = None,
     audio: AudioFolder = None,
-    split: Split = "test",
+    split: Annotated[str | None, typer.Option(help="Split of the corpus. Default: test.")] = None,
     clips: Annotated[
         Path | None, typer.Option(help="Folder of clips with tracked lips, instead of a corpus.")
     ] = None,
@@ -188,7 +189,11 @@ def schemes(
     By default, the shipped samples are used, with the recognizers blocks and gmm.
     """
     from kouxing.evaluation.lips import sentences
-    from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
+    from kouxing.evaluation.lips.four_schemes import (
+        load_recognizers,
+        print_missing,
+        recognize_all,
+    )
     from kouxing.evaluation.lips.report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos
@@ -199,15 +204,20 @@ def schemes(
     check_output(json_file, force=force)
     if manifest and clips:
         raise UserError("use either --manifest or --clips, not both")
+    if (audio or split) and not manifest:
+        raise UserError("--audio and --split apply to a corpus; add --manifest")
+    if (anchor or sound_at_once) and not videos:
+        raise UserError("--anchor and --sound-at-once apply to videos; add --videos FOLDER")
     model = load_live_model()
     if manifest:
-        chosen = sentences.corpus_sentences(model, manifest, split, audio)
+        chosen = sentences.corpus_sentences(model, manifest, split or "test", audio)
     elif clips:
         chosen = sentences.clip_sentences(model, clips)
     else:
         chosen = sentences.sample_sentences(model, SENTENCE.parent)
     recognizers = load_recognizers(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
     names = lips or list(lip_models())
+    print_missing(names, recognizers)
     recognized = recognize_all(model, recognizers, chosen)
     outcome = score_schemes(recognized, recognizers, names)
     print_outcome(outcome, Console())
@@ -215,7 +225,7 @@ def schemes(
     if videos:
         options = {"has_anchor": anchor, "sound_at_once": sound_at_once}
         written = write_videos(recognized, recognizers, names, videos, **options)
-        print_message(f"wrote {len(written)} videos to {videos}")
+        print_message(f"wrote {plural(len(written), 'video')} to {videos}")
         if any(sentence.aligned is None for sentence in recognized):
             print_message("no videos of scheme 1: some sentences have no text")
 

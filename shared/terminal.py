@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 
 from kouxing.shared.errors import UserError
@@ -37,6 +40,56 @@ def open_progress() -> Progress:
 def plural(count: int, noun: str) -> str:
     """Return a count with its noun, such as "1 image" or "2 images"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def print_table(
+    console: Console, title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
+) -> None:
+    """Print a table; a row may lack its last cells.
+
+    Cells wrap between words. If the longest words do not fit side by side, each row is printed as
+    a list of its cells.
+    """
+    from rich import box  # noqa: PLC0415 (few commands need it)
+    from rich.table import Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
+    wrap = partial(fill, width=console.width - 2, break_long_words=False, break_on_hyphens=False)
+    cells = [[*row, *[""] * (len(columns) - len(row))] for row in rows]
+    available = console.width - 2 * (len(columns) - 1)
+    widths = _column_widths(columns, cells, available)
+    console.print(Text(f"\n{title}".rstrip("\n")))
+    if sum(widths) > available:
+        for row in cells:
+            lines = (f"{name}: {cell}" for name, cell in zip(columns, row, strict=True) if cell)
+            text = "\n  ".join(wrap(line, subsequent_indent="    ") for line in lines)
+            console.print(Text(text), soft_wrap=True)
+        return
+    table = Table(box=box.SIMPLE, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for name, width in zip(columns, widths, strict=True):
+        table.add_column(Text(name), width=width)
+    for row in cells:
+        table.add_row(*map(Text, row))
+    console.print(table)
+
+
+def _column_widths(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], available: int
+) -> list[int]:
+    """Return widths that hold the longest words; narrow columns grow first, up to ``available``."""
+    cells_of_column = [*zip(columns, *rows, strict=True)]
+    widths = [
+        max(cell_len(word) for cell in cells for word in ["", *cell.split()])
+        for cells in cells_of_column
+    ]
+    bodies = [max(map(cell_len, cells[1:]), default=0) for cells in cells_of_column]
+    for limits in (bodies, [*map(cell_len, columns)]):  # values stay whole rather than headings
+        while sum(widths) < available:
+            narrow = [n for n, limit in enumerate(limits) if widths[n] < limit]
+            if not narrow:
+                break
+            widths[min(narrow, key=widths.__getitem__)] += 1
+    return widths
 
 
 def command_name() -> str:

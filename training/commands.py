@@ -75,7 +75,9 @@ def phone_lm(
     dictionary: Annotated[
         Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, with the words of --ngrams.")
     ] = None,
-    words: Annotated[int, typer.Option(min=1, help="Number of words to sample.")] = 30_000_000,
+    words: Annotated[
+        int | None, typer.Option(min=1, help="Number of words to sample. Default: 30,000,000.")
+    ] = None,
     order: Annotated[int, typer.Option(min=2, max=10, help="Phones in the longest n-grams.")] = 6,
     max_ngrams: Annotated[
         int, typer.Option(min=1000, help="About how many n-grams to keep.")
@@ -91,10 +93,12 @@ def phone_lm(
     check_output(output, force=force)
     if (ngrams is None) != (dictionary is None):
         raise UserError("--ngrams needs --dictionary; give both or neither")
+    if words is not None and ngrams is None:
+        raise UserError("--words applies to sampled words; add --ngrams and --dictionary")
     inventory = load_inventory(language)
     drawn = None
     if ngrams and dictionary:
-        drawn = draw_phones(ngrams, dictionary, inventory, num_words=words, seed=seed)
+        drawn = draw_phones(ngrams, dictionary, inventory, num_words=words or 30_000_000, seed=seed)
     train_phone_lm(
         corpus or [], text or [], output, inventory, drawn=drawn, order=order, max_ngrams=max_ngrams
     )

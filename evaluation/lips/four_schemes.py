@@ -37,6 +37,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
+from kouxing.shared.terminal import print_message
 
 SCHEMES = (1, 2, 3, 4)
 ALIGNED, RECOGNIZED, LIVE, NEXT_PHONE = SCHEMES
@@ -108,6 +109,17 @@ def load_recognizers(
             TestedRecognizer(title, model, lip_predictor_for(model), config, has_paper_rule)
         )
     return recognizers
+
+
+def print_missing(lips: Sequence[str], recognizers: Sequence[TestedRecognizer]) -> None:
+    """Print why some recognizers have no schemes with a lip model."""
+    for name in lips:
+        for tested in recognizers:
+            if not tested.can_drive(name):
+                print_message(
+                    f"no schemes 2 to 4 with {name} lips and {tested.name}: {name} lips need a"
+                    " neural recognizer, such as --acoustic blocks"
+                )
 
 
 def all_conditions(recognizers: Sequence[TestedRecognizer], lips: Sequence[str]) -> list[Condition]:

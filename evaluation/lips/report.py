@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
+from itertools import groupby, pairwise
 
 from rich.console import Console
 
 from kouxing.evaluation.lips.scheme_scores import ConditionScore, Order, Outcome
 from kouxing.evaluation.lips.scores import MEASURES, CurveScore, HitScore, LipScore
-from kouxing.evaluation.tables import format_number, print_table
+from kouxing.evaluation.tables import format_number
+from kouxing.shared.terminal import plural, print_table
 
 Cell = Callable[[LipScore], str]
 
@@ -23,7 +24,7 @@ def print_scores(scores: Sequence[LipScore], console: Console) -> None:
         rows = []
         for group, members in groupby(pooled, lambda score: score.group):
             of_group = list(members)
-            rows.append([f"[bold]{group}: {max(score.num_clips for score in of_group)}[/bold]"])
+            rows.append([f"{group}: {max(score.num_clips for score in of_group)}"])
             for score in of_group:
                 delay = "" if score.delay_ms is None else f", {score.delay_ms:.0f}"
                 rows.append([f"  {score.scheme}{delay}", *_cells(columns, score)])
@@ -106,18 +107,19 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
                 print_table(console, f"{lips} against {name}", columns, map(_row, rows))
     console.print(LEGEND, highlight=False)
     for order in outcome.orders:
-        console.print(describe(order), highlight=False, soft_wrap=True)
+        console.print(describe(order), highlight=False)
 
 
 def describe(order: Order) -> str:
-    """Say whether an order holds, and what schemes 3 and 4 lose."""
+    """Say whether an order holds, and how much correlation each step costs."""
     figures = " ".join(f"{figure:.2f}" for figure in order.correlations)
-    aligned, _, live, next_phone = order.correlations
+    steps = [before - after for before, after in pairwise(order.correlations)]
+    costs = ("recognition errors cost", "live output", "waiting for the next phone")
     return (
         f"{order.lips}, {order.recognizer}, opening against {order.reference} ({figures}): "
         f"1 > 2 > 3 > 4 {'holds' if order.holds else 'does not hold'}, in "
-        f"{order.num_holding} of {order.num_sentences} sentences; "
-        f"live costs {aligned - live:+.2f}, waiting for the next phone {live - next_phone:+.2f}"
+        f"{order.num_holding} of {plural(order.num_sentences, 'sentence')}; "
+        + ", ".join(f"{cost} {step:.2f}" for cost, step in zip(costs, steps, strict=True))
     )
 
 

@@ -36,7 +36,6 @@ from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import change_speed
-from kouxing.evaluation.tables import print_table
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
@@ -54,6 +53,7 @@ from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import Syllable
 from kouxing.shared.phones.syllables import group_syllables
+from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.float32]

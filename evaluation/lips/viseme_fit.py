@@ -25,7 +25,6 @@ from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
 from kouxing.evaluation.lips.scores import MEASURES, clips_to_score, real_faps
-from kouxing.evaluation.tables import print_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -34,6 +33,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_tim
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,16 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.options import Assignments, ConfigFile
-from kouxing.shared.terminal import Force, JsonFile, check_output, print_message, write_json
+from kouxing.services.cli.options import Assignments, ConfigFile, Output
+from kouxing.shared.terminal import (
+    Force,
+    JsonFile,
+    check_output,
+    plural,
+    print_message,
+    write_json,
+    write_output,
+)
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="Run listening tests: people rate videos."
@@ -30,8 +38,8 @@ def new(
     from kouxing.evaluation.mos.study import new_study
 
     study = new_study(folder, title=title, reference=reference, anchor=anchor)
-    size = f"{len(study.sentences)} sentences x {len(study.conditions)} conditions"
-    print_message(f"created a study of {size}; next: kouxing mos serve {folder}")
+    sizes = plural(len(study.sentences), "sentence"), plural(len(study.conditions), "condition")
+    print_message(f"created a study of {' in '.join(sizes)}; next: kouxing mos serve {folder}")
 
 
 @app.command()
@@ -44,7 +52,7 @@ def serve(
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
-    """Serve the page of a study until Ctrl-C. The gateway.* settings apply."""
+    """Serve the page of a study until Ctrl-C, with the settings of the gateway."""
     import asyncio
 
     from kouxing.evaluation.mos import server
@@ -54,9 +62,11 @@ def serve(
     from kouxing.services.kinds import read_settings
     from kouxing.shared.config import parse_assignments
 
-    overrides = {} if port is None else {"port": str(port)}
-    settings = read_settings(config, parse_assignments(assignments or []))
-    gateway = settings.load(GatewayConfig, overrides)
+    assigned = parse_assignments(assignments or [])
+    overrides = {key.removeprefix("gateway."): value for key, value in assigned.items()}
+    if port is not None:
+        overrides["port"] = str(port)
+    gateway = read_settings(config).load(GatewayConfig, overrides)
     study, store = load_study(folder), Store(folder)
     try:
         asyncio.run(
@@ -73,7 +83,7 @@ def report(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Print mean opinion scores with 95 % confidence intervals."""
+    """Print mean opinion scores with 95 % confidence intervals, with and without outliers."""
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.mos.report import draw_boxes, make_report, print_report
     from kouxing.evaluation.mos.store import read_answers
@@ -86,3 +96,14 @@ def report(
     if picture is not None:
         save_figure(draw_boxes(study, answers), picture)
     write_json(json_file, {"opinions": [asdict(opinion) for opinion in results]})
+
+
+@app.command()
+def export(folder: Folder, output: Output = None, force: Force = False) -> None:
+    """Write every score as a line of CSV, to standard output or a file."""
+    from kouxing.evaluation.mos.report import to_csv
+    from kouxing.evaluation.mos.store import read_answers
+    from kouxing.evaluation.mos.study import load_study
+
+    check_output(output, force=force)
+    write_output(to_csv(load_study(folder), read_answers(folder)), output)

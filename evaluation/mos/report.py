@@ -7,9 +7,11 @@ is too narrow, so the report also has the mean of all scores.
 
 from __future__ import annotations
 
+import csv
+import io
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,8 +22,8 @@ from scipy import stats
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.mos.store import Answer
 from kouxing.evaluation.mos.study import SCALES, Study
-from kouxing.evaluation.tables import print_table
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import print_table
 
 WHISKERS = 1.5  # interquartile ranges from the quartiles to the fences
 Scores = dict[tuple[int, str], int]  # of one condition on one scale, by judge and sentence
@@ -55,7 +57,7 @@ def make_report(study: Study, answers: Iterable[Answer]) -> list[Opinion]:
     """Compute the results; raises UserError if there are no answers."""
     groups = group_scores(study, answers)
     if not groups:
-        raise UserError(f"{study.folder} has no answers yet; start with: kouxing mos serve")
+        raise UserError(f"no answers yet; collect them with: kouxing mos serve {study.folder}")
     return [opinion_of(*key, scores) for key, scores in groups.items()]
 
 
@@ -118,6 +120,18 @@ def print_report(study: Study, opinions: Iterable[Opinion], console: Console) ->
     ]
     print_table(console, "mean opinion scores, 95 % confidence", columns, rows)
     console.print("Use the intervals of all scores; those without outliers are too narrow.")
+
+
+def to_csv(study: Study, answers: Iterable[Answer]) -> str:
+    """Return a table with a line per score, and the role of its condition."""
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow([*(field.name for field in fields(Answer)), "role"])
+    roles = {study.reference: "reference", study.anchor: "anchor"}
+    for answer in answers:
+        role = "practice" if answer.place < 0 else roles.get(answer.condition, "")
+        writer.writerow([*asdict(answer).values(), role])
+    return table.getvalue()
 
 
 def draw_boxes(study: Study, answers: Iterable[Answer]) -> Any:

@@ -10,7 +10,8 @@ from typing import Any
 from rich.console import Console
 
 from kouxing.corpora.figures import new_figure, save_figure
-from kouxing.evaluation.tables import percent, print_table
+from kouxing.evaluation.tables import percent
+from kouxing.shared.terminal import plural, print_table
 
 Figures = Mapping[str, Any]  # result of evaluate_recognizer
 
@@ -24,8 +25,8 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
         console.rule(name)
         print_table(
             console,
-            f"{figures['split']}: {figures['recordings']} recordings, "
-            f"{figures['speakers']} speakers",
+            f"{figures['split']}: {plural(figures['recordings'], 'recording')}, "
+            f"{plural(figures['speakers'], 'speaker')}",
             ("output", "phone error %", "95 %", "ins/del/sub %", "viseme error %", "95 %"),
             map(_output, figures["scores"]),
         )
@@ -63,7 +64,7 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
     for message in messages:
         console.print(message, markup=False, soft_wrap=True)
     if messages:
-        console.print(f"{len(messages)} rows skipped")
+        console.print(f"{plural(len(messages), 'row')} skipped")
 
 
 def _output(score: Figures) -> list[str]:

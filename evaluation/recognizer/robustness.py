@@ -21,7 +21,7 @@ from kouxing.evaluation.recognizer.disturbances import (
 )
 from kouxing.evaluation.recognizer.error_rates import mouth_shapes
 from kouxing.evaluation.recognizer.labials import Labials
-from kouxing.evaluation.tables import percent, print_table
+from kouxing.evaluation.tables import percent
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
@@ -30,6 +30,7 @@ from kouxing.services.recognizer.offline import decode_offline
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import score_recording
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import print_table
 
 _SOUND_S = 60.0
 _MAX_OTHER_RECORDINGS = 40

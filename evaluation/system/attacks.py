@@ -27,12 +27,13 @@ from rich.console import Console
 from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import percentiles, stream
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import format_number, print_table
+from kouxing.evaluation.tables import format_number
 from kouxing.services.kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import print_table
 
 PHASES = ("before", "during", "after")
 PHASE_S = 3.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.live import CHUNK
-from kouxing.evaluation.tables import format_number, print_table
+from kouxing.evaluation.tables import format_number
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.writer import VideoWriter
@@ -28,6 +28,7 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level import VISEMES
+from kouxing.shared.terminal import print_table
 
 MODELS = ("neural", "blocks")
 NUM_SESSIONS = (1, 16)

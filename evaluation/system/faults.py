@@ -30,7 +30,6 @@ from kouxing.evaluation.system.continuity import Continuity, compare, worst
 from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link, Network
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
-from kouxing.evaluation.tables import print_table
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
@@ -38,6 +37,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
+from kouxing.shared.terminal import print_table
 
 NUM_SESSIONS = 16
 SPIN = """

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import print_table
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import print_table
 
 CHUNK_S = 0.02
 END_LIMIT_S = 30.0  # for the last frame

@@ -25,7 +25,7 @@ from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.system.latency import percentiles
 from kouxing.evaluation.system.live import CHUNK
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import format_number, print_table
+from kouxing.evaluation.tables import format_number
 from kouxing.services.kinds import read_settings
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -33,6 +33,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import plural, print_table
 
 LIMIT_MS = 60.0  # latency limit for 95 % of the frames
 SERVICES = ("control", "recognizer", "synthesizer")  # services under load
@@ -242,7 +243,8 @@ def show(load: Load, console: Console) -> None:
         console.print(f"not even one session has 95 % of its frames within {LIMIT_MS:g} ms")
         return
     console.print(
-        f"{figures['sessions']:.0f} sessions have 95 % of their frames within {LIMIT_MS:g} ms plus "
+        f"With {plural(round(figures['sessions']), 'session')}, 95 % of the frames are within "
+        f"{LIMIT_MS:g} ms plus "
         f"{load.delay_ms:g} ms of delay, on {load.cores} cores (load before: "
         f"{load.machine_load:.1f}): {figures['sessions_per_core']:.1f} sessions per core, "
         f"{figures['sessions_per_busy_core']:.1f} per used core. A session needs "

@@ -20,9 +20,10 @@ from rich.console import Console
 
 from kouxing.evaluation.system.chromium import Chromium
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import format_number, print_table
+from kouxing.evaluation.tables import format_number
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import print_table
 
 SIZE_PX = (1100, 800)
 SETTLE_S = 12.0  # the page needs this to choose its resolution and its playout delay

@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from kouxing.services.cli.options import AudioTrack, CurveForm, ListenOutput, MouthFile
 from kouxing.services.cli.running_system import find_control
@@ -27,6 +24,7 @@ from kouxing.shared.terminal import (
     check_output,
     plural,
     print_message,
+    print_table,
     write_json,
 )
 
@@ -89,6 +87,10 @@ def speak(
         raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
     if source in ("mic", "monitor") and (raw or rate or channels or track):
         raise UserError(f"--raw, --rate, --channels and --track do not apply to {source}")
+    if source in ("mic", "monitor") and fast:
+        raise UserError(f"--fast does not apply to {source}: its sound arrives in real time")
+    if raw and track is not None:
+        raise UserError("--track does not apply to raw samples; leave out --raw or --track")
     if source == "mic":
         audio = microphone(device)
     elif source == "monitor":
@@ -119,12 +121,13 @@ def devices() -> None:
     """List the devices for 'kouxing speak mic' and 'kouxing speak monitor'."""
     from kouxing.shared.sound_devices import sound_devices
 
-    table = Table("kind", "name", "command", box=box.SIMPLE)
-    for device in sound_devices():
+    devices = sound_devices()
+    if not devices:
+        print_message("no microphone and no sound server was found")
+    for device in devices:
         source = "mic" if device.kind == "mic" else "monitor"
-        command = f'kouxing speak {source} --device "{device.name}"'
-        table.add_row(device.kind, escape(device.name), escape(command))
-    Console().print(table)
+        typer.echo(f"{device.kind}: {device.name}")
+        typer.echo(f'    kouxing speak {source} --device "{device.name}"')
 
 
 def listen(
@@ -191,8 +194,9 @@ def express(
         ),
     ] = None,
     hold: Annotated[
-        float, typer.Option(help="Seconds until the expressions fade.")
-    ] = DEFAULT_HOLD_S,
+        float | None,
+        typer.Option(help=f"Seconds until the expressions fade. Default: {DEFAULT_HOLD_S:g}."),
+    ] = None,
     control: Control = "",
 ) -> None:
     """Show expressions on a face. Without expressions, end those it shows."""
@@ -201,11 +205,14 @@ def express(
     words = list(arguments or ())
     session = _session_name(words.pop(0)) if words and "=" not in words[0] else ""
     strengths = dict(map(_parse_strength, words))
-    check_expressions(strengths, hold)
+    if hold is not None and not strengths:
+        raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
+    hold_s = DEFAULT_HOLD_S if hold is None else hold
+    check_expressions(strengths, hold_s)
     with connect(control_address(control)) as client:
         all_sessions = [state.session for state in client.status().sessions]
         for name in [session] if session else ["", *all_sessions]:
-            client.set_face(name, expressions=strengths, hold_s=hold)
+            client.set_face(name, expressions=strengths, hold_s=hold_s)
 
 
 def _parse_strength(text: str) -> tuple[str, float]:
@@ -224,30 +231,29 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
     with connect(control_address(control), timeout_s=3.0) as client:
         report = client.status()
     out = Console()
-    services = Table("service", "state", "last seen", "metrics", box=box.SIMPLE)
+    services = []
     for service in report.services:
         metrics = ", ".join(
             f"{name} {value:.4g}"
             for name, value in sorted(service.metrics.items())
             if name.endswith(("_p50", "_p95")) or name in SHOWN_METRICS or _is_drop_counter(name)
         )
-        services.add_row(
-            escape(service.instance), service.state, f"{service.age_s:.1f} s ago", escape(metrics)
-        )
-    out.print(services)
+        services.append((service.instance, service.state, f"{service.age_s:.1f} s ago", metrics))
+    print_table(out, "", ("service", "state", "last seen", "metrics"), services)
     if not report.sessions:
         out.print("no session is open")
     else:
-        sessions = Table("session", "state", "open for", "speaking", "workers", box=box.SIMPLE)
-        for session in report.sessions:
-            sessions.add_row(
+        sessions = [
+            (
                 session.session,
                 session.state,
                 f"{session.age_s:.0f} s",
                 "yes" if session.speaking else "no",
-                escape(", ".join(sorted({*session.workers.values()}))),
+                ", ".join(sorted({*session.workers.values()})),
             )
-        out.print(sessions)
+            for session in report.sessions
+        ]
+        print_table(out, "", ("session", "state", "open for", "speaking", "workers"), sessions)
     write_json(json_file, asdict(report))
 
 
@@ -262,7 +268,7 @@ def doctor(control: Control = "") -> None:
         typer.echo(f"{'FAIL' if finding.fix else 'ok  '} {finding.subject}: {finding.result}")
         for line in finding.fix.splitlines():
             typer.echo(f"     {line}")
-    typer.echo(f"{num_failed} of {num_checks} checks failed")
+    typer.echo(f"{num_failed} of {plural(num_checks, 'check')} failed")
     if num_failed:
         raise typer.Exit(1)
 

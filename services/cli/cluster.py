@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from kouxing.services.cli.options import ConfigFile, ServiceAssignments
 from kouxing.services.kinds import KINDS, read_settings
 from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command
+from kouxing.shared.terminal import print_table
 
 Number = Annotated[int | None, typer.Option(min=0, max=1000, help="Number of workers to run.")]
 
@@ -40,7 +38,9 @@ def cluster(
         for name, number in (("recognizer", recognizers), ("synthesizer", synthesizers)):
             if number is not None:
                 workers.scale(KINDS[name], number, settings)
-        table = Table("worker", "host", box=box.SIMPLE)
-        for name, host in workers.hosts().items():
-            table.add_row(name, escape(host or "waits for a free core"))
-    Console().print(table if table.rows else "no workers are running on this cluster")
+        hosts = workers.hosts()
+    if not hosts:
+        typer.echo("no workers are running on this cluster")
+        return
+    rows = ((name, host or "waits for a free core") for name, host in hosts.items())
+    print_table(Console(), "", ("worker", "host"), rows)

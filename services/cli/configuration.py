@@ -54,6 +54,8 @@ def config(
     """Print all keys with their meaning, allowed values, default, current value and its origin."""
     if service and service not in TABLES:
         raise UserError(f"unknown service {service!r}; choose one of {', '.join(TABLES)}")
+    if markdown and (service or config or assignments):
+        raise UserError("--markdown prints all defaults; leave out the service, --config and --set")
     values = parse_assignments(assignments or [])
     if markdown:
         text = markdown_page()

@@ -45,6 +45,9 @@ def export_head(
     from kouxing.services.driver.render.scene import load_head
 
     if all_heads:
+        if head != DEFAULT_HEAD:
+            raise UserError("--all exports every built-in head; leave out --head or --all")
+        check_output(*(glb / file for file in _page_files().values() if glb.is_dir()), force=force)
         export_page_heads(glb)
         print_message(f"wrote the heads to {glb}")
         return

@@ -6,10 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import (
@@ -21,7 +18,7 @@ from kouxing.shared.keys import (
     revoke_key,
     user_key,
 )
-from kouxing.shared.terminal import print_message
+from kouxing.shared.terminal import Force, check_output, print_message, print_table
 
 app = typer.Typer(no_args_is_help=True, help="Manage the keys that may connect to the services.")
 
@@ -49,10 +46,12 @@ def add(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="File to write. Default: NAME.key.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """Create a key for another machine, and allow it immediately."""
     roles = roles or [CLIENT]
     path = output or Path(f"{name}.key")
+    check_output(path, force=force)
     add_key(name, roles, path)
     kinds = [role.removeprefix("service:") for role in roles if role.startswith("service:")]
     print_message(
@@ -64,10 +63,9 @@ def add(
 @app.command("list")
 def list_keys() -> None:
     """List the allowed keys with their roles."""
-    table = Table("name", "roles", "public key", box=box.SIMPLE)
-    for public, grant in sorted(read_grants().items(), key=lambda item: item[1].name):
-        table.add_row(grant.name, escape(", ".join(grant.roles)), escape(public))
-    Console().print(table)
+    grants = sorted(read_grants().items(), key=lambda item: item[1].name)
+    rows = ((grant.name, ", ".join(grant.roles), public) for public, grant in grants)
+    print_table(Console(), "", ("name", "roles", "public key"), rows)
 
 
 @app.command()

@@ -65,9 +65,14 @@ class CommandGroup(TyperGroup):
 
 
 def _name_values(command: Any, ctx: Any) -> None:
-    """Show TEXT or PATH in the help of options instead of Python's types, and nothing for flags."""
+    """Show TEXT or PATH in the help of options instead of Python's types.
+
+    Flags and arguments show nothing: their names are enough.
+    """
     for parameter in command.get_params(ctx):
-        if isinstance(parameter, TyperOption) and parameter.metavar is None:
+        if not isinstance(parameter, TyperOption):
+            parameter.display_type = lambda ctx: ""
+        elif parameter.metavar is None:
             parameter.metavar = _VALUE_NAMES.get(parameter.display_type(ctx))
     for subcommand in getattr(command, "commands", {}).values():
         _name_values(subcommand, ctx)

@@ -41,10 +41,11 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.terminal import open_progress, print_message, write_error, write_text
+from kouxing.shared.terminal import open_progress, plural, print_message, write_error, write_text
 
 Span = tuple[float, float, str]  # start and end in seconds, and the label
 
+DEFAULT_NUM_POINTS = 21
 FRAME_RATE_HZ = 25.0
 CSV_COLUMNS = ("time_s", "opening", "line", "point", "x", "y")
 _VIDEO_SIZE_PX = (640, 480)
@@ -79,7 +80,7 @@ def draw_mouth(
     *,
     timing: Timing | None = None,
     smooth: bool = False,
-    num_points: int = 21,
+    num_points: int | None = None,
     speech_to_text: Path | None = None,
     track: int | None = None,
 ) -> None:
@@ -92,9 +93,14 @@ def draw_mouth(
 
     Raises ``UserError`` if a file cannot be read or written, or the options do not fit each other.
     """
-    write = _WRITERS.get(output.suffix.lower())
+    suffix = output.suffix.lower()
+    write = _WRITERS.get(suffix)
     if write is None:
         raise UserError(f"{output}: give a name that ends in {', '.join(_WRITERS)}")
+    if num_points is not None and suffix != ".csv":
+        raise UserError(f"{output}: --points applies to .csv")
+    if smooth and suffix not in (".mp4", ".csv"):
+        raise UserError(f"{output}: --smooth applies to .mp4 and .csv; a picture has key frames")
     if text is not None and speech_to_text is not None:
         raise UserError("give either a text or --speech-to-text, not both")
     if text is None and speech_to_text is None and timing is not None:
@@ -118,7 +124,7 @@ def draw_mouth(
         key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
         silence=inventory.silence,
         smooth=smooth,
-        num_points=num_points,
+        num_points=num_points or DEFAULT_NUM_POINTS,
     )
     print_message(f"wrote {output}: {write(output, mouth)}")
 
@@ -209,7 +215,7 @@ def _write_picture(output: Path, mouth: _Mouth) -> str:
         write_text(output, drawing.svg(picture))
     else:
         write_picture(output, drawing.rasterize(picture))
-    return f"{len(moments)} key frames, {len(mouth.phones)} phones"
+    return f"{plural(len(moments), 'key frame')}, {plural(len(mouth.phones), 'phone')}"
 
 
 def _write_video(output: Path, mouth: _Mouth) -> str:
@@ -229,7 +235,7 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
                 time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels)
             )
             writer.write_image(drawing.rasterize(drawing.image(moment, *_VIDEO_SIZE_PX)))
-    return f"{len(frames)} images, {len(mouth.phones)} phones"
+    return f"{plural(len(frames), 'image')}, {plural(len(mouth.phones), 'phone')}"
 
 
 def _label_at(time_s: float, spans: Sequence[Span]) -> str:
@@ -257,7 +263,7 @@ def _write_csv(output: Path, mouth: _Mouth) -> str:
                     )
     except OSError as error:
         raise write_error(output, error) from None
-    return f"{len(times_s)} frames"
+    return plural(len(times_s), "frame")
 
 
 _WRITERS: dict[str, Callable[[Path, _Mouth], str]] = {

@@ -17,6 +17,7 @@ from kouxing.services.cli.options import (
     ExportOptions,
     HeadName,
     MouthFile,
+    Output,
     Timing,
 )
 from kouxing.services.driver.config import Framing
@@ -50,7 +51,6 @@ Form = Annotated[
     PhoneFormat | None,
     typer.Option("--format", help="Output format. Default: from the output's suffix, or a table."),
 ]
-Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]
 _FORMAT_OF_SUFFIX = {
     ".txt": PhoneFormat.TABLE,
     ".csv": PhoneFormat.CSV,
@@ -281,14 +281,16 @@ def lips(
         typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
     ] = None,
     smooth: Annotated[
-        bool, typer.Option("--smooth", help="Interpolate smoothly between key frames.")
+        bool, typer.Option("--smooth", help="Interpolate smoothly between key frames (.mp4, .csv).")
     ] = False,
     points: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=2, max=1000, help="Points on each of the four lines of the contour (.csv)."
+            min=2,
+            max=1000,
+            help="Points on each of the four lines of the contour (.csv). Default: 21.",
         ),
-    ] = 21,
+    ] = None,
     speech_to_text: Annotated[
         Path | None,
         typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text."),

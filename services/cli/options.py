@@ -25,6 +25,7 @@ AudioTrack = Annotated[
     int | None,
     typer.Option("--track", metavar="N", help="Audio track of the file. Default: the first."),
 ]
+Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]
 MouthFile = Annotated[
     Path | None, typer.Option("--mouth", help="Mouth profile of the speaker, from kouxing adapt.")
 ]

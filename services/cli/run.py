@@ -64,6 +64,8 @@ def run(
     """Run all services on this machine, and restart any that crashes or hangs."""
     from kouxing.services.cli.supervisor import Supervisor
 
+    if play is None and (stop_after or track is not None):
+        raise UserError("--stop-after and --track need a file: kouxing run --play my.wav")
     given = parse_assignments(assignments or [])
     if port is not None:
         given["gateway.port"] = str(port)

@@ -9,6 +9,7 @@ After a restart, control learns the sessions from the services that serve them.
 from __future__ import annotations
 
 import heapq
+import secrets
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -73,6 +74,7 @@ class ControlService(Service):
         placement = Placement(self._registry, config.max_load)
         self._sessions = Sessions(self._registry, placement, config.max_sessions)
         self._status = Status(self._registry, self._sessions)
+        self._process_id = secrets.token_hex(8)  # the instance may be a setting
         self._faults = Faults()
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
@@ -229,7 +231,7 @@ class ControlService(Service):
             sent_ns=heartbeat.sent_ns,
             received_ns=received_ns,
             replied_ns=now_ns(),
-            control=self.instance,
+            control=self._process_id,
             keys=self._requests.changed_keys(heartbeat),
         )
         self._commands.send(reply, to=sender)

@@ -110,11 +110,11 @@ class Sessions:
             text = f"session {name!r} is open; choose another name"
             raise Refusal(ErrorCode.SESSION_EXISTS, text)
         if len(self._records) >= self._max_sessions:
-            text = f"{self._max_sessions} sessions are open, the limit of control.max_sessions"
+            text = f"the limit of control.max_sessions is reached: {self._max_sessions}"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         num_of_key = self._num_per_key[client.key]
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
-            text = f"your key has {num_of_key} open sessions, its maximum; close some first"
+            text = f"your key has its maximum of open sessions, {num_of_key}; close one first"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         workers = self._placement.place({}, now_s, may_refuse=opening.paced)
         facts = self._registry.facts(workers.values())

@@ -95,8 +95,8 @@ def align_syllables(
     num_frames = frames_in(-(-len(samples) * SAMPLE_RATE_HZ // sample_rate_hz))
     if num_frames < graph.num_needed[0]:
         raise UserError(
-            f"{num_frames * HOP_S:.2f} s of audio is too short for "
-            f"{sum(map(len, syllables))} phones; check that the text matches the recording"
+            f"{num_frames * HOP_S:.2f} s of audio is too short for the phones of the text,"
+            f" {sum(map(len, syllables))}; check that the text matches the recording"
         )
     scores = _score_recording(model, samples, sample_rate_hz, num_frames, with_progress)
     path, _ = viterbi_path(scores, graph.states, graph, topology.log_stay, topology.log_leave)

@@ -113,7 +113,7 @@ def _parse(text: str) -> FapAnimation:
         raise _BadFileError(lines[-1][0], f"the file ends after {complete} of {num_frames} frames")
     if len(lines) > 1 + 2 * num_frames:
         raise _BadFileError(
-            lines[1 + 2 * num_frames][0], f"the header announces only {num_frames} frames"
+            lines[1 + 2 * num_frames][0], f"more frames than the header announces: {num_frames}"
         )
     faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
     visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)

@@ -52,5 +52,8 @@ def characters_of(text: str, inventory: PhoneInventory) -> Characters:
     characters = "".join(inventory.readable.findall(text))
     syllables = inventory.pronounce(characters)
     if len(syllables) != len(characters):
-        raise UserError(f"{text!r} has {len(syllables)} syllables and {len(characters)} characters")
+        raise UserError(
+            f"{text!r}: {len(characters)} characters have another number of syllables,"
+            f" {len(syllables)}; give one character for each syllable"
+        )
     return list(zip(characters, syllables, strict=True))

@@ -95,7 +95,7 @@ class HeartbeatReply(Message):
     sent_ns: Nanoseconds  # as in the heartbeat
     received_ns: Nanoseconds  # control's clock
     replied_ns: Nanoseconds  # control's clock
-    control: Name  # control's instance; when it changes, control has restarted
+    control: Name  # generated when control starts; when it changes, control has restarted
     keys: Annotated[dict[Name, AllowedKey], Meta(max_length=MAX_KEYS)] | None = (
         None  # that may connect to the worker's sockets, by public key; None: as before
     )

@@ -15,7 +15,7 @@ from tests.system import CHAIN, DEMO, System
 def test_a_session_continues_while_control_is_killed_and_started_again(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")[:56000]
     with (
-        System((*CHAIN, "driver"), tmp_path) as system,
+        System((*CHAIN, "driver"), tmp_path, {"KOUXING_CONTROL_INSTANCE": "control"}) as system,
         Client(system.control, timeout_s=60.0) as client,
     ):
         session = client.open_session(encoding="f32le", shapes=["vrm"])

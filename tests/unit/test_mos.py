@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from kouxing.evaluation.mos import server
 from kouxing.evaluation.mos.commands import app
 from kouxing.evaluation.mos.report import (
     make_report,
@@ -28,6 +29,7 @@ from kouxing.evaluation.mos.study import (
     new_study,
     williams_design,
 )
+from kouxing.services.gateway.config import GatewayConfig
 from kouxing.shared.errors import UserError
 
 CONDITIONS = ("real", "live", "late", "still")
@@ -145,7 +147,7 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     run = CliRunner().invoke
     assert run(app, ["new", str(folder), "--reference", "real", "--anchor", "still"]).exit_code == 0
     report = ["report", str(folder)]
-    assert "no answers yet" in str(run(app, report).exception)
+    assert f"kouxing mos serve {folder}" in str(run(app, report).exception)
     study, given = load_study(folder), {"real": 5, "live": 4, "late": 3, "still": 1}
     cells = [(judge, cell) for judge in range(2) for cell in sorted(study.files)]
     store = Store(folder)
@@ -160,6 +162,26 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     figures = json.loads(files[1].read_text())
     means = {each["condition"]: each["of_all"]["value"] for each in figures["opinions"]}
     assert means == pytest.approx(given)
+    exported = run(app, ["export", str(folder), "-o", str(folder / "scores.csv")])
+    assert exported.stderr == f"wrote {folder / 'scores.csv'}\n"
+    head, first, *_, last = (folder / "scores.csv").read_text().splitlines()
+    assert head == "judge,place,sentence,condition,scale,score,language,unix_s,role"
+    assert first == "0,0,a,late,realism,3,zh,0.0,"
+    assert last == "1,-1,a,real,sync,1,zh,0.0,practice"
     text = StringIO()
-    print_report(study, make_report(study, read_answers(folder)), Console(file=text, width=60))
-    assert "…" not in text.getvalue(), "a name is cut off"
+    print_report(study, make_report(study, read_answers(folder)), Console(file=text, width=80))
+    assert "real (hidden reference)" in text.getvalue()
+
+
+def test_serve_takes_the_gateways_keys(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = []
+
+    async def serve(_study: object, _store: Store, config: GatewayConfig, _ready: object) -> None:
+        ports.append(config.port)
+
+    monkeypatch.setattr(server, "serve", serve)
+    run = CliRunner().invoke
+    assert "8 sentences in 4 conditions" in run(app, ["new", str(folder)]).stderr
+    for option in (["--set", "port=8124"], ["--port", "8125"]):
+        assert run(app, ["serve", str(folder), *option]).exit_code == 0
+    assert ports == [8124, 8125]

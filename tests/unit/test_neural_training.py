@@ -179,7 +179,7 @@ def test_trains_and_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.Mo
     assert "1 of 1 recordings aligned" in lines
     assert "3 of 3 recordings labeled by the teacher" in lines
     assert any("errors on dev" in line for line in lines)
-    assert lines[-1] == "1 rows skipped"
+    assert lines[-1] == "1 row skipped"
     card = output.with_suffix(".md").read_text()
     assert "CC0-1.0" in card
     assert "aligned by `gmm.npz`, on 3 recordings" in card

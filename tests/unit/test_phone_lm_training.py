@@ -212,7 +212,7 @@ def test_trains_on_texts_and_corpora(corpus: Path, tmp_path: Path) -> None:
         f"{5 * (5 + 7 + 5 + 3)} phones of text, {1 + len(SENTENCE)} of sentences of the corpora"
     )
     assert "none.wav; row skipped" in lines[1]
-    assert lines[2] == "1 rows skipped"
+    assert lines[2] == "1 row skipped"
     assert "n-grams of 1 to 6 phones kept: 60, " in lines[3]
     table = Table.of(load_phone_lm(output, MANDARIN))
     n, i, h = (INDEX[phone] for phone in "nih")

@@ -30,9 +30,8 @@ def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
     frame_bytes = SAMPLE_BYTES[encoding] * num_channels
     if len(pcm) % frame_bytes:
         raise BadAudio(
-            f"{len(pcm)} bytes are not a whole number of {encoding} frames of {num_channels} "
-            f"channels ({frame_bytes} bytes each); send the encoding and channels that the session "
-            "was opened with"
+            f"a length of {len(pcm)} B is not a multiple of {frame_bytes} B ({encoding}, channels: "
+            f"{num_channels}); send the encoding and channels that the session was opened with"
         )
     if encoding == "s16le":
         scaled = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(FULL_SCALE)
