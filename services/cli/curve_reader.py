@@ -1,14 +1,18 @@
 """Reads the motion of a face from a table, as ``CsvExporter`` and ``JsonLinesExporter`` write it.
 
-Takes of the app Live Link Face (CSV) are read too. Their time code is HH:MM:SS:FF.fff, where FF.fff
-counts frames. The file does not name their rate. It is taken as the lowest standard rate above the
-largest FF. If a take does not cross a full second, it is taken as the app's default.
+Tables of spreadsheet programs may be in UTF-16, and have semicolons or tabs with decimal commas.
+Takes of the app Live Link Face (CSV) are read too. Their frames without a face, with a count of 0,
+are left out. Their time code is HH:MM:SS:FF.fff, where FF.fff counts frames. The file does not name
+their rate. It is taken as the lowest standard rate above the largest FF. If a take does not cross a
+full second, it is taken as the app's default.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 import json
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -23,7 +27,9 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 
 TABLE_SUFFIXES = (".csv", ".jsonl")
 MAX_MB = 128  # about two hours
-_MAX_VALUE = float(np.finfo(np.float32).max)
+_MAX_FAP = 1e6
+_MAX_WEIGHT = 10.0  # of a shape; percentages are larger
+_TIME_CODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+(?:\.\d+)?)")  # ";" if frames are dropped
 _TIME_CODE_RATES_HZ = (24, 25, 30, 48, 50, 60)
 _DAY_S = 86400.0
 _HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
@@ -37,32 +43,64 @@ def read_table(path: Path) -> FapAnimation:
     Raises ``UserError`` if the file cannot be read, has no times, no known column, or a value that
     is not a number.
     """
-    try:
-        if path.stat().st_size > MAX_MB * 1_000_000:
-            raise UserError(f"{path} is larger than {MAX_MB} MB; split it")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: this is not a text file; give a table of curves") from None
-    rows = _json_rows(path, lines) if path.suffix.lower() == ".jsonl" else csv.reader(lines)
+    lines = _read_lines(path)
+    is_json = path.suffix.lower() == ".jsonl"
+    rows = _json_rows(path, lines) if is_json else _csv_rows(path, lines)
     names = [str(name).strip().lower() for name in next(rows, [])]
     time_name = next((name for name in ("time_s", "timecode") if name in names), None)
     if time_name is None:
         raise UserError(f"{path}: the table has no times; add a column time_s or Timecode")
     columns, basis = _known_columns(path, names)
+    is_shapes = names[columns[0]] not in FAP_NUMBER
+    count = names.index("blendshapecount") if "blendshapecount" in names else None
     times: list[str] = []
     values: list[Float64] = []
     for number, row in enumerate(rows, start=1):
+        if count is not None and row[count : count + 1] == ["0"]:
+            continue
         try:
             times.append(row[names.index(time_name)])
             values.append(np.array([row[column] for column in columns], np.float64))
         except (ValueError, TypeError, IndexError):
             raise UserError(f"{path}, frame {number}: a value is missing or not a number") from None
-        if len(row) != len(names) or not (np.abs(values[-1]) <= _MAX_VALUE).all():
+        if len(row) != len(names) or not (np.abs(values[-1]) <= _MAX_FAP).all():
             raise UserError(f"{path}, frame {number}: a value is missing or not a number")
+        if is_shapes and (np.abs(values[-1]) > _MAX_WEIGHT).any():
+            raise UserError(
+                f"{path}, frame {number}: values of shapes must be from 0 to 1; divide percentages"
+                " by 100"
+            )
+    if not times:
+        raise UserError(f"{path}: the table has no frames with a face")
     times_s = _times_s(path, times, is_time_code=time_name == "timecode")
     return _resample(path, times_s, np.array(values) @ basis)
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        if path.stat().st_size > MAX_MB * 1_000_000:
+            raise UserError(f"{path} is larger than {MAX_MB} MB; split it")
+        content = path.read_bytes()
+        is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise UserError(f"{path}: this is not a text file; give a table of curves in UTF-8")
+    return [line for line in text.splitlines() if line.strip(" ,;\t")]
+
+
+def _csv_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the cells of each line, separated by commas, semicolons or tabs."""
+    header = next((line for line in lines if not line.startswith("sep=")), "")  # from Excel
+    delimiter = max(",;\t", key=header.count)
+    try:
+        for row in csv.reader(lines[lines.index(header) :] if header else [], delimiter=delimiter):
+            yield row if delimiter == "," else [cell.replace(",", ".") for cell in row]
+    except csv.Error as error:
+        raise UserError(f"{path}: this is not a table: {error}; export it again") from None
 
 
 def _json_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
@@ -78,10 +116,13 @@ def _json_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
             if not names:
                 names = list(fields)
                 yield names
+            if len(fields) != len(names):
+                raise ValueError
             yield [fields[name] for name in names]
         except (ValueError, TypeError, LookupError, StopIteration, RecursionError):
             raise UserError(
-                f"{path}, line {number}: expected an object with time_s and the values of a face"
+                f"{path}, line {number}: expected an object with time_s, and the values of a"
+                f" face in {', '.join(('faps', *SHAPE_SETS))}; all lines need the same values"
             ) from None
 
 
@@ -105,16 +146,16 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
 
 def _times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
     try:
-        fields = np.array([str(time).split(":") for time in times], np.float64)
-        if fields.ndim != 2 or fields.shape[1] != (4 if is_time_code else 1):
-            raise ValueError
-        if not np.isfinite(fields).all():
+        codes = [_TIME_CODE.fullmatch(str(time).strip()) for time in times]
+        given = [code.groups() if code else () for code in codes] if is_time_code else times
+        fields = np.array(given, np.float64)
+        if len(fields.T) == 0 or not np.isfinite(fields).all():
             raise ValueError
     except ValueError:
         form = "a time code HH:MM:SS:FF.fff" if is_time_code else "a time in seconds"
         raise UserError(f"{path}: every line needs {form}") from None
     if not is_time_code:
-        return fields[:, 0]
+        return fields
     hours, minutes, seconds, frames = fields.T
     crosses_a_second = len(np.unique(seconds)) > 1
     rate_hz = next(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from kouxing.shared.phones.events import Phone
 
 RATE_HZ = 50.0
 JAW = FAP_NUMBER["open_jaw"] - 1
+ARKIT_JAW_HALF_OPEN = np.where(np.array(ARKIT.names) == "jawOpen", 0.5, 0.0)
 HEAD_YAW = FAP_NUMBER["head_yaw"] - 1
 
 
@@ -90,6 +92,28 @@ def test_time_codes(tmp_path: Path, codes: list[str], times_s: list[float]) -> N
     )
 
 
+_TAKE = (
+    "Timecode,BlendShapeCount,JawOpen\n\n00:00:00:00.000,61,0.0\n00:00:00:01.000,0,\n"
+    "00:00:00:02.500,61,0.5\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (_TAKE.replace(",", "\t").replace("\n", "\r\n"), "utf-16"),
+        ("sep=;\n" + _TAKE.replace(",", ";").replace(".", ","), "utf-8-sig"),
+        (re.sub(r":(\d\d\.)", r";\1", _TAKE) + ",,\n", "utf-8"),
+    ],
+)
+def test_reads_a_take_that_a_spreadsheet_wrote(tmp_path: Path, text: str, encoding: str) -> None:
+    path = tmp_path / "take.csv"
+    path.write_bytes(text.encode(encoding))
+    animation = read_table(path)
+    assert animation.frame_rate_hz == pytest.approx(60 / 2.5)
+    assert animation.faps[-1, JAW] == pytest.approx(ARKIT.faps(ARKIT_JAW_HALF_OPEN)[JAW])
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -102,9 +126,18 @@ def test_time_codes(tmp_path: Path, codes: list[str], times_s: list[float]) -> N
         ("a.csv", "time_s,jawOpen\n0,0\n40,0\n", "1 to 1000 frames per second"),
         ("a.csv", "Timecode,JawOpen\n00:01,0\n", "every line needs a time code"),
         ("a.csv", "", "no times"),
-        ("a.csv", "time_s,jawOpen\n", "every line needs"),
+        ("a.csv", "time_s,jawOpen\n", "no frames with a face"),
+        ("a.csv", "time_s,jawOpen\n0,0.2\n0.02,50\n", "frame 2: .* divide percentages by 100"),
+        ("a.csv", f"time_s,jawOpen\n0,{'1' * 140_000}\n", "not a table"),
+        ("a.csv", "t\0", "not a text file"),
         ("a.jsonl", '{"time_s": 0}\n', "line 1: expected an object with time_s"),
         ("a.jsonl", '{"faps": [0]}\n', "line 1: expected an object with time_s"),
+        (
+            "a.jsonl",
+            '{"time_s": 0, "arkit": {"jawOpen": 0}}\n'
+            '{"time_s": 1, "arkit": {"jawOpen": 0, "mouthClose": 1}}\n',
+            "line 2: .* all lines need the same values",
+        ),
         ("a.jsonl", "[" * 5000, "line 1: expected an object"),
     ],
 )

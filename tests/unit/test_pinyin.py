@@ -87,10 +87,37 @@ def test_pronounces_text() -> None:
         ("3.5%", "百分之三点五"),
         ("第2个，2个", "第二个两个"),
         ("-5℃", "负五摄氏度"),
+        ("－5度，50%-60%", "负五度百分之五十到百分之六十"),
+        ("3—5天，1.5-2.5倍，3-5%", "三到五天一点五到二点五倍三到百分之五"),
+        ("￥300元，¥1.5万", "三百元一点五万元"),
+        ("13,000，5‰", "一万三千千分之五"),
+        ("01月02日，12月22日", "一月二日十二月二十二日"),
+        ("2号，2個人，第2個", "二号兩個人第二個"),
+        ("3 2 1\n10", "三二一十"),
+        ("138 1234 5678", "幺三八幺二三四五六七八"),
+        ("COVID-19病毒", "十九病毒"),
     ],
 )
 def test_reads_numbers(text: str, read: str) -> None:
     assert "".join(syllable.text for syllable in transcribe(text).syllables) == read
+
+
+@pytest.mark.parametrize(
+    ("text", "spellings"),
+    [
+        ("音樂、重慶", "yin1 yue4 chong2 qing4"),
+        ("睡覺，銀行行長", "shui4 jiao4 yin2 hang2 hang2 zhang3"),
+        ("看著，著名，頭髮乾", "kan4 zhe5 zhu4 ming2 tou2 fa4 gan4"),
+        ("nǐhǎo, péngyou", "ni3 hao3 peng2 you"),
+        ("fāngàn fāng'àn", "fan1 gan4 fang1 an4"),
+        ("ni3hao3 hua1r5 hui4 r5", "ni3 hao3 hua1 r5 hui4 r5"),
+        ("nĭ hɑ̌o ɡuó", "ni3 hao3 guo2"),
+        ("pāris café résumé banana mp3", ""),
+    ],
+)
+def test_reads_traditional_characters_and_pinyin_words(text: str, spellings: str) -> None:
+    transcript = transcribe(text)
+    assert " ".join(syllable.spelling for syllable in transcript.syllables) == spellings
 
 
 def test_transcript_has_characters_tones_and_dropped_parts() -> None:

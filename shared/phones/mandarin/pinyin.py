@@ -8,7 +8,7 @@ Decisions beyond these sources:
 - A syllable is valid if its final belongs to a row that its initial allows (``j q x`` only before i
   and ü, and so on). This accepts rare readings (``biang``, ``fiao``, ``den``) on which word lists
   differ, and rejects typing errors (``muo``, ``ja``).
-- Er-hua (an r-colored ending) as a separate syllable (``hua1 er5``) is the phone ``er``. Within a
+- Er-hua (an r-colored ending) as a separate syllable (``er5`` or ``r5``) is the phone ``er``. In a
   syllable (``huar1``), ``er`` follows the syllable's final.
 - The syllable ``ê`` (also ``eh``) is ``ei``, the nearest phone by mouth shape. ``yo`` is ``iou``,
   and ``wong`` is ``ueng``. ``yai`` (an old reading of 崖) is ``ia`` + ``i``.
@@ -49,7 +49,7 @@ _WITHOUT_INITIAL = {
     **{"yu": ("v",), "yue": ("ve",), "yuan": ("van",), "yun": ("vn",)},
     **{"yv": ("v",), "yve": ("ve",), "yvan": ("van",), "yvn": ("vn",)},
     **{"ê": ("ei",), "eh": ("ei",), "yo": ("iou",), "wong": ("ueng",), "yai": ("ia", "i")},
-    **{"m": ("m",), "n": ("n",), "ng": ("n",), "hm": ("h", "m"), "hng": ("h", "n")},
+    **{"r": ("er",), "m": ("m",), "n": ("n",), "ng": ("n",), "hm": ("h", "m"), "hng": ("h", "n")},
 }
 
 # Spelling of finals: without initial (the first spelling above), after an initial, after j q x.
@@ -64,14 +64,41 @@ _SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
 
 _CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
 _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
+_MAX_LETTERS = 10  # of a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
 _SPACE_BESIDE_CHARACTER = re.compile(f"(?<![{_LATIN}]) | (?![{_LATIN}])")
 # Numbers are read sentence by sentence: time and memory grow with the square of the length.
 _SENTENCE = re.compile(
     r"[^。！？]{1,500}(?![^。！？])[。！？]*|.{1,500}(?<!\d)|.{1,500}", re.DOTALL
 )
-_HALF_WIDTH = str.maketrans("０１２３４５６７８９．％", "0123456789.%")
+_HALF_WIDTH = str.maketrans("０１２３４５６７８９．％￥", "0123456789.%¥")
+_PHONE_NUMBER = re.compile(r"(?<!\d)(1\d\d) (\d{4}) (\d{4})(?!\d)")
+# Rewritten before wetext 0.1 reads numbers, because it reads these wrongly.
+_NUMBER_SPELLINGS = tuple(
+    (re.compile(pattern), replacement)
+    for pattern, replacement in (
+        (r"(?<=\d)：(?=\d)", ":"),
+        (r"(?<![\d.,])(\d{1,3}(?:,\d{3})+)(?![\d,])", lambda match: match[1].replace(",", "")),
+        (r"(?<=[%℃度])[-−–—－~～](?=\d)", "到"),
+        (r"(?<=\d)[–—－～](?=\d)", "~"),
+        (r"(\.\d+)-(?=\d)|(?<![\d-])(\d+)-(?=\d+(?:\.\d+)?%)", r"\1\2~"),
+        (r"(?<!\d)[−－](?=\d)", "-"),
+        (r"(?<=[A-Za-z])-(?=\d)", " "),
+        (r"(\d[\d.]*)‰", r"千分之\1"),
+        (r"[¥$€£](?=[\d.]+[万亿萬億]?[元块塊])", ""),
+        (r"¥([\d.]+[万亿萬億])", r"\1元"),
+        (r"(?<!\d)0(?=[1-9][月日号號])", ""),
+        (r"(?<![\d.])2(?=[月日号號楼樓])", "二"),
+        (r"(?<![\d.第])2(?=[個張隻條種歲塊點雙間顆輛])", "兩"),
+    )
+)
+# Traditional characters with two simplified ones, where the reading differs from the usual one.
+_READ_AS = (
+    (re.compile("(?<![名顯显原編编論论卓土昭])著(?![名作者稱称書书述])"), "着"),
+    (re.compile("乾(?![隆坤卦])"), "干"),
+)
 _KEYCAP = re.compile("[0-9#*]\ufe0f?\u20e3")  # emoji of a key, a bullet
+_LETTERS = str.maketrans("ɑɡ\u0306", "ag\u030c")  # of schoolbooks; a breve instead of a caron
 _TONES = {"\u0304": 1, "\u0301": 2, "\u030c": 3, "\u0300": 4}  # combining marks
 
 
@@ -154,17 +181,45 @@ def transcribe(text: str) -> Transcript:
         return _read_characters(text)
     syllables, dropped = [], []
     for word in _PINYIN_WORD.findall(unicodedata.normalize("NFKC", text)):
-        try:
-            phones = phones_of_syllable(word)
-        except UserError:
+        spellings = _split_word(word)
+        if not spellings:
             dropped.append(word)
-        else:
-            syllables.append(SpokenSyllable(word, _with_tone_digit(word), phones))
+        for spelling in spellings:
+            phones = phones_of_syllable(spelling)
+            syllables.append(SpokenSyllable(spelling, _with_tone_digit(spelling), phones))
     return Transcript(tuple(syllables), tuple(dropped))
 
 
+def _split_word(word: str) -> list[str]:
+    """Split a pinyin word with tones (``nǐhǎo``, ``ni3hao3``) into syllables; empty: impossible.
+
+    Within a word, a syllable that starts with a, o or e follows an apostrophe (GB/T 16159).
+    """
+    if _is_syllable(word):
+        return [word]
+    for end in range(min(len(word) - 1, _MAX_LETTERS), 0, -1):
+        # Without a tone, words of other languages may look like syllables.
+        has_tone = re.search(r"\d$", _with_tone_digit(word[:end]))
+        if has_tone and _plain(word[end:])[:1] not in "aoeê" and _is_syllable(word[:end]):
+            rest = _split_word(word[end:])
+            if rest:
+                return [word[:end], *rest]
+    return []
+
+
+def _is_syllable(word: str) -> bool:
+    try:
+        phones_of_syllable(word)
+    except UserError:
+        return False
+    return True
+
+
 def _read_characters(text: str) -> Transcript:
-    text = re.sub(r"(?<=\d)：(?=\d)", ":", text.translate(_HALF_WIDTH))
+    text = _PHONE_NUMBER.sub(r"\1\2\3", text.translate(_HALF_WIDTH))
+    text = re.sub(r"(?<=\d)\s+(?=\d)", "、", text)  # different numbers
+    for pattern, replacement in _NUMBER_SPELLINGS:
+        text = pattern.sub(replacement, text)
     without_spaces = _SPACE_BESIDE_CHARACTER.sub("", " ".join(text.split()))
     characters = "".join(map(_read_numbers, _SENTENCE.findall(without_spaces)))
     syllables = tuple(
@@ -184,13 +239,33 @@ def _pinyin_of(characters: str) -> list[str]:
     from pypinyin import Style, lazy_pinyin  # noqa: PLC0415 (takes 0.3 s, and few callers read text)
 
     syllables: list[str] = lazy_pinyin(
-        characters,
+        _simplify(characters),
         style=Style.TONE3,
         errors=lambda unknown: [""] * len(unknown),  # type: ignore[arg-type,return-value]
         neutral_tone_with_five=True,
         v_to_u=False,
     )
     return syllables
+
+
+def _simplify(characters: str) -> str:
+    """Replace traditional characters, whose readings in words pypinyin lacks: 音樂 -> 音乐."""
+    for pattern, replacement in _READ_AS:
+        characters = pattern.sub(replacement, characters)
+    return "".join(
+        letter if letter.encode("gb2312", "ignore") else _simplified(letter)
+        for letter in characters
+    )
+
+
+@lru_cache(maxsize=8192)
+def _simplified(character: str) -> str:
+    from wetext import Normalizer  # noqa: PLC0415 (takes 0.3 s)
+
+    simplified: str = Normalizer(lang="zh", operator="tn", traditional_to_simple=True).normalize(
+        character
+    )
+    return simplified if len(simplified) == 1 else character
 
 
 def _read_numbers(text: str) -> str:
@@ -210,7 +285,7 @@ def _is_spoken(letter: str) -> bool:
 
 def _with_tone_digit(syllable: str) -> str:
     """Write a tone mark as a digit: pǎo -> pao3."""
-    decomposed = unicodedata.normalize("NFD", syllable)
+    decomposed = unicodedata.normalize("NFD", syllable).translate(_LETTERS)
     digits = [str(_TONES[mark]) for mark in decomposed if mark in _TONES]
     letters = "".join(mark for mark in decomposed if mark not in _TONES)
     return unicodedata.normalize("NFC", letters) + "".join(digits[:1])
@@ -218,7 +293,7 @@ def _with_tone_digit(syllable: str) -> str:
 
 def _plain(syllable: str) -> str:
     """Return a syllable in lower case, with v for ü, without its tone."""
-    decomposed = unicodedata.normalize("NFD", syllable.strip().lower())
+    decomposed = unicodedata.normalize("NFD", syllable.strip().lower()).translate(_LETTERS)
     toneless = "".join(mark for mark in decomposed if mark not in _TONES)
     composed = unicodedata.normalize("NFC", toneless)
     return re.sub(r"[0-5]$", "", composed).replace("u:", "v").replace("ü", "v")
