@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
+from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.spoken_text import mismatch_message, read_text
 from kouxing.services.driver.video import film
+from kouxing.services.driver.video.time_stretch import stretch
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
@@ -29,8 +31,10 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.phones.transcript import TimedSyllable
 from kouxing.shared.terminal import print_message
 
+T = TypeVar("T", Phone, TimedSyllable)
 _IMAGE_RATE_HZ = 25.0  # of a video, if the source is sound
 _MAX_IMAGE_RATE_HZ = 240.0
 
@@ -44,6 +48,24 @@ class Motion:
     image_rate_hz: float  # default for a video
     samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
     phones: list[Phone] | None = None  # spoken phones in order; None if the source has no sound
+    syllables: Sequence[TimedSyllable] = ()  # as written, in order
+
+
+def slow_down(motion: Motion, speed: float) -> Motion:
+    """Return a motion at a speed of 0.25 to 1, with its sound at the same pitch."""
+    if speed == 1.0:
+        return motion
+    return replace(
+        motion,
+        frames=[(time_s / speed, faps) for time_s, faps in motion.frames],
+        samples=None if motion.samples is None else stretch(motion.samples, speed),
+        phones=None if motion.phones is None else [_slower(item, speed) for item in motion.phones],
+        syllables=[_slower(item, speed) for item in motion.syllables],
+    )
+
+
+def _slower(item: T, speed: float) -> T:
+    return replace(item, onset_s=item.onset_s / speed, duration_s=item.duration_s / speed)
 
 
 def has_motion(source: Path) -> bool:
@@ -116,12 +138,14 @@ def animate(
             for lip_model, config in zip(models, settings, strict=True)
         ]
         events = recording.events
+    spoken = [event for event in events if isinstance(event, Phone) and event.is_spoken]
     return Motion(
         faces[0] if len(faces) == 1 else film.stack_faces(faces),
         settings[0].frame_rate_hz,
         _IMAGE_RATE_HZ,
         samples,
-        [event for event in events if isinstance(event, Phone) and event.is_spoken],
+        spoken,
+        write_syllables(spoken, transcript, model.inventory),
     )
 
 

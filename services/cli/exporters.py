@@ -9,10 +9,12 @@ from typing import ClassVar, Protocol
 
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import Motion
+from kouxing.services.cli.animation import Motion, slow_down
+from kouxing.services.cli.captions import make_captions
 from kouxing.services.cli.curves import CURVE_EXPORTERS
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.captions import band_height_px
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
 from kouxing.services.driver.video import film
@@ -20,7 +22,7 @@ from kouxing.services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_
 from kouxing.shared.errors import UserError
 
 _DRAWING_OPTIONS = frozenset(
-    {"lips", "head", "size", "background", "camera", "yaw_deg", "pitch_deg"}
+    {"lips", "head", "size", "background", "camera", "yaw_deg", "pitch_deg", "captions"}
 )
 
 
@@ -44,13 +46,16 @@ class VideoExporter:
     """
 
     unit: ClassVar[str] = "image"
-    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"rate_hz", "sound"}
+    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"rate_hz", "sound", "speed"}
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
         check_name(output)
         self._output = output
         self._rate_hz = options.rate_hz
-        self._renderer = _make_renderer(output, options)
+        self._speed = options.speed
+        self._captions = options.captions
+        self._size_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
+        self._renderer = _make_renderer(output, options, self._size_px)
 
     def export(self, motion: Motion, progress: Progress) -> int:
         """Draw a motion and return the number of images.
@@ -58,6 +63,7 @@ class VideoExporter:
         Raises ``UserError`` if a file cannot be written.
         """
         task = progress.add_task("drawing", total=1.0)
+        motion = slow_down(motion, self._speed)
         with contextlib.closing(self._renderer):
             return film.render_video(
                 motion.frames,
@@ -65,6 +71,7 @@ class VideoExporter:
                 self._renderer,
                 frame_rate_hz=self._rate_hz or motion.image_rate_hz,
                 samples=motion.samples,
+                captions=make_captions(self._captions, motion, self._size_px),
                 on_progress=lambda share: progress.update(task, completed=share),
             )
 
@@ -78,12 +85,20 @@ class PictureExporter:
     def __init__(self, output: Path, options: ExportOptions) -> None:
         self._output = output
         self._at_s = options.at_s or 0.0
-        self._renderer = _make_renderer(output, options)
+        self._captions = options.captions
+        self._size_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
+        self._renderer = _make_renderer(output, options, self._size_px)
 
     def export(self, motion: Motion, progress: Progress) -> int:
         """Draw the picture and return 1."""
         with contextlib.closing(self._renderer):
-            film.render_picture(motion.frames, self._output, self._renderer, self._at_s)
+            film.render_picture(
+                motion.frames,
+                self._output,
+                self._renderer,
+                self._at_s,
+                make_captions(self._captions, motion, self._size_px),
+            )
         return 1
 
 
@@ -127,10 +142,14 @@ def _check_options(output: Path, options: ExportOptions, exporter: type[Exporter
             )
 
 
-def _make_renderer(output: Path, options: ExportOptions) -> Renderer | SideBySide:
-    """Return a renderer that draws a face for each lip model, side by side."""
+def _make_renderer(
+    output: Path, options: ExportOptions, size_px: tuple[int, int]
+) -> Renderer | SideBySide:
+    """Return a renderer that draws a face for each lip model, side by side, above captions."""
     num_faces = len(options.lips)
-    width_px, height_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
+    width_px, height_px = size_px
+    if options.captions is not None:
+        height_px -= band_height_px(size_px)
     if width_px % num_faces:
         raise UserError(f"--size {options.size}: choose a width that is a multiple of {num_faces}")
     background = scene.background(options.background)

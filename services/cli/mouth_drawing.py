@@ -16,12 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import Timing
 from kouxing.services.cli.spoken_text import mismatch_message, read_text
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables
+from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
@@ -37,9 +38,9 @@ from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
+from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
-from kouxing.shared.phones.syllables import group_syllables
+from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 from kouxing.shared.terminal import open_progress, plural, print_message, write_error, write_text
 
@@ -120,7 +121,7 @@ def draw_mouth(
     mouth = _Mouth(
         samples=samples,
         phones=phones,
-        syllables=_label_syllables(phones, transcript, inventory),
+        syllables=write_syllables(phones, transcript, inventory),
         key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
         silence=inventory.silence,
         smooth=smooth,
@@ -150,30 +151,12 @@ def _time_phones(
     return alignment.phones
 
 
-def _label_syllables(
-    phones: Sequence[Phone], transcript: Transcript | None, inventory: PhoneInventory
-) -> list[TimedSyllable]:
-    """Return the syllables of the text, or those of recognized phones, which have no tones."""
-    if transcript is not None:
-        return timed_syllables(phones, transcript, inventory)
-    syllables = []
-    for group in group_syllables(phones, inventory):
-        spelling = inventory.spell(tuple(phone.symbol for phone in group))
-        onset_s = group[0].onset_s
-        duration_s = group[-1].onset_s + group[-1].duration_s - onset_s
-        syllables.append(TimedSyllable(spelling, spelling, onset_s, duration_s))
-    return syllables
-
-
 def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
     """Return the label of each syllable: its characters, if they can be drawn, and its spelling."""
     texts = [item.text for item in mouth.syllables if item.text != item.spelling]
-    shows_text = not are_pixels or drawing.can_draw("".join(texts))
+    shows_text = not are_pixels or can_draw("".join(texts))
     if not shows_text:
-        print_message(
-            "labels show only pinyin: no font with Chinese characters was found (Debian: install"
-            " fonts-noto-cjk)"
-        )
+        print_message(f"labels show only pinyin: {NO_CHINESE_FONT}")
     return [
         (
             item.onset_s,

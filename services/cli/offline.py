@@ -13,6 +13,7 @@ from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.options import (
     DEFAULT_HEAD,
     AudioTrack,
+    CaptionKind,
     CurveForm,
     ExportOptions,
     HeadName,
@@ -119,6 +120,13 @@ def render(
             min=1, max=240, help="Images per second. Default: 25, or the rate of the curves."
         ),
     ] = None,
+    captions: Annotated[
+        CaptionKind | None,
+        typer.Option(help="Captions below the face: pinyin, phones, or the characters of --text."),
+    ] = None,
+    speed: Annotated[
+        float, typer.Option(min=0.25, max=1, help="0.5 is half as fast, at the same pitch.")
+    ] = 1.0,
     track: AudioTrack = None,
     sound: Annotated[Path | None, typer.Option(help="Sound to add to curves.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, in seconds.")] = None,
@@ -134,6 +142,8 @@ def render(
 
     if live and text is not None:
         raise UserError("a live stream has no text in advance; use either --live or --text")
+    if captions is CaptionKind.CHARACTERS and text is None:
+        raise UserError("--captions characters needs the spoken text; add --text")
     models = tuple(lips or [DEFAULT_LIP_MODEL])
     if mouth is not None and "learnt" not in models:
         raise UserError("--mouth applies to learnt lips; add --lips learnt")
@@ -148,6 +158,7 @@ def render(
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
         yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,
+        captions=captions, speed=speed,
     )  # fmt: skip
 
     def render_file(source: Path, target: Path) -> None:
@@ -157,7 +168,7 @@ def render(
         if has_motion(source):
             _check_no_sound_options(
                 source, lips=lips, live=live or None, text=text, mouth=mouth,
-                expressiveness=expressiveness, track=track,
+                expressiveness=expressiveness, track=track, captions=captions,
             )  # fmt: skip
         elif sound is not None:
             raise UserError(f"--sound applies to curves; {source} has its own sound")

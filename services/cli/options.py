@@ -62,6 +62,14 @@ class ListenOutput(StrEnum):
     PHONES = "phones"
 
 
+class CaptionKind(StrEnum):
+    """What the captions of a video show."""
+
+    PINYIN = "pinyin"
+    CHARACTERS = "characters"
+    PHONES = "phones"
+
+
 class Timing(StrEnum):
     """Method that times the phones of a text."""
 
@@ -84,3 +92,5 @@ class ExportOptions:
     rate_hz: float | None = None  # images per second; None: the default of the motion
     at_s: float | None = None  # time of a single picture
     sound: Path | None = None  # to add to a .fap file
+    captions: CaptionKind | None = None
+    speed: float = 1.0

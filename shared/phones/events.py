@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from kouxing_client.messages import SILENCE
 from numpy.typing import NDArray
+
+from kouxing.shared.phones.inventory import SILENCE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

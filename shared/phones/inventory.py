@@ -6,6 +6,7 @@ A language is a Python package with ``phones.tsv`` and a function ``pronounce``.
   it cannot read
 - ``READABLE``, a pattern for the parts of a line of text to pronounce; by default words
 - ``spell``, a function that spells a syllable's phones; by default the symbols in a row
+- ``write``, a function that returns a spelling or a phone as it is printed; by default unchanged
 - ``CODE``, the ISO 639-1 code that recordings use for the language
 
 ``BUILT_IN`` lists the languages of kouxing. An installed distribution adds a language with an entry
@@ -43,6 +44,7 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 BUILT_IN = {"mandarin": "kouxing.shared.phones.mandarin"}
 DEFAULT_LANGUAGE = "mandarin"
 ENTRY_POINTS = "kouxing.languages"
+SILENCE = "sil"  # the phone of a pause, in every language, as in kouxing_client
 KINDS = ("initial", "vowel", "silence")
 MAX_PHONES = 255  # model files count phones in 8 bits
 SILENCE = "sil"  # also in kouxing_client, which is slow to import
@@ -66,6 +68,7 @@ class PhoneInventory:
     transcribe: Callable[[str], Transcript] | None = None  # like pronounce, with the spelling
     readable: re.Pattern[str] = _WORDS  # finds the parts of a line to pronounce
     spell: Callable[[Syllable], str] = "".join  # phones of a syllable to its spelling
+    write: Callable[[str], str] = str  # a spelling or a phone as printed: "ni3" is "nǐ"
     code: str = ""  # ISO 639-1, such as "zh"; empty: no recordings have it
 
     def __post_init__(self) -> None:
@@ -158,6 +161,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
             transcribe=getattr(lexicon, "transcribe", None),
             readable=getattr(lexicon, "READABLE", _WORDS),
             spell=getattr(lexicon, "spell", "".join),
+            write=getattr(lexicon, "write", str),
             code=getattr(lexicon, "CODE", ""),
         )
     except (OSError, ImportError, KeyError, ValueError, TypeError, AttributeError) as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.driver.render.captions import Captions
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
 from kouxing.services.driver.video.recording import Recording, interpolate
@@ -55,16 +56,20 @@ def render_video(
     *,
     frame_rate_hz: float,
     samples: NDArray[np.float32] | None = None,
+    captions: Captions | None = None,
     on_progress: Callable[[float], None] = lambda _share: None,
 ) -> int:
     """Write a video or one picture per image; return the number of images.
 
     The last of the ``frames``, at least one, is held until the sound (n,), 16 kHz mono, ends.
+    ``captions`` are drawn below the images.
     ``on_progress`` is called with the finished share, 0 to 1.
 
     Raises ``UserError`` if the file cannot be written.
     """
-    recording = Recording(path, renderer, frame_rate_hz, sound=samples is not None)
+    recording = Recording(
+        path, renderer, frame_rate_hz, sound=samples is not None, captions=captions
+    )
     try:
         if samples is not None:
             recording.add_sound(0, samples)
@@ -82,9 +87,13 @@ def render_video(
 
 
 def render_picture(
-    frames: list[Frame], path: Path, renderer: Renderer | SideBySide, at_s: float
+    frames: list[Frame],
+    path: Path,
+    renderer: Renderer | SideBySide,
+    at_s: float,
+    captions: Captions | None = None,
 ) -> None:
-    """Write the picture (PNG) at a time.
+    """Write the picture (PNG) at a time, with captions below it.
 
     Raises ``UserError`` if the time is outside the animation, or the file cannot be written.
     """
@@ -94,4 +103,5 @@ def render_picture(
     times_s = [time_s for time_s, _ in frames]
     after = min(int(np.searchsorted(times_s, at_s, side="right")), len(frames) - 1)
     pair = frames[max(after - 1, 0)], frames[after]
-    write_picture(path, renderer.draw(interpolate(*pair, at_s)))
+    image = renderer.draw(interpolate(*pair, at_s))
+    write_picture(path, image if captions is None else captions.add_below(image, at_s))

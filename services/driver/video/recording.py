@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.driver.render.captions import Captions
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
 from kouxing.services.driver.video.writer import open_writer
@@ -27,6 +28,7 @@ class Recording:
 
     A renderer with a transparent background makes a transparent video. Unless ``overwrite`` is set,
     ``close`` adds a number to the name of an existing file.
+    ``captions`` are drawn below the images.
 
     Raises ``UserError`` if the file cannot be written.
     """
@@ -39,15 +41,20 @@ class Recording:
         *,
         sound: bool = True,
         overwrite: bool = True,
+        captions: Captions | None = None,
     ) -> None:
         self.path = path
         self.num_images = 0
         self._renderer = renderer
         self._frame_rate_hz = frame_rate_hz
+        self._captions = captions
+        width_px, height_px = renderer.size
+        if captions is not None:
+            height_px += captions.height_px
         self._frames: deque[tuple[float, Faps]] = deque()
         self._num_samples = 0
         self._writer = open_writer(
-            path, renderer.size, frame_rate_hz, MEDIA_RATE_HZ if sound else None,
+            path, (width_px, height_px), frame_rate_hz, MEDIA_RATE_HZ if sound else None,
             transparent=renderer.transparent, overwrite=overwrite,
         )  # fmt: skip
 
@@ -89,7 +96,10 @@ class Recording:
         if time_s > last_s:
             return False
         after = self._frames[min(1, len(self._frames) - 1)]
-        self._writer.write_image(self._renderer.draw(interpolate(self._frames[0], after, time_s)))
+        image = self._renderer.draw(interpolate(self._frames[0], after, time_s))
+        if self._captions is not None:
+            image = self._captions.add_below(image, time_s)
+        self._writer.write_image(image)
         self.num_images += 1
         return True
 

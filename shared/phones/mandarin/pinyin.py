@@ -163,6 +163,31 @@ def spell(phones: tuple[str, ...]) -> str:
     return initial[0] + _SPELLED_AFTER.get(final, final)
 
 
+def write(spelling: str) -> str:
+    """Return a syllable with tone mark and ü, or a phone as it is written in a syllable.
+
+    The mark is on a or e, on the o of ou, else on the last vowel (ISO 7098).
+
+    Examples
+    --------
+    >>> write("lv4"), write("gui4"), write("er5"), write("uei")
+    ('lǜ', 'guì', 'er', 'ui')
+    """
+    plain = _plain(spelling)
+    if plain in _SPELLED_AFTER:
+        return _SPELLED_AFTER[plain]
+    letters = plain.replace("v", "u" if plain[0] in "jqxy" else "ü")
+    tone = _with_tone_digit(spelling)[-1]
+    mark = next((mark for mark, number in _TONES.items() if str(number) == tone), None)
+    if mark is None:
+        return letters
+    vowels = [at for at, letter in enumerate(letters) if letter in "aeêiouü"]
+    marked = [at for at in vowels if letters[at] in "aeê" or letters[at:].startswith("ou")]
+    nasals = [at for at, letter in enumerate(letters) if letter in "mn"]  # without vowel: hm, ng
+    place = (marked or vowels[-1:] or nasals)[0]
+    return unicodedata.normalize("NFC", letters[: place + 1] + mark + letters[place + 1 :])
+
+
 def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters with numbers and dates, or else pinyin.
 

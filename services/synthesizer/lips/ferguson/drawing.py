@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from html import escape
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from kouxing.services.synthesizer.lips.ferguson.contour import contour
+from kouxing.shared.fonts import font_for
 
 Array = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
@@ -33,12 +33,6 @@ _LINE_PX_PER_WIDTH = 0.006
 WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
 _ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # Pillow's names
 _SUPERSAMPLING = 3
-# font files with Chinese characters on Linux, macOS and Windows
-_CHINESE_FONTS = (
-    "NotoSansCJK-Regular.ttc", "NotoSansSC-Regular.otf", "SourceHanSansSC-Regular.otf",
-    "wqy-zenhei.ttc", "wqy-microhei.ttc", "DroidSansFallbackFull.ttf", "PingFang.ttc",
-    "Hiragino Sans GB.ttc", "msyh.ttc", "simsun.ttc",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,27 +196,6 @@ def svg(drawing: Drawing) -> str:
     return "\n".join([*lines, "</svg>", ""])
 
 
-def can_draw(text: str) -> bool:
-    """Return whether ``rasterize`` has a font for a text."""
-    return text.isascii() or _chinese_font(1.0) is not None
-
-
-@lru_cache
-def _chinese_font(size_px: float) -> ImageFont.FreeTypeFont | None:
-    """Return the first installed font of ``_CHINESE_FONTS``, or None."""
-    for name in _CHINESE_FONTS:
-        try:
-            return ImageFont.truetype(name, size_px)
-        except OSError:
-            continue
-    return None
-
-
-def _font(text: str, size_px: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    chinese = None if text.isascii() else _chinese_font(size_px)
-    return chinese or ImageFont.load_default(size_px)
-
-
 def rasterize(drawing: Drawing) -> UInt8:
     """Return a drawing as a picture (height_px, width_px, 3), sRGB."""
     fine = Image.new(
@@ -239,7 +212,7 @@ def rasterize(drawing: Drawing) -> UInt8:
             width = max(1, round(outline.line_px * _SUPERSAMPLING))
             pen.line(points, fill=outline.color, width=width, joint="curve")
     for label in drawing.labels:
-        font = _font(label.text, max(label.size_px * _SUPERSAMPLING, 1.0))
+        font = font_for(label.text, max(label.size_px * _SUPERSAMPLING, 1.0))
         place = (label.x * _SUPERSAMPLING, label.y * _SUPERSAMPLING)
         pen.text(place, label.text, label.color, font, _ANCHORS[label.anchor])
     picture = fine.resize((drawing.width_px, drawing.height_px), Image.Resampling.BOX)

@@ -1,0 +1,90 @@
+"""The syllables of a recording as they are written, and the captions of its video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from kouxing.services.cli.options import CaptionKind
+from kouxing.services.driver.render.captions import Caption, Captions
+from kouxing.services.recognizer.alignment import timed_syllables
+from kouxing.shared.errors import UserError
+from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.syllables import group_syllables
+from kouxing.shared.phones.transcript import TimedSyllable, Transcript
+
+if TYPE_CHECKING:
+    from kouxing.services.cli.animation import Motion
+
+
+def write_syllables(
+    phones: Sequence[Phone], transcript: Transcript | None, inventory: PhoneInventory
+) -> list[TimedSyllable]:
+    """Return the syllables of the text, with tones, or of recognized phones, without tones.
+
+    The text of a syllable is its character, or else its spelling.
+    """
+    if transcript is None:
+        return [_syllable_of(group, inventory) for group in group_syllables(phones, inventory)]
+    syllables = []
+    for timed in timed_syllables(phones, transcript, inventory):
+        spelling = inventory.write(timed.spelling)
+        text = timed.text if inventory.readable.search(timed.text) else spelling
+        syllables.append(replace(timed, text=text, spelling=spelling))
+    return syllables
+
+
+def _syllable_of(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyllable:
+    spelling = inventory.spell(tuple(phone.symbol for phone in group))
+    onset_s, end_s = group[0].onset_s, group[-1].onset_s + group[-1].duration_s
+    return TimedSyllable(spelling, spelling, onset_s, end_s - onset_s)
+
+
+def make_captions(
+    kind: CaptionKind | None, motion: Motion, size_px: tuple[int, int]
+) -> Captions | None:
+    """Return the captions of a video of this size, if any.
+
+    Raises ``UserError`` if characters are required and the text has none, or no font has them.
+    """
+    if kind is None:
+        return None
+    captions: list[Caption] = []
+    if kind is CaptionKind.PHONES:
+        captions = _captions_of_phones(motion.phones or [], load_inventory())
+    else:
+        is_text = kind is CaptionKind.CHARACTERS
+        if is_text and all(syllable.text == syllable.spelling for syllable in motion.syllables):
+            raise UserError("--captions characters needs a text in characters; this one is pinyin")
+        captions = [
+            Caption(
+                syllable.onset_s,
+                syllable.onset_s + syllable.duration_s,
+                syllable.text if is_text else syllable.spelling,
+            )
+            for syllable in motion.syllables
+        ]
+    if not can_draw("".join(caption.text for caption in captions)):
+        raise UserError(f"--captions characters: {NO_CHINESE_FONT}, or use --captions pinyin")
+    return Captions(captions, size_px)
+
+
+def _captions_of_phones(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Caption]:
+    joined = {
+        phone.index
+        for before, phone in pairwise(phones)
+        if before.symbol in inventory.initials and phone.symbol in inventory.vowels
+    }
+    return [
+        Caption(
+            phone.onset_s,
+            phone.onset_s + phone.duration_s,
+            inventory.write(phone.symbol),
+            is_joined=phone.index in joined,
+        )
+        for phone in phones
+    ]

@@ -1,0 +1,88 @@
+"""Captions: what they contain, where they are drawn, and slow motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kouxing.services.cli.animation import Motion, slow_down
+from kouxing.services.cli.captions import make_captions, write_syllables
+from kouxing.services.cli.options import CaptionKind
+from kouxing.services.driver.render.captions import Caption, Captions, band_height_px
+from kouxing.services.driver.video.time_stretch import stretch
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import load_inventory
+from tests import lips
+
+MANDARIN = load_inventory()
+SIZE = (320, 180)
+YELLOW = (255, 210, 63)
+PHONES = [
+    lips.phone(number, symbol, 0.2 * number, 0.2)
+    for number, symbol in enumerate(("l", "v", "sh", "iii", "g", "uei"))
+]
+
+
+def motion_of(text: str | None = None) -> Motion:
+    transcript = None if text is None else MANDARIN.read(text)
+    syllables = write_syllables(PHONES, transcript, MANDARIN)
+    return Motion([(0.0, np.zeros(68, np.float32))], 50.0, 25.0, None, PHONES, syllables)
+
+
+@pytest.mark.parametrize(
+    ("text", "texts", "spellings"),
+    [
+        (None, "lü shi gui", "lü shi gui"),
+        ("绿是贵", "绿 是 贵", "lǜ shì guì"),
+        ("lv4 shi4 gui4", "lǜ shì guì", "lǜ shì guì"),
+    ],
+)
+def test_writes_syllables_as_printed(text: str | None, texts: str, spellings: str) -> None:
+    syllables = motion_of(text).syllables
+    assert [syllable.text for syllable in syllables] == texts.split()
+    assert [syllable.spelling for syllable in syllables] == spellings.split()
+
+
+def test_highlights_only_the_current_caption_below_the_picture() -> None:
+    captions = make_captions(CaptionKind.PHONES, motion_of(), SIZE)
+    assert captions is not None
+    picture = np.full((SIZE[1] - captions.height_px, SIZE[0], 3), 7, np.uint8)
+    places = []
+    for time_s in (0.1, 1.1):
+        drawn = captions.add_below(picture, time_s)
+        assert drawn.shape == (SIZE[1], SIZE[0], 3)
+        np.testing.assert_array_equal(drawn[: len(picture)], picture)
+        places.append(np.nonzero((drawn == YELLOW).all(axis=2))[1])
+    assert places[0].max() < places[1].min()
+    assert not (captions.add_below(picture, 9.0) == YELLOW).all(axis=2).any()
+    clear = captions.add_below(np.zeros((*picture.shape[:2], 4), np.uint8), 0.1)
+    assert clear[-1, :, 3].max() == 0, "the band of a transparent picture is transparent"
+
+
+def test_long_texts_and_pauses_start_a_new_line() -> None:
+    words = [Caption(0.1 * number, 0.1 * number + 0.1, "zhuang") for number in range(40)]
+    captions = Captions([*words, Caption(9.0, 9.2, "a")], SIZE)
+    picture = np.zeros((SIZE[1] - band_height_px(SIZE), SIZE[0], 3), np.uint8)
+    bands = [captions.add_below(picture, time_s)[len(picture) :] for time_s in (0.0, 3.9, 9.3)]
+    assert len({band.tobytes() for band in bands}) == 3
+    margins = np.concatenate([band[:, :4] for band in bands])
+    assert (margins == margins[0, 0]).all(), "the lines fit"
+
+
+def test_characters_need_a_text_in_characters() -> None:
+    with pytest.raises(UserError, match="needs a text in characters"):
+        make_captions(CaptionKind.CHARACTERS, motion_of("lv4 shi4 gui4"), SIZE)
+
+
+def test_slow_motion_keeps_the_pitch_and_moves_everything() -> None:
+    slow = slow_down(motion_of(), 0.5)
+    assert [phone.onset_s for phone in slow.phones or ()] == pytest.approx(np.arange(6) * 0.4)
+    assert slow.syllables[1].onset_s == pytest.approx(0.8)
+    times_s = np.arange(16_000) / 16_000
+    tone = np.sin(2 * np.pi * 440 * times_s).astype(np.float32) * (times_s > 0.5)
+    slow_tone = stretch(tone.astype(np.float32), 0.25)
+    assert len(slow_tone) == 64_000
+    loud = np.flatnonzero(np.abs(slow_tone) > 0.3)
+    assert loud[0] / 16_000 == pytest.approx(2.0, abs=0.15)
+    spectrum = np.abs(np.fft.rfft(slow_tone))
+    assert spectrum.argmax() / 4 == pytest.approx(440, abs=2)
