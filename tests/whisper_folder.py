@@ -45,16 +45,12 @@ def string(text: str) -> bytes:
     return struct.pack("<H", len(text) + 1) + text.encode() + b"\0"
 
 
-def write_whisper(
-    folder: Path,
-    arrays: dict[str, np.ndarray],
-    *,
-    version: int = 6,
-    name: str = "WhisperSpec",
-) -> Path:
+def write_whisper(folder: Path, arrays: dict[str, np.ndarray], *, version: int = 6) -> Path:
     """Write a file as CTranslate2 does; arrays of uint16 are the upper halves of floats."""
     kinds = {"f4": 0, "i1": 1, "i2": 2, "i4": 3, "f2": 4, "u2": 5}
-    content = struct.pack("<I", version) + string(name) + struct.pack("<II", 3, len(arrays))
+    content = (
+        struct.pack("<I", version) + string("WhisperSpec") + struct.pack("<II", 3, len(arrays))
+    )
     for key, array in arrays.items():
         sizes = struct.pack(f"<B{array.ndim}I", array.ndim, *array.shape)
         kind = struct.pack("<BI", kinds[array.dtype.str[1:]], array.nbytes)

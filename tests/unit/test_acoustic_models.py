@@ -8,6 +8,7 @@ import pytest
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
 from kouxing.services.recognizer.acoustic.load import SHIPPED, load_model, model_path
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
 from tests.system import DEMO
 
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
@@ -40,6 +41,18 @@ def test_scores_come_within_the_look_ahead(model: AcousticModel, frames: np.ndar
         # With a look-ahead of one frame, the first three frames are needed for any score.
         assert num_settled >= number - stream.look_ahead_frames or number < 3
         assert num_settled <= number
+
+
+def test_the_neural_model_sees_only_its_look_ahead() -> None:
+    model = load_model(model_path("neural"), look_ahead_ms=30.0)
+    frames = model.create_front_end().accept_waveform(HELLO)
+    other = frames.copy()
+    other[50:] += 0.5
+    same = (score_segment(model, frames) == score_segment(model, other)).all(axis=1)
+    assert same[:47].all()
+    assert not same[47:].any()
+    with pytest.raises(UserError, match="no look-ahead of 50 ms; choose 10, 30"):
+        load_model(model_path("neural"), look_ahead_ms=50.0)
 
 
 def test_chunks_and_earlier_segments_do_not_affect_scores(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer
 
-from kouxing.services.cli.offline import PhoneFormat, align
+from kouxing.services.cli.offline import align
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.alignment import (
     align_syllables,
@@ -78,18 +78,6 @@ def test_csv_json_table_and_textgrid() -> None:
     starts = [float(line.split("=")[1]) for line in lines if line.startswith("            xmin")]
     ends = [float(line.split("=")[1]) for line in lines if line.startswith("            xmax")]
     assert (starts, ends[-1]) == ([0.0, *ends[:-1]], 1.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "form", "beginning"),
-    [("said.TextGrid", None, "File type"), ("said.txt", PhoneFormat.CSV, "index,phone")],
-)
-def test_the_suffix_or_an_option_selects_the_format(
-    name: str, form: PhoneFormat | None, beginning: str, tmp_path: Path
-) -> None:
-    text = "大家好，我是一个会说话的虚拟人。请看我的嘴唇，它们跟着声音一起动。"
-    align(DEMO / "hello-male.wav", text, form=form, output=tmp_path / name)
-    assert (tmp_path / name).read_text().startswith(beginning)
 
 
 def test_rejects_a_text_that_does_not_fit(

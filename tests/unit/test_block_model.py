@@ -142,19 +142,12 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     path = tmp_path / "blocks.npz"
     blocks().save(path)
     arrays = read_archive(path).arrays
-    encoder, _ = networks()
-    broken = BlockReadout(96, 180, READOUT).eval()
-    with torch.no_grad():
-        broken.output.bias[3] = float("nan")
     changes: list[tuple[dict[str, np.ndarray], str]] = [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
         ({"network": np.frombuffer(VAD.read_bytes(), np.uint8)}, "has the inputs"),
-        ({"network": onnx_of(*networks(), BLOCK, past=122)}, "has the sizes"),
         ({"network": onnx_of(*networks(), BLOCK, past=6000)}, "has the sizes"),  # much memory
         ({"network": onnx_of(*networks(178), BLOCK)}, r"its network scores \(1, 30, 178\)"),
-        ({"network": onnx_of(encoder, broken, BLOCK)}, "are not finite"),
         ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),
-        ({"acoustic_scale": np.array(np.nan, np.float32)}, "not finite"),
     ]
     for change, message in changes:
         write_archive(path, {**arrays, **change})

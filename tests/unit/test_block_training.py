@@ -4,16 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks import batches, readout
-from kouxing.training.blocks.network import RIGHT_CONTEXT, BlockEncoder, BlockReadout, layout
 from kouxing.training.blocks.recipe import train_blocks
-from kouxing.training.blocks.trainer import BlockNetwork
 from kouxing.training.neural import optimizer, teacher
 from kouxing.training.neural.network import ReadoutShape
 from tests.unit.test_block_model import HELLO, SMALL
@@ -23,35 +20,6 @@ from tests.whisper_folder import encoder_arrays, write_whisper
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SMALL_READOUT = ReadoutShape(inner=48, gru=24, dropout=0.2, noise=0.15)
-
-
-def small_network() -> BlockNetwork:
-    torch.manual_seed(0)
-    return BlockNetwork(
-        BlockEncoder(SMALL(num_states=6)), BlockReadout(96, 6, SMALL_READOUT)
-    ).eval()
-
-
-@torch.no_grad()
-def outputs(network: BlockNetwork, frames: np.ndarray, block_length: int) -> torch.Tensor:
-    """Compute log posteriors by block, (blocks, B + R, 2, states)."""
-    laid = layout((len(frames) - 1) // 2, block_length)
-    features = network.encoder(torch.from_numpy(frames)[None], laid)
-    return network.readout.read(features, laid)[0, laid.blocks]
-
-
-@pytest.mark.parametrize("block_length", [4, 10])
-def test_a_block_needs_only_its_right_context(block_length: int) -> None:
-    network = small_network()
-    frames = np.random.default_rng(0).normal(0.5, 0.5, (121, 80)).astype(np.float32)
-    whole = outputs(network, frames, block_length)
-    for block in (0, 2):
-        needed = 2 * (block_length * (block + 1) + RIGHT_CONTEXT) + 1
-        live = outputs(network, frames[:needed], block_length)
-        torch.testing.assert_close(live[block], whole[block], rtol=0, atol=1e-5)
-        changed = frames.copy()
-        changed[needed - 1] = 0.0
-        assert (outputs(network, changed, block_length)[block] - whole[block]).abs().max() > 1e-4
 
 
 @pytest.fixture

@@ -37,12 +37,6 @@ def test_numbers_messages_and_counts_media_time_at_16_khz() -> None:
     assert sent(stream) == []
 
 
-def test_a_moved_session_resends_what_the_new_recognizer_needs() -> None:
-    stream = stream_of(5)
-    stream.move(3, 1.0)
-    assert sent(stream) == [3, 4, 5]
-
-
 def test_keeps_acknowledged_audio_for_a_limited_time() -> None:
     stream = stream_of(149)
     stream.acknowledge(149, 15.0)
@@ -50,27 +44,6 @@ def test_keeps_acknowledged_audio_for_a_limited_time() -> None:
     stream.move(1, 15.0)
     num_kept = round(RESEND_S / 0.1) + 1
     assert sent(stream) == list(range(151 - num_kept, 151))
-
-
-def test_resends_what_is_not_acknowledged_in_time_and_waits_longer_each_time() -> None:
-    stream = stream_of(5)
-    stream.acknowledge(2, 1.0)
-    assert not stream.is_stuck(1.5)
-    assert stream.is_stuck(1.7)
-    stream.resend(1.7)
-    assert sent(stream) == [3, 4, 5]
-    assert not stream.is_stuck(2.8)
-    assert stream.is_stuck(3.0)
-    stream.acknowledge(5, 3.0)
-    assert not stream.is_stuck(30.0)
-
-
-def test_resends_audio_that_was_lost_before_the_first_acknowledgement() -> None:
-    stream = stream_of(3)
-    assert not stream.is_stuck(0.5)
-    assert stream.is_stuck(0.7)
-    stream.resend(0.7)
-    assert sent(stream) == [1, 2, 3]
 
 
 def test_flushed_audio_is_not_sent_but_the_end_is() -> None:

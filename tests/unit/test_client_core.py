@@ -117,16 +117,6 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     assert "refuses this client" in str(answer.exception(0))
 
 
-def test_connects_again_if_the_socket_to_control_is_dead() -> None:
-    scene = Scene()
-    dead = scene.commands
-    dead.has_room = False
-    answer = scene.core.request("flush-session", "s")
-    assert not dead.is_open
-    scene.answer("done")
-    assert answer.result(0)["session"] == "s"
-
-
 def test_status_collects_all_pages() -> None:
     scene = Scene()
     status = scene.core.status("")
@@ -177,16 +167,6 @@ def test_audio_waits_for_subscriptions_so_that_no_frame_is_missed() -> None:
     assert sequences(scene.audio()) == []
     scene.pass_time(RESUBSCRIBE_S)
     assert sequences(scene.audio()) == [2]
-
-
-def test_a_blocked_socket_gets_the_rest_later() -> None:
-    scene = Scene()
-    scene.audio().has_room = False
-    scene.push(2)
-    assert scene.session.is_blocked
-    scene.audio().has_room = True
-    scene.core.tick()
-    assert sequences(scene.audio()) == [1, 2]
 
 
 def test_an_unknown_session_ends_unless_it_moves() -> None:

@@ -7,17 +7,7 @@ import pytest
 from kouxing.shared.clock import (
     ClockOffset,
     StallDetector,
-    duration_to_samples,
-    to_samples,
-    to_seconds,
 )
-
-
-def test_media_time_is_samples_at_16_khz() -> None:
-    assert to_samples(1.5) == 24000
-    assert to_seconds(24000) == 1.5
-    assert to_samples(-0.1) == 0
-    assert duration_to_samples(-0.005) == -80
 
 
 def test_the_exchange_with_the_shortest_round_trip_gives_the_offset() -> None:

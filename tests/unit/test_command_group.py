@@ -64,13 +64,6 @@ def test_help_names_values_instead_of_python_types() -> None:
         assert not re.search(r"<(bool|str|float|int|path|list)", text)
 
 
-@pytest.mark.parametrize("command", [[], ["speak"], ["head", "export"], ["wave"]])
-def test_h_prints_help(added: list[str], command: list[str]) -> None:
-    result = CliRunner().invoke(command_line.app, [*command, "-h"])
-    assert result.exit_code == 0
-    assert "Usage:" in result.output
-
-
 def test_the_command_line_imports_neither_training_nor_evaluation_nor_services() -> None:
     code = (
         "import sys, kouxing.services.cli.main\n"

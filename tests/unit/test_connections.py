@@ -15,7 +15,6 @@ from kouxing.shared.connections import (
     MAX_QUEUED,
     MIN_BUDGET,
     PENALTY_S,
-    STALLED_S,
     Budget,
     Connection,
     ConnectionLimiter,
@@ -108,17 +107,6 @@ def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
     assert other.unread == MAX_QUEUED, "libzmq drops more"
     assert sum(connection.is_cut for connection in silent) == 2
     assert not other.is_cut
-
-
-def test_a_subscriber_is_stalled_when_nothing_is_acknowledged(scene: Scene) -> None:
-    peer = scene.deliver(1)
-    scene.enforce_limits(0.0)
-    scene.socket.num_sent += 1
-    for now_s in (0.5, 1.5, 2.5):  # slow, but it reads
-        scene.traffic[1] = Traffic(acknowledged=int(now_s * 100), unsent=1)
-        scene.enforce_limits(now_s)
-        assert not peer.is_stalled(now_s)
-    assert peer.is_stalled(2.5 + 1.1 * STALLED_S)
 
 
 @pytest.mark.parametrize("shares", ["key", "address"])

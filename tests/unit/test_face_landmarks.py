@@ -17,7 +17,6 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 
 NUM_FRAMES = 60
 QUIET = np.full(NUM_FRAMES, -60.0)
-NOSE_TO_MOUTH, WIDTH = 2.0, 5.0
 MOUTH = {
     2: (0, -2, 6), 13: (0, -3.99, 5.2), 14: (0, -4.01, 5.4), 78: (-2.2, -4, 4), 308: (2.2, -4, 4),
     81: (-1, -3.99, 5), 311: (1, -3.99, 5), 178: (-1, -4.01, 5), 402: (1, -4.01, 5),

@@ -18,7 +18,6 @@ from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import load_inventory
@@ -94,8 +93,3 @@ def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     opening = 5.0 * made[0][:, LOWER_LIP] / WIDEST
     assert opening.min() >= 0.0
     assert 2.5 < opening.max() <= 5.0
-
-
-def test_error_for_a_language_without_a_table() -> None:
-    with pytest.raises(UserError, match="no table for other"):
-        load_table(replace(load_inventory(), language="other"))

@@ -12,13 +12,12 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableSegmenter, segment_speech
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames
-from kouxing.services.synthesizer.lips.ferguson.table import load_table, parse_table
+from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Progress
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.ferguson.recipe import format_table
 from tests.live_streams import LiveStream
 from tests.system import DEMO
 
@@ -90,17 +89,3 @@ def test_key_frames_do_not_overshoot() -> None:
     assert smooth.max() <= 4.0
     assert (np.diff(smooth) >= -1e-12).all()
     np.testing.assert_allclose(frames.openings_at([0.0, 1.0, 2.0], smooth=True), [0.0, 4.0, 4.0])
-
-
-def test_built_in_table_is_plausible_and_round_trips() -> None:
-    assert set(TABLE.opening) == set(INVENTORY.phones)
-    assert all(TABLE.opening[phone] == 0.0 for phone in "bpm")
-    assert 1.0 < TABLE.opening["i"] < TABLE.opening["a"]
-    factors = {TABLE.level[vowel]: TABLE.influence[vowel] for vowel in INVENTORY.vowels}
-    assert sorted(factors) == [1, 2, 3, 4]
-    assert sorted(factors, key=lambda level: -factors[level]) == [1, 2, 3, 4]
-    text = format_table(TABLE, INVENTORY, ["about"])
-    assert parse_table(text, INVENTORY) == TABLE
-    for damaged in (text.replace("\na\t", "\nA\t"), text.replace("\na\t4", "\na\t9")):
-        with pytest.raises(UserError, match="damaged"):
-            parse_table(damaged, INVENTORY)

@@ -159,23 +159,6 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
     run(speak())
 
 
-def test_a_sentence_in_one_message_is_passed_on_in_real_time() -> None:
-    sentence, next_message = b"\1\0" * 16000 * 6, b"\2\0" * 320
-
-    async def speak() -> None:
-        session = FakeSession()
-        audio_input = AudioInput(session, PCM16, is_ahead=False)  # type: ignore[arg-type]
-        async with audio_input.running():
-            await audio_input.push(sentence)
-            await audio_input.push(next_message)
-            await asyncio.sleep(3.0)
-            assert 2.9 < len(session.pcm) / 32000 < 3.1
-            await asyncio.sleep(60.0)
-        assert session.pcm == sentence + next_message, "no silence for a silent microphone"
-
-    run(speak())
-
-
 def test_the_rate_limit_allows_a_burst_and_then_real_time() -> None:
     async def flood() -> None:
         limit = RateLimit()

@@ -34,18 +34,6 @@ def test_drops_sound_and_old_frames_but_not_text() -> None:
     assert num_dropped == MAX_QUEUED - NUM_FRAMES_KEPT
 
 
-def test_keeps_one_frame_at_rest() -> None:
-    queue = ViewerQueue()
-    for number in range(MAX_QUEUED // 2):
-        queue.put(MessageKind.FRAME, b"frame %d" % number)
-        queue.put(MessageKind.REST, b"rest %d" % number)
-    queue.put(MessageKind.TEXT, "one too many")
-
-    newest = range(MAX_QUEUED // 2 - NUM_FRAMES_KEPT, MAX_QUEUED // 2)
-    frames = [b"frame %d" % number for number in newest]
-    assert drain(queue) == [*frames, b"rest %d" % newest[-1], "one too many"]
-
-
 def test_text_cannot_exceed_the_limit() -> None:
     queue = ViewerQueue()
     for number in range(2 * MAX_QUEUED):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from kouxing.services.driver.head.glb_export import export_glb
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, FAPS
 from kouxing.shared.face.shapes import ARKIT, VRM
 from tests import heads
@@ -22,7 +21,7 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     export_glb(heads.load("woman"), path)
     document, binary = read_chunks(path)
     assert document["buffers"][0]["byteLength"] == len(binary)
-    return {**document, "binary": bytes(binary)}
+    return document
 
 
 def test_every_fap_and_arkit_shape_is_a_target_or_a_rotation(document: dict[str, Any]) -> None:
@@ -38,41 +37,6 @@ def test_every_fap_and_arkit_shape_is_a_target_or_a_rotation(document: dict[str,
     assert [shape["name"] for shape in shapes] == list(ARKIT.names)
     assert set(ARKIT.names) <= targets
     assert shapes[ARKIT.names.index("jawOpen")]["faps"]["open_jaw"] > 0
-
-
-def moved(document: dict[str, Any], mesh_name: str, target: str) -> dict[int, Any]:
-    """Return displacements by vertex number."""
-    mesh = next(mesh for mesh in document["meshes"] if mesh["name"] == mesh_name)
-    row = mesh["extras"]["targetNames"].index(target)
-    accessor = document["accessors"][mesh["primitives"][0]["targets"][row]["POSITION"]]
-    sparse, views = accessor["sparse"], document["bufferViews"]
-    at, count = [views[sparse[k]["bufferView"]] for k in ("indices", "values")], sparse["count"]
-    rows = np.frombuffer(document["binary"], np.uint16, count, at[0]["byteOffset"])
-    values = np.frombuffer(document["binary"], np.float32, 3 * count, at[1]["byteOffset"])
-    return dict(zip(rows.tolist(), values.reshape(-1, 3), strict=True))
-
-
-def test_arkit_shapes_move_all_parts(document: dict[str, Any]) -> None:
-    head = heads.load("woman")
-    for shape, part, point in (
-        ("jawOpen", "skin", "2.3"),
-        ("jawOpen", "teeth_lower", "9.11"),
-        ("tongueOut", "tongue", "6.1"),
-        ("eyeLookUpLeft", "eye_left", "3.5"),
-    ):
-        vertex = head.feature_points[point]
-        faps = ARKIT.basis[ARKIT.names.index(shape)]
-        wanted = (head.deform(faps) - head.vertices)[vertex]
-        shift = moved(document, part, shape)[vertex - head.part(part).vertices.start]
-        np.testing.assert_allclose(shift, wanted, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"), [("no/head.glb", "cannot write"), ("head.png", r"ends in \.glb")]
-)
-def test_rejects_a_path_that_cannot_be_written(tmp_path: Path, name: str, message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        export_glb(heads.load("woman", "coarse"), tmp_path / name)
 
 
 def read(document: dict[str, Any], binary: bytearray, accessor: int) -> np.ndarray:

@@ -59,40 +59,25 @@ def test_rotations(head: Head, name: str, point: str, about: int, axis: int, sig
     assert turned == pytest.approx(0.1, rel=0.01)
 
 
-def test_normals_are_unit_vectors_and_follow(head: Head) -> None:
-    faps = neutral_faps(open_jaw=300, raise_b_midlip=-400, head_yaw=20_000)
-    vertices, normals = head.pose(faps)
-    np.testing.assert_allclose(vertices, head.deform(faps), atol=1e-7)
-    # normals are blended at the neck and become slightly shorter
-    assert np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 0.03
-
-
-@pytest.mark.parametrize(
-    "damage", ["cut", "text", "format", "uv", "index", "part_names", "texture_skin", "huge"]
-)
+@pytest.mark.parametrize("damage", ["cut", "format", "uv", "index", "huge"])
 def test_rejects_a_damaged_file(
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     good = ASSETS / f"{DEFAULT_HEAD}.npz"
     broken = tmp_path / "broken.npz"
+    with np.load(good) as asset:
+        arrays = {key: asset[key] for key in asset.files}
+    if damage == "format":
+        arrays["format"] = np.array("kouxing head 99")
+    elif damage == "uv":
+        del arrays["uv"]
+    elif damage == "index":
+        arrays["field_vertices"] = arrays["field_vertices"] + np.uint16(40_000)
+    elif damage == "huge":
+        monkeypatch.setattr("kouxing.services.driver.head.head.MAX_BYTES", 100_000)
+    np.savez(broken, allow_pickle=False, **arrays)
     if damage == "cut":
         broken.write_bytes(good.read_bytes()[:5000])
-    elif damage == "text":
-        broken.write_text("no head")
-    else:
-        with np.load(good) as asset:
-            arrays = {key: asset[key] for key in asset.files}
-        if damage == "format":
-            arrays["format"] = np.array("kouxing head 99")
-        elif damage in ("uv", "texture_skin"):
-            del arrays[damage]
-        elif damage == "huge":
-            monkeypatch.setattr("kouxing.services.driver.head.head.MAX_BYTES", 100_000)
-        elif damage == "part_names":
-            arrays[damage] = arrays[damage][:1]
-        else:
-            arrays["field_vertices"] = arrays["field_vertices"] + np.uint16(40_000)
-        np.savez(broken, allow_pickle=False, **arrays)
     with pytest.raises(UserError, match="broken"):
         Head.load(broken)
 

@@ -14,7 +14,7 @@ from tests.lips import make_face
 
 FRAME_S = 0.02
 BROW = FAP_NUMBER["raise_l_m_eyebrow"] - 1
-PITCH, YAW = (FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw"))
+PITCH = FAP_NUMBER["head_pitch"] - 1
 QUIET_DB, SILENT_DB, STRESS_DB = -26.0, -80.0, -14.0
 
 

@@ -1,9 +1,6 @@
 """Scores of lips and the fit report, on artificial clips."""
 
-import json
-from collections.abc import Collection, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,43 +13,38 @@ from kouxing.evaluation.lips.schemes import (
     RecognizedClip,
     Scheme,
 )
-from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool, score_clip
+from kouxing.evaluation.lips.scores import LipScore, pool, score_clip
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.phones.events import Phone, SoundEvent
-from kouxing.training.visemes.recipe import save_parameters
+from kouxing.shared.phones.events import Phone
 from tests.lips import INVENTORY, clip_of, utterance
 
 START = initial_parameters()
 MOUTH = np.array(MOUTH_FAPS) - 1
 
 
-def recognized(
-    clip: LipClip, phones: Sequence[Phone] = (), events: Sequence[SoundEvent] = ()
-) -> RecognizedClip:
+def recognized(clip: LipClip, phones: list[Phone]) -> RecognizedClip:
     return RecognizedClip(
         clip=clip,
         num_frames=0,
         levels=level_track(clip.samples),
-        events={delay_s: list(events) for delay_s in DELAYS_S},
+        events={delay_s: [] for delay_s in DELAYS_S},
         inventory=INVENTORY,
-        recognized=list(phones),
+        recognized=phones,
         aligned=None,
     )
 
 
-def make_scheme(name: str, frames: NDArray[np.float64], delay_s: float = 0.05) -> Scheme:
-    return Scheme(name, delay_s, lambda _clip: frames)
-
-
 def scores_of(lips: RecognizedClip, schemes: dict[str, NDArray[np.float64]]) -> list[LipScore]:
     """Score made frames under their names."""
-    results = [score_clip(lips, make_scheme(name, frames)) for name, frames in schemes.items()]
+    results = [
+        score_clip(lips, Scheme(name, 0.05, lambda _clip, frames=frames: frames))
+        for name, frames in schemes.items()
+    ]
     return pool([score for score in results if score is not None])
 
 
@@ -97,45 +89,6 @@ def test_measures_lag_openings_and_closures() -> None:
     assert score.curves["opening"].correlation == pytest.approx(1.0)
     assert score.curves["opening"].best_lag_ms is None
     assert score.closures.real == score.openings == score.bpm == 0
-
-
-def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: str = "zh") -> None:
-    (folder / f"{name}.json").write_text(json.dumps({"language": language, "licence": "MIT"}))
-    (folder / f"{name}.csv").write_text(f"t,{column}\n0.0,1\n")
-    (folder / f"{name}.flac").write_bytes(b"")
-
-
-def test_skips_clips_used_for_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    parameters = tmp_path / "parameters.text"
-    save_parameters(START, parameters, "a test", learnt_from=["a_one"], chosen_with=["a_two"])
-    assert clips_seen(parameters) == {"a_one", "a_two"}
-    clips = tmp_path / "clips"
-    clips.mkdir()
-    for name in ("a_one", "a_two"):
-        write_clip(clips, name)
-    monkeypatch.setattr(
-        "kouxing.corpora.lip_clips.read_audio", lambda _path: np.zeros(1600, np.float32)
-    )
-    with pytest.raises(UserError, match=r"held\.txt"):
-        clips_to_score(clips, parameters)
-    (clips / "held.txt").write_text("a_one a_two a_three b_four")
-    with pytest.raises(UserError, match="trained on all clips"):
-        clips_to_score(clips, parameters)
-    write_clip(clips, "a_three", "F12_raise_l_cornerlip")
-    with pytest.raises(UserError, match="no clip measures"):
-        clips_to_score(clips, parameters)
-    write_clip(clips, "a_three")
-    write_clip(clips, "b_four", language="en")
-
-    def names(sources: Collection[str] = (), language: str | None = None) -> list[str]:
-        results = clips_to_score(clips, parameters, language=language, sources=sources)
-        return [clip.name for clip in results]
-
-    assert names() == ["a_three", "b_four"]
-    assert names(language="zh") == ["a_three"]
-    assert names(["b"]) == ["b_four"]
-    with pytest.raises(UserError, match="no clip is from c"):
-        names(["c"])
 
 
 def test_figures_need_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from prometheus_client import CollectorRegistry
 
 from kouxing.shared.metrics import WINDOW, LoadMeter, Metrics
-from kouxing.shared.prometheus import MetricsCollector
 
 
 def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
@@ -49,26 +47,3 @@ def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None
     assert last == 0.0
     busy.start_working(7.0)
     assert busy.share(9.0) == 1.0
-
-
-class Page:
-    """A page for Prometheus."""
-
-    def __init__(self) -> None:
-        self.metrics = Metrics()
-        self._registry = CollectorRegistry()
-        self._registry.register(MetricsCollector(self.metrics, "tester"))
-
-    def value(self, name: str, **labels: str) -> float | None:
-        return self._registry.get_sample_value(name, {"service": "tester", **labels})
-
-
-def test_the_page_has_histograms_of_latencies_in_seconds() -> None:
-    page = Page()
-    for value_ms in (0.4, 5.0, 5.1, 60_000.0):
-        page.metrics.observe("chunk_ms", value_ms)
-    limits = ("0.0005", "0.005", "0.01", "5.0", "+Inf")
-    counts = [page.value("kouxing_chunk_seconds_bucket", le=limit) for limit in limits]
-    assert counts == [1, 2, 3, 3, 4]
-    assert page.value("kouxing_chunk_seconds_count") == 4
-    assert page.value("kouxing_chunk_seconds_sum") == pytest.approx(60.0105)

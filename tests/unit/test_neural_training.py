@@ -80,23 +80,13 @@ def test_rejects_files_of_other_kinds_and_sizes(tmp_path: Path) -> None:
     refused("64 x 80 x 3 instead of 32 x 80 x 3; give the folder of a Whisper model of width 32")
     write_whisper(tmp_path, encoder_arrays(num_layers=1))
     refused("lacks encoder/layer_1")
-    write_whisper(tmp_path, encoder_arrays(), name="TransformerSpec")
-    refused("contains a 'TransformerSpec'")
     write_whisper(tmp_path, encoder_arrays(), version=3)
     refused("its version 3 is too old")
-    unclear = encoder_arrays()
-    unclear["encoder/conv2/bias"][3] = np.nan
-    write_whisper(tmp_path, unclear)
-    refused("conv2/bias contains values that are not finite")
-    name = "encoder/conv1/weight"
-    quantized = encoder_arrays() | {name: np.ones((32, NUM_MELS, 3), np.int8)}
-    write_whisper(tmp_path, quantized)
+    quantized = {"encoder/conv1/weight": np.ones((32, NUM_MELS, 3), np.int8)}
+    write_whisper(tmp_path, encoder_arrays() | quantized)
     refused("conv1/weight is quantized")
     (tmp_path / "model.bin").write_bytes(b"")
     refused("not a Whisper model")
-
-
-# --- augmentation
 
 
 def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
@@ -116,19 +106,15 @@ def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
 # --- the network
 
 
-def random_frames(num_frames: int, seed: int = 0) -> torch.Tensor:
-    return torch.from_numpy(
-        np.random.default_rng(seed).normal(0, 0.5, (1, num_frames, NUM_MELS)).astype(np.float32)
-    )
-
-
 def test_onnxruntime_computes_what_pytorch_does() -> None:
     torch.manual_seed(0)
     network = Network(SMALL(num_states=180, look_aheads=(2, 7))).eval()
-    frames = random_frames(2 * WINDOW + 21)
+    frames = np.random.default_rng(0).normal(0, 0.5, (2 * WINDOW + 21, NUM_MELS))
+    frames = frames.astype(np.float32)
     for layer, look_ahead in enumerate(network.shape.look_aheads):
         with torch.no_grad():
-            rows = network.log_posteriors(network(frames), layer)[0].flatten(0, 1).numpy()
+            hidden = network(torch.from_numpy(frames)[None])
+            rows = network.log_posteriors(hidden, layer)[0].flatten(0, 1).numpy()
         model = NeuralModel(
             topology=load_model().topology,
             network=onnx_of(network),
@@ -137,7 +123,7 @@ def test_onnxruntime_computes_what_pytorch_does() -> None:
             acoustic_scale=1.0,
             output_layer=layer,
         )
-        scores = model.create_stream().score(frames[0].numpy())
+        scores = model.create_stream().score(frames)
         np.testing.assert_allclose(scores, rows[max(0, look_ahead - 2) :], atol=0.1)
 
 

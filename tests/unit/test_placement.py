@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from kouxing.services.control.load import MEASURED_S, MIN_SESSIONS, RETRY_AFTER_S, WorkerLoad
+from kouxing.services.control.load import MIN_SESSIONS, RETRY_AFTER_S, WorkerLoad
 from kouxing.services.control.refusal import Refusal
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.session import OpenSession
@@ -42,31 +42,6 @@ def test_admits_as_many_sessions_as_the_measured_load_leaves_room_for(
 ) -> None:
     assert num_admitted(WorkerLoad(), 0.0) == 3, "its cost is unknown"
     assert num_admitted(loaded(num_sessions, measured), 10.0) == admitted
-
-
-def test_remembers_the_highest_cost_for_a_while_without_the_load_of_an_idle_worker() -> None:
-    load = WorkerLoad()
-    load.measure(0.05, 0.0)
-    load.add_session(2.0, paced=True)
-    load.measure(0.15, 10.0)
-    assert load.cost == pytest.approx(0.1)
-    load = loaded(4, 0.4)
-    load.measure(0.02, 12.0)
-    assert load.expected(12.0) == pytest.approx(0.4, rel=0.05)
-    load.measure(0.02, 1000.0)
-    assert load.expected(1000.0) < 0.05
-
-
-def test_unpaced_audio_leaves_room_for_live_sessions() -> None:
-    load = loaded(2, 0.1)
-    load.add_session(20.0, paced=False)
-    load.measure(1.0, 30.0)
-    assert load.has_room(30.0, MAX_LOAD)
-    load.remove_session(30.0, paced=False)
-    load.measure(0.9, 30.5)
-    assert load.has_room(30.5, MAX_LOAD), "the measured load includes the last two seconds"
-    load.measure(0.1, 30.5 + MEASURED_S)
-    assert load.expected(30.5 + MEASURED_S) == pytest.approx(0.1)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from kouxing.services.driver.poses import Poses
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
-from kouxing.shared.face.idle_motion import FADE_S, IdleMotion
+from kouxing.shared.face.idle_motion import FADE_S
 
 
 def faps(value: float) -> np.ndarray:
@@ -30,19 +30,6 @@ def test_shows_the_newest_session_until_it_closes() -> None:
         poses.remove(session)
         shown.append(poses.shown)
     assert shown == ["c", "b", "b", ""]
-
-
-def test_switching_wraps_around_and_holds_until_the_session_closes() -> None:
-    poses = poses_of("a", "b", "c")
-    shown = []
-    for step in (1, 1, -1, -1, -1):
-        poses.switch(step)
-        shown.append(poses.shown)
-    assert shown == ["a", "b", "a", "c", "b"]
-    poses.add("d", 0.0)
-    assert poses.shown == "b"
-    poses.remove("b")
-    assert poses.shown == "d"
 
 
 def test_waits_for_a_named_session() -> None:
@@ -75,25 +62,3 @@ def test_a_stalled_face_fades_to_rest_and_returns() -> None:
         came_back = poses.faps(3.0 + 0.02 * number)[0]
         assert came_back == pytest.approx(min(0.02 * number / FADE_S, 1.0), abs=0.01)
     assert not poses.is_stalled(3.5)
-
-
-def test_resting_face_moves_and_does_not_jump() -> None:
-    poses, session = Poses(idle_motion_seed=3), IdleMotion(8)
-    shown = []
-    for number in range(60 * 30):
-        now_s = number / 60.0
-        if number == 60 * 12:
-            poses.add("a", now_s)
-        if 60 * 13 < number < 60 * 18:
-            frame = np.zeros(NUM_FAPS, np.float32)
-            session.apply(frame, now_s)
-            poses.update("a", frame, now_s)
-        if number == 60 * 18:
-            poses.remove("a")
-        shown.append(poses.faps(now_s))
-    lids, head = np.array(shown)[:, 18], np.array(shown)[:, 47:50]
-    assert (lids[: 60 * 12] > 500.0).any()
-    assert (lids[60 * 19 :] > 500.0).any()
-    assert (np.ptp(head[: 60 * 12], axis=0) > 100.0).all()
-    step_deg = np.rad2deg(np.abs(np.diff(head, axis=0)).max() * 1e-5)
-    assert step_deg < 0.15  # 9 degrees per second

@@ -111,15 +111,6 @@ def test_limits_how_far_a_paced_client_is_ahead_of_the_clock() -> None:
     assert [client.send(1.0, gap_s=9.9) for _ in range(3)] == [True, True, False]
 
 
-def test_a_resumed_session_skips_audio_before_the_grid() -> None:
-    session = make_session(epoch=2, media_time=24_000)
-    assert session.read_chunk(chunk(1, media_time=9280), 0.0) is None
-    first = session.read_chunk(chunk(2, media_time=10_080), 0.0)
-    assert first is not None
-    assert first[0] == 10_240
-    assert session.read_chunk(chunk(3, media_time=10_400), 0.0) is not None
-
-
 def test_a_live_client_stalls_once_until_audio_arrives() -> None:
     session = make_session()
     for _ in range(2):

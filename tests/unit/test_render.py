@@ -11,11 +11,10 @@ import pytest
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render import renderer as render
-from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
+from kouxing.services.driver.render.renderer import BACKGROUND
 from kouxing.services.driver.render.scene import background, camera, load_head
 from kouxing.services.driver.render.window import Window
 from kouxing.shared.errors import UserError
-from tests.heads import neutral_faps
 
 
 @pytest.fixture(scope="module")
@@ -52,20 +51,6 @@ def test_framed_parts_are_in_the_picture(head: Head, framing: Framing) -> None:
     points = {"face": ("2.1", "11.1", "10.1"), "head": ("11.4",), "mouth": ("9.3", "2.1", "8.3")}
     for point in points[framing]:
         assert np.abs(seen(head, framing, point)).max() < 0.97
-
-
-def test_transparent_edges_keep_their_colors(head: Head) -> None:
-    renderer = Renderer(head, 160, 120, background=None)
-    image = renderer.draw(neutral_faps())
-    renderer.close()
-    renderer = Renderer(head, 160, 120, background=background("white"))
-    on_white = renderer.draw(neutral_faps()).astype(float)
-    renderer.close()
-    alpha = image[..., 3:].astype(float) / 255
-    assert ((alpha > 0.1) & (alpha < 0.9)).sum() > 100
-    over_white = image[..., :3] * alpha + 255 * (1 - alpha)
-    assert np.abs(over_white - on_white).mean() < 0.5
-    assert np.abs(over_white - on_white)[(alpha > 0)[..., 0]].mean() < 2
 
 
 def test_backgrounds() -> None:

@@ -19,10 +19,6 @@ from kouxing.shared.errors import UserError
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
 
-def level(samples: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(samples.astype(np.float64) ** 2)))
-
-
 @pytest.mark.slow
 def test_evaluates_a_small_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = "utt_id\tpath\tspeaker\tsplit\tseconds\tpinyin\n"

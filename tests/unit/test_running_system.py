@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import os
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -11,15 +11,6 @@ import pytest
 from kouxing.services.cli.clients import control_address
 from kouxing.services.cli.running_system import announce, find_control
 from kouxing.shared.keys import user_key
-from tests.system import ROOT
-
-ANNOUNCE = """
-import sys
-from kouxing.services.cli.running_system import announce
-with announce(sys.argv[1]):
-    print("announced", flush=True)
-    sys.stdin.read()
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -28,29 +19,21 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("KOUXING_CONTROL", raising=False)
 
 
-def announcing(control: str) -> subprocess.Popen[str]:
-    process = subprocess.Popen(
-        [sys.executable, "-c", ANNOUNCE, control],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "announced\n"
-    return process
-
-
-def test_finds_the_newest_running_system_even_if_others_were_killed() -> None:
+def test_finds_the_newest_running_system_even_if_others_were_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert find_control() == ""
-    first, second, third = (announcing(f"tcp://127.0.0.1:{port}") for port in (1, 2, 3))
-    assert find_control() == "tcp://127.0.0.1:3"
-    third.kill()  # leaves its file behind
-    third.communicate()
-    assert find_control() == "tcp://127.0.0.1:2"
-    second.communicate()  # the end of its input
-    assert control_address("") == "tcp://127.0.0.1:1"
-    first.communicate()
+    with ExitStack() as stack:
+        for number in (1, 2):
+            monkeypatch.setattr(os, "getpid", lambda number=number: number)
+            stack.enter_context(announce(f"tcp://127.0.0.1:{number}"))
+            (folder,) = tmp_path.iterdir()
+            os.utime(folder / str(number), (number, number))
+        assert find_control() == "tcp://127.0.0.1:2"
+        killed = folder / "3"  # nobody holds its lock
+        killed.write_text("tcp://127.0.0.1:3", encoding="utf-8")
+        assert find_control() == "tcp://127.0.0.1:2"
+        assert not killed.exists()
     assert find_control() == ""
 
 

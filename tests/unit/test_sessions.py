@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from kouxing.services.control.placement import UNPACED_AUDIO, Placement
+from kouxing.services.control.placement import Placement
 from kouxing.services.control.refusal import Refusal
 from kouxing.services.control.registry import Registry
 from kouxing.services.control.session_record import SessionRecord
@@ -170,20 +170,6 @@ def test_limits_the_sessions_in_total_and_per_key() -> None:
         system.open()
 
 
-def test_audio_that_is_not_paced_has_its_own_socket(system: System) -> None:
-    system.lose("recognizer-1")
-    for instance in ("recognizer-2", "recognizer-3"):
-        heartbeat = worker("recognizer", instance)
-        unpaced = {UNPACED_AUDIO: f"tcp://{instance}:unpaced"}
-        system.add(replace(heartbeat, endpoints={**heartbeat.endpoints, **unpaced}))
-    record = system.open(paced=False)
-    first = record.workers["audio"]
-    assert record.opened_message("").audio == f"tcp://{first}:unpaced"
-    system.lose(first)
-    assert system.sessions.move(record, 1.0)
-    assert record.moved_message().audio == f"tcp://{record.workers['audio']}:unpaced"
-
-
 def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
     record = system.open(face=FaceSettings(shapes=["vrm", "vrm"]))
     assert record.start_message(0.0).face.lip_model == "dynamic-visemes", (
@@ -248,20 +234,6 @@ def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
     assert record.start_message(1.0).media_time == max(32_000, reported)
     assert system.sessions.record_started(record, last, 0) == set()
     assert record.waiting_for == set()
-
-
-def test_a_worker_wrongly_declared_lost_keeps_its_sessions(system: System) -> None:
-    record = system.open()
-    record.announced, record.waiting_for = True, set()
-    system.lose("recognizer-1")
-    assert not system.sessions.move(record, 1.0)
-    assert system.sessions.pending() == [record]
-    assert "recognizer-1" not in system.sessions.participants(record)
-    system.add(worker("recognizer", "recognizer-1"))
-    assert system.registry.reclaim_lost("recognizer-1", Peer(b"recognizer-1"))
-    assert system.sessions.reinstate_worker("recognizer-1") == []
-    assert (record.epoch, system.sessions.pending()) == (1, [])
-    assert "recognizer-1" in system.sessions.participants(record)
 
 
 def test_services_become_silent_in_the_order_of_their_heartbeats(system: System) -> None:

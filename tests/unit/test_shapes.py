@@ -18,13 +18,6 @@ def weights_by_name(faps: np.ndarray, shapes: ShapeSet = ARKIT) -> dict[str, flo
     return dict(zip(shapes.names, shapes.weights(faps).tolist(), strict=True))
 
 
-def test_zero_faps_give_zero_weights() -> None:
-    rest = np.zeros(NUM_FAPS, np.float32)
-    assert not ARKIT.weights(rest).any()
-    np.testing.assert_array_equal(OCULUS.weights(rest), np.eye(15, dtype=np.float32)[0])
-    assert not VRM.weights(rest).any()
-
-
 def test_recovers_single_shapes() -> None:
     weights = np.array([ARKIT.weights(faps) for faps in ARKIT.basis])
     assert weights.argmax(axis=1).tolist() == [*range(len(ARKIT.names))]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.known_text import characters_of, match_syllables
+from kouxing.shared.phones.known_text import characters_of
 from kouxing.shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
 
 MANDARIN = load_inventory("mandarin")
@@ -47,17 +47,6 @@ def test_an_initial_is_final_once_no_vowel_can_follow() -> None:
     assert (initial.text, initial.final) == ("d", True)
 
 
-def test_joins_two_syllables_after_a_revision() -> None:
-    track = SyllableTrack(MANDARIN)
-    for index, symbol in enumerate(("a", "ou", "sil")):
-        track.update(phone(index, symbol, final=False))
-    withdrawn, joined = track.update(phone(0, "m", final=False))
-    assert (withdrawn.index, withdrawn.duration_s, withdrawn.final) == (1, 0.0, True)
-    assert joined.text == "mou"
-    (alone,) = track.update(phone(1, "sil", duration_s=0.0))  # the vowel is withdrawn
-    assert alone.text == "m"
-
-
 def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
     text = characters_of("四是四，十是十。十四是十四，四十是四十！" * 4, MANDARIN)
     track = SyllableTrack(MANDARIN, text)
@@ -77,16 +66,6 @@ def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
     expected = [character for number, (character, _) in enumerate(text) if number % 10 != 7]
     right = sum(a == b for a, b in zip(shown, expected, strict=True))
     assert right >= 0.9 * len(expected), shown
-
-
-def test_spells_syllables_that_are_not_in_the_text() -> None:
-    places = match_syllables([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")])
-    assert places == [None, 0, 1]
-    track = SyllableTrack(MANDARIN, characters_of("好。", MANDARIN))
-    texts: dict[int, str] = {}
-    for index, symbol in enumerate(("n", "i", "h", "ao")):
-        texts |= {new.index: new.text for new in track.update(phone(index, symbol))}
-    assert texts == {0: "ni", 2: "好"}
 
 
 @given(

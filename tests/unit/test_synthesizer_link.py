@@ -57,16 +57,6 @@ def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> 
     assert {message.epoch for message in (resume, speech, *rest)} == {2}
 
 
-def test_only_one_frame_to_resume_after_is_sent() -> None:
-    link = Link()
-    link.send_all(progress(1.0))
-    link.acknowledge_up_to(1, frame=40)
-    link.connect_to(2)
-    assert link.acknowledge_up_to(1, epoch=2) == []
-    sent = link.connect_to(3)
-    assert [isinstance(m, Progress) and m.newest_frame is not None for m in sent] == [True, False]
-
-
 def test_forgets_messages_before_an_interruption() -> None:
     link = Link()
     link.send_all(Speech(media_time=0, active=True), progress(1.0))

@@ -15,7 +15,6 @@ import pytest
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.alignment import align_text, spoken
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -110,11 +109,3 @@ def test_opens_the_mouth(toy: PhoneInventory, path: Path) -> None:
     jaw = np.array([faps[2] for _, faps in frames])  # FAP 3, at 50 Hz
     assert jaw[round(50 * a.onset_s) : round(50 * (a.onset_s + a.duration_s))].max() > 200
     assert not jaw[:10].any()  # before the speech
-
-
-@pytest.mark.usefixtures("toy")
-def test_rejects_a_model_whose_language_is_not_installed(path: Path, tmp_path: Path) -> None:
-    other = {"language": np.array("klingon")}
-    np.savez(tmp_path / "toy.npz", allow_pickle=False, **{**read_archive(path).arrays, **other})
-    with pytest.raises(UserError, match=r"toy\.npz: language 'klingon' is not .*: mandarin, toy"):
-        load_model(tmp_path / "toy.npz")

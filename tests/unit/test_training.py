@@ -13,54 +13,14 @@ from kouxing.corpora.speech_corpus import (
     read_corpus,
 )
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.front_end.features import NUM_BANDS
 from kouxing.services.recognizer.search.forced_path import (
     utterance_graph,
     viterbi_path,
 )
 from kouxing.shared.errors import UserError
-from kouxing.training.gmm.estimation import (
-    Copy,
-    FrameSet,
-    estimate,
-    first_estimate,
-    split,
-)
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
-from kouxing.training.training_set import Example
 from tests.languages import MANDARIN, SIL
-
-INDEX = MANDARIN.index
-FIRST_STATE = np.arange(len(MANDARIN) + 1) * 3
-SYLLABLES = ("ma", "ti", "sou", "lan")
-
-
-def spectrum(phone: str) -> np.ndarray:
-    rng = np.random.default_rng(INDEX[phone])
-    return np.concatenate([[14.0], rng.normal(12, 3, NUM_BANDS)])
-
-
-def made_up_speech(num: int, seed: int = 0) -> list[Example]:
-    """Each phone has a spectrum of its own; silence is weak."""
-    rng = np.random.default_rng(seed)
-    examples = []
-    for _ in range(num):
-        names = [str(name) for name in rng.choice(SYLLABLES, 3)]
-        phones = [phone for name in names for phone in (name[0], name[1:])]
-        rows = [np.full((15, 41), 7.0)]
-        rows += [np.tile(spectrum(phone), (int(rng.integers(6, 14)), 1)) for phone in phones]
-        rows.append(np.full((15, 41), 7.0))
-        log_mel = np.concatenate(rows)
-        examples.append(
-            Example(
-                log_mel=(log_mel + rng.normal(0, 0.7, log_mel.shape)).astype(np.float16),
-                phones=tuple(INDEX[phone] for phone in phones),
-                syllables=(2, 2, 2),
-                weight=1.0,
-            )
-        )
-    return examples
 
 
 @pytest.fixture(autouse=True)
@@ -208,29 +168,6 @@ def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
     )
     assert found == pytest.approx(best, rel=1e-4)
     assert len(path) == num_frames
-
-
-# --- estimation
-
-
-def frame_set(num: int) -> FrameSet:
-    copies = [Copy(example, 1.0, example.log_mel) for example in made_up_speech(num)]
-    return FrameSet.build(copies, MANDARIN, FIRST_STATE, np.zeros(13, np.float32), 1)
-
-
-def test_the_likelihood_never_falls() -> None:
-    frames = frame_set(30)
-    hmm = first_estimate(frames, FIRST_STATE)
-    before = frames.realign(hmm)
-    for num_mixtures in (1, 2, 4):
-        if num_mixtures > 1:
-            hmm = split(hmm, frames, num_mixtures)
-            before = frames.realign(hmm)
-        for _ in range(6):
-            hmm = estimate(frames, hmm)
-            now = frames.realign(hmm)
-            assert now >= before - 1e-3
-            before = now
 
 
 # --- whole recipes

@@ -161,20 +161,6 @@ def frame(value: float) -> np.ndarray:
     return faps
 
 
-def test_images_follow_media_time_at_any_frame_rate(renderer: Renderer, tmp_path: Path) -> None:
-    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
-    recording.add_sound(0, np.zeros(16000, np.float32))
-    for number in range(31):
-        recording.add_frame(number / 30, frame(number))
-    while recording.step():
-        pass
-    recording.close()
-    assert recording.num_images == 26
-    assert recording.duration_s == pytest.approx(26 / 25)
-    with av.open(str(tmp_path / "a.mp4")) as film:
-        assert sum(1 for _ in film.decode(video=0)) == 26
-
-
 def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)

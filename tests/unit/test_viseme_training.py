@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from kouxing.corpora.lip_clips import part_of, read_clips
+from kouxing.corpora.lip_clips import read_clips
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
@@ -17,7 +17,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.visemes.fit import estimate, frames_of
-from kouxing.training.visemes.recipe import train_visemes
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
 
 INVENTORY = load_inventory()
@@ -103,23 +102,3 @@ def test_rejects_bad_clips(about: str, table: str, message: str, tmp_path: Path)
     (tmp_path / "bad.csv").write_text(table)
     with pytest.raises(UserError, match=f"the clip bad: .*{message}"):
         read_clips(tmp_path)
-
-
-def test_a_rule_assigns_clips_to_parts(tmp_path: Path) -> None:
-    names = [f"clip_{k}" for k in range(40)]
-    free, closed = ([part_of(name, may_train=free) for name in names] for free in (True, False))
-    assert {"train", "choice", "held"} == set(free)
-    assert {"choice", "held"} == set(closed)
-    assert [k for k in range(40) if free[k] == "held"] == [
-        k for k in range(40) if closed[k] == "held"
-    ]
-    header, row = "t,ok,F3_open_jaw", "0.5,1,10"
-    for name in names[:12]:
-        write_clip(tmp_path, name, "zh", header, row, license_name="academic use only")
-    assert "train" not in {clip.part for clip in read_clips(tmp_path)}
-    with pytest.raises(UserError, match="--any-license"):
-        train_visemes(tmp_path, tmp_path / "out.json")
-    clips = read_clips(tmp_path, any_license=True)
-    assert {clip.name: clip.part for clip in clips} == {
-        name: part for name, part in zip(names, free, strict=True) if name in names[:12]
-    }

@@ -4,25 +4,8 @@ import pytest
 from kouxing.services.recognizer.front_end.features import NUM_BANDS
 from kouxing.services.recognizer.front_end.vtln import (
     REFERENCE_HZ,
-    VOICED_STRENGTH,
-    PitchTracker,
     VocalTractNormalizer,
 )
-
-FORMANTS_HZ = (600.0, 1500.0, 2500.0)
-
-
-def vowel(pitch_hz: float, seconds: float = 1.0, level: float = 0.1) -> np.ndarray:
-    """Return glottal pulses through resonances, 80 Hz wide."""
-    num_samples = int(16_000 * seconds)
-    pulses = np.zeros(num_samples)
-    pulses[np.arange(0, num_samples, 16_000 / pitch_hz).astype(int)] = 1.0
-    time_s = np.arange(800) / 16_000
-    ring = np.zeros(800)
-    for index, hz in enumerate(FORMANTS_HZ):
-        ring += np.exp(-np.pi * 80 * time_s) * np.sin(2 * np.pi * hz * time_s) / (1 + index)
-    sound = np.convolve(pulses, ring)[:num_samples]
-    return np.asarray(level * sound / np.abs(sound).max(), dtype=np.float32)
 
 
 def bands_with_a_peak(num_frames: int, peak: int) -> np.ndarray:
@@ -43,14 +26,6 @@ def center_hz(band: float) -> float:
     low, high = (1127 * np.log1p(hz / 700) for hz in (40.0, 7600.0))
     mel = low + (1 + band) * (high - low) / (NUM_BANDS + 1)
     return float(700 * np.expm1(mel / 1127))
-
-
-@pytest.mark.parametrize(("pitch_hz", "level"), [(80.0, 0.5), (160.0, 0.02), (330.0, 0.5)])
-def test_tracks_the_pitch_of_a_vowel(pitch_hz: float, level: float) -> None:
-    measured_hz, strength = PitchTracker().accept_waveform(vowel(pitch_hz, level=level))
-    np.testing.assert_allclose(measured_hz[4:], pitch_hz, rtol=0.03)
-    assert (strength[4:] > VOICED_STRENGTH).all()
-    assert strength.max() <= 1.0
 
 
 def test_warps_a_low_voice_more_over_time() -> None:
