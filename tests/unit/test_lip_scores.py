@@ -13,7 +13,7 @@ from kouxing.evaluation.lips.schemes import (
     RecognizedClip,
     Scheme,
 )
-from kouxing.evaluation.lips.scores import LipScore, pool, score_clip
+from kouxing.evaluation.lips.scores import ClipScore, LipScore, pool, score_clip
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
@@ -41,11 +41,11 @@ def recognized(clip: LipClip, phones: list[Phone]) -> RecognizedClip:
 
 def scores_of(lips: RecognizedClip, schemes: dict[str, NDArray[np.float64]]) -> list[LipScore]:
     """Score made frames under their names."""
-    results = [
-        score_clip(lips, Scheme(name, 0.05, lambda _clip, frames=frames: frames))
-        for name, frames in schemes.items()
-    ]
-    return pool([score for score in results if score is not None])
+
+    def score(name: str) -> ClipScore | None:
+        return score_clip(lips, Scheme(name, 0.05, lambda _clip: schemes[name]))
+
+    return pool([result for name in schemes if (result := score(name)) is not None])
 
 
 def test_measures_lag_openings_and_closures() -> None:

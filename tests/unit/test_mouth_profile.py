@@ -97,7 +97,7 @@ def test_the_adapted_model_computes_the_formula() -> None:
 def test_rejects_too_little_speech() -> None:
     num_positions = 499
     speech = Observations(
-        known_s=0.02 * np.arange(num_positions),
+        known_s=0.02 * np.arange(num_positions, dtype=np.float64),
         predicted=np.zeros((num_positions, SHAPE[1], NUM_FAPS), np.float32),
         hidden=np.zeros((num_positions, SHAPE[0]), np.float32),
         tracked=np.zeros((num_positions, SHAPE[1], NUM_FAPS)),

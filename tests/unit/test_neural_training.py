@@ -109,8 +109,8 @@ def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
 def test_onnxruntime_computes_what_pytorch_does() -> None:
     torch.manual_seed(0)
     network = Network(SMALL(num_states=180, look_aheads=(2, 7))).eval()
-    frames = np.random.default_rng(0).normal(0, 0.5, (2 * WINDOW + 21, NUM_MELS))
-    frames = frames.astype(np.float32)
+    rng = np.random.default_rng(0)
+    frames = rng.normal(0, 0.5, (2 * WINDOW + 21, NUM_MELS)).astype(np.float32)
     for layer, look_ahead in enumerate(network.shape.look_aheads):
         with torch.no_grad():
             hidden = network(torch.from_numpy(frames)[None])
