@@ -56,6 +56,7 @@ def test_the_driver_is_restarted(system: System) -> None:
     before = drivers()
     system.process("driver").kill()
     wait_until(lambda: drivers() - before)
+    wait_until(lambda: "driver is running again" in system.console.getvalue())
 
 
 def test_a_wrong_configuration_ends_the_wait(tmp_path: Path) -> None:
