@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import groupby
 
 import fontpkg
 from PIL import ImageFont
@@ -29,6 +30,12 @@ def font_for(text: str, size_px: float) -> ImageFont.FreeTypeFont:
     """Return a font for a text; Chinese characters are boxes if no font has them."""
     chinese = _chinese_font(size_px) if _is_chinese(text) else None
     return chinese or ImageFont.truetype(fontpkg.path("Noto Sans"), size_px)
+
+
+def text_runs(text: str, size_px: float) -> list[tuple[str, ImageFont.FreeTypeFont]]:
+    """Split a text into parts with one font each: not every Chinese font has tone marks."""
+    runs = ("".join(letters) for _, letters in groupby(text, _is_chinese))
+    return [(run, font_for(run, size_px)) for run in runs]
 
 
 def _is_chinese(text: str) -> bool:

@@ -1,7 +1,8 @@
 """``kouxing lips``: the 2-D mouth of a sound, as a video, a picture of key frames, or a table.
 
 The method is that of Zhang et al. 2021. A text and its timing give key frames of the opening R.
-Interpolation gives R(t), and R(t) gives the contour.
+Interpolation gives R(t), and R(t) gives the contour. The paper's mouth has one width. Here, another
+lip model gives the width, so that the mouth is round for u, ü and o.
 """
 
 from __future__ import annotations
@@ -18,17 +19,23 @@ from numpy.typing import NDArray
 
 from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.inputs import read_mono_16k
-from kouxing.services.cli.options import Timing
+from kouxing.services.cli.options import DrawnLips, Timing
 from kouxing.services.cli.spoken_text import mismatch_message, read_text
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
-from kouxing.services.recording_chain import recognize_recording
+from kouxing.services.recording_chain import (
+    analyze_recording,
+    animate_recording,
+    recognize_recording,
+)
+from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.ferguson import drawing
-from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, rounded_contour
 from kouxing.services.synthesizer.lips.ferguson.key_frames import (
     KeyFrames,
     anchors_of,
@@ -36,22 +43,26 @@ from kouxing.services.synthesizer.lips.ferguson.key_frames import (
 )
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 from kouxing.shared.terminal import open_progress, plural, print_message, write_error, write_text
 
+Array = NDArray[np.float64]
 Span = tuple[float, float, str]  # start and end in seconds, and the label
 
 DEFAULT_NUM_POINTS = 21
 FRAME_RATE_HZ = 25.0
-CSV_COLUMNS = ("time_s", "opening", "line", "point", "x", "y")
+CSV_COLUMNS = ("time_s", "opening", "line", "point", "x", "y", "phone")
 _VIDEO_SIZE_PX = (640, 480)
 _MOUTHS_PER_ROW, _MOUTH_PX = 8, 150.0
 _MAX_MOUTHS = 400  # in one picture
+_STRETCH = slice(5, 7)  # FAP 6 and 7, of the corners
 _BLOCK_FRAMES = 250  # number of contours to compute at once
 
 
@@ -63,15 +74,28 @@ class _Mouth:
     phones: Sequence[Phone]
     syllables: Sequence[TimedSyllable]
     key_frames: KeyFrames
+    widths: tuple[Array, Array]  # times, and the width at each, relative to the mouth at rest
     silence: str
     smooth: bool  # whether the velocity of the opening is continuous
     num_points: int  # of each line of the contour, in a table
 
-    def sample(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the times of the video's frames, and the opening at each of them."""
+    def widths_at(self, times_s: Sequence[float] | Array) -> Array:
+        """Return the width at times (n,), relative to the mouth at rest."""
+        return np.interp(times_s, *self.widths)
+
+    def sample(self) -> tuple[Array, Array, Array]:
+        """Return the times of the video's frames, and the opening and the width at each of them."""
         num_frames = int(len(self.samples) / MEDIA_RATE_HZ * FRAME_RATE_HZ) + 1
         times_s = np.arange(num_frames) / FRAME_RATE_HZ
-        return times_s, self.key_frames.openings_at(times_s, smooth=self.smooth)
+        openings = self.key_frames.openings_at(times_s, smooth=self.smooth)
+        return times_s, openings, self.widths_at(times_s)
+
+    @property
+    def symbols(self) -> list[Span]:
+        """The phones as labels."""
+        return [
+            (phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in self.phones
+        ]
 
 
 def draw_mouth(
@@ -79,6 +103,7 @@ def draw_mouth(
     text: str | None,
     output: Path,
     *,
+    lips: DrawnLips = DrawnLips.VISEMES,
     timing: Timing | None = None,
     smooth: bool = False,
     num_points: int | None = None,
@@ -90,7 +115,7 @@ def draw_mouth(
     ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with sound, and
     ``.csv`` has the contour of every frame with ``num_points`` for each line. Without a text, the
     model in the folder ``speech_to_text`` recognizes it, or else phones are recognized. With
-    ``smooth``, the velocity of the opening is continuous at key frames.
+    ``smooth``, the velocity of the opening is continuous at key frames. ``lips`` gives the width.
 
     Raises ``UserError`` if a file cannot be read or written, or the options do not fit each other.
     """
@@ -115,6 +140,8 @@ def draw_mouth(
     with open_progress() as progress:
         with_progress = partial(progress.track, description="timing")
         timed = _time_phones(source, samples, transcript, timing, with_progress)
+        with_progress = partial(progress.track, description="finding the lips")
+        widths = _widths(lips, samples, timed, with_progress)
     phones = spoken(timed, inventory)
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
@@ -123,6 +150,7 @@ def draw_mouth(
         phones=phones,
         syllables=write_syllables(phones, transcript, inventory),
         key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
+        widths=widths,
         silence=inventory.silence,
         smooth=smooth,
         num_points=num_points or DEFAULT_NUM_POINTS,
@@ -151,6 +179,25 @@ def _time_phones(
     return alignment.phones
 
 
+def _widths(
+    lips: DrawnLips,
+    samples: NDArray[np.float32],
+    timed: Sequence[Phone],
+    with_progress: WithProgress,
+) -> tuple[Array, Array]:
+    """Return times, and the distance of the corners at each, relative to the mouth at rest."""
+    if lips is DrawnLips.FERGUSON:
+        return np.zeros(1), np.ones(1)
+    model = load_live_model()
+    predictor = lip_predictor_for(model) if lips is DrawnLips.LEARNT else None
+    recording = analyze_recording(model, samples, predictor, timed, with_progress)
+    frames = animate_recording(
+        recording, load_lip_model(name=lips), SynthesizerConfig(lips=lips, expressiveness=1.0)
+    )
+    stretch = [faps[_STRETCH].sum() / FAP_UNITS_PER_FAPU for _, faps in frames]
+    return np.array([time_s for time_s, _ in frames]), 1.0 + np.array(stretch)
+
+
 def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
     """Return the label of each syllable: its characters, if they can be drawn, and its spelling."""
     texts = [item.text for item in mouth.syllables if item.text != item.spelling]
@@ -173,14 +220,19 @@ def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledM
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
     anchors = anchors_of(mouth.phones, mouth.silence) or [(0.0, mouth.silence)]
+    middles_s = {phone.onset_s: phone.onset_s + phone.duration_s / 2 for phone in mouth.phones}
+    widths = mouth.widths_at([middles_s.get(time_s, time_s) for time_s, _ in anchors])
     return [
         drawing.LabeledMouth(
             time_s,
             float(opening),
             "" if phone == mouth.silence else phone,
             syllables.get(time_s, ""),
+            float(width),
         )
-        for (time_s, phone), opening in zip(anchors, mouth.key_frames.openings, strict=True)
+        for (time_s, phone), opening, width in zip(
+            anchors, mouth.key_frames.openings, widths, strict=True
+        )
         if time_s >= 0.0
     ]
 
@@ -203,19 +255,16 @@ def _write_picture(output: Path, mouth: _Mouth) -> str:
 
 def _write_video(output: Path, mouth: _Mouth) -> str:
     labels = _labels(mouth, are_pixels=True)
-    symbols = [
-        (phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in mouth.phones
-    ]
-    times_s, openings = mouth.sample()
-    frames = list(zip(times_s.tolist(), openings.tolist(), strict=True))
+    symbols = mouth.symbols
+    frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
         open_progress() as progress,
     ):
         writer.write_sound(mouth.samples)
-        for time_s, opening in progress.track(frames, description="drawing"):
+        for time_s, opening, width in progress.track(frames, description="drawing"):
             moment = drawing.LabeledMouth(
-                time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels)
+                time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels), width
             )
             writer.write_image(drawing.rasterize(drawing.image(moment, *_VIDEO_SIZE_PX)))
     return f"{plural(len(frames), 'image')}, {plural(len(mouth.phones), 'phone')}"
@@ -228,19 +277,21 @@ def _label_at(time_s: float, spans: Sequence[Span]) -> str:
 
 
 def _write_csv(output: Path, mouth: _Mouth) -> str:
-    times_s, openings = mouth.sample()
+    times_s, openings, widths = mouth.sample()
+    symbols = mouth.symbols
     try:
         with output.open("w", encoding="utf-8", newline="") as file:
             table = csv.writer(file, lineterminator="\n")
             table.writerow(CSV_COLUMNS)
             for first in range(0, len(times_s), _BLOCK_FRAMES):
                 block = slice(first, first + _BLOCK_FRAMES)
-                contours = contour(openings[block], mouth.num_points)
+                contours = rounded_contour(openings[block], widths[block], mouth.num_points)
                 for time_s, opening, lines in zip(
                     times_s[block], openings[block], contours, strict=True
                 ):
+                    at, phone = f"{time_s:.3f}", _label_at(time_s, symbols)
                     table.writerows(
-                        (f"{time_s:.3f}", f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}")
+                        (at, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
                         for name, line in zip(LINES, lines, strict=True)
                         for number, (x, y) in enumerate(line)
                     )

@@ -15,6 +15,7 @@ from kouxing.services.cli.options import (
     AudioTrack,
     CaptionKind,
     CurveForm,
+    DrawnLips,
     ExportOptions,
     HeadName,
     MouthFile,
@@ -287,6 +288,13 @@ def lips(
             " phones are recognized.",
         ),
     ],
+    lips: Annotated[
+        DrawnLips,
+        typer.Option(
+            help="Lip model that gives the width of the mouth, which is round for u, ü and o."
+            " ferguson: always the same width."
+        ),
+    ] = DrawnLips.VISEMES,
     timing: Annotated[
         Timing | None,
         typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
@@ -320,6 +328,7 @@ def lips(
         audio,
         text[0] if text else None,
         Path(output),
+        lips=lips,
         timing=timing,
         smooth=smooth,
         num_points=points,

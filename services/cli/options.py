@@ -70,6 +70,14 @@ class CaptionKind(StrEnum):
     PHONES = "phones"
 
 
+class DrawnLips(StrEnum):
+    """What gives the width of a mouth that is drawn in two dimensions."""
+
+    VISEMES = "dynamic-visemes"
+    LEARNT = "learnt"
+    FERGUSON = "ferguson"  # always the same width, as in the paper
+
+
 class Timing(StrEnum):
     """Method that times the phones of a text."""
 

@@ -12,7 +12,7 @@ import pytest
 
 from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
 from kouxing.services.cli.offline import lips
-from kouxing.services.cli.options import Timing
+from kouxing.services.cli.options import DrawnLips, Timing
 from kouxing.services.driver import picture
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
 from kouxing.shared.errors import UserError
@@ -25,19 +25,38 @@ TEXT = "四是四，十是十，十四是十四，四十是四十。"
 
 def test_table_holds_the_contour_of_every_frame(tmp_path: Path) -> None:
     output = tmp_path / "mouth.csv"
-    draw_mouth(SOUND, TEXT, output, num_points=5)
+    draw_mouth(SOUND, TEXT, output, num_points=5, lips=DrawnLips.FERGUSON)
     with output.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == CSV_COLUMNS
     assert len(rows) == NUM_FRAMES * len(LINES) * 5
     last = rows[-1]
-    assert (last["line"], last["point"]) == ("outer lower", "4")
+    assert (last["line"], last["point"], last["phone"]) == ("outer lower", "4", "")
+    assert {"s", "ii", "sh", "iii"} <= {row["phone"] for row in rows}
     widest = max(rows, key=lambda row: float(row["opening"]))
     first = next(row for row in rows if row["time_s"] == widest["time_s"])
     at = rows.index(first)
     heights = [float(row["y"]) for row in rows[at : at + 20]]
     expected = contour([float(widest["opening"])], 5)[0, :, :, 1].ravel()
     np.testing.assert_allclose(heights, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("lips", list(DrawnLips))
+def test_only_the_mouth_of_the_paper_does_not_round(lips: DrawnLips, tmp_path: Path) -> None:
+    output = tmp_path / "mouth.csv"
+    sound = SOUND.with_name("hello-female.wav")
+    text = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
+    draw_mouth(sound, text, output, lips=lips, timing=Timing.ALIGN, num_points=2)
+    with output.open(newline="") as file:
+        corners = [row for row in csv.DictReader(file) if row["line"] == "outer upper"]
+    narrowest = {
+        phone: min(1 - 2 * float(row["x"]) for row in corners[::2] if row["phone"] == phone)
+        for phone in ("ei", "ou", "uo")
+    }
+    if lips is DrawnLips.FERGUSON:
+        assert narrowest == {"ei": 1, "ou": 1, "uo": 1}
+    else:
+        assert max(narrowest["ou"], narrowest["uo"]) < narrowest["ei"] - 0.05
 
 
 def test_picture_and_svg_show_every_key_frame(tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ LINES = {
 }
 _ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without travel
 _MOUTH_WIDTHS_PER_MNS = 0.39  # of the head "woman"
+_WIDTH_RANGE = (0.6, 1.2)  # of rounded and spread lips
 _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
 
 
@@ -128,6 +129,21 @@ def contour(openings: ArrayLike, num_points: int = 41) -> Array:
         x = np.linspace(line.travel.x[0], line.travel.x[-1], num_points)
         points[:, row, :, 0] = x
         points[:, row, :, 1] = line.heights(x, openings)
+    return points
+
+
+def rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int = 41) -> Array:
+    """Return the lip contour for openings R and widths (num_frames,), like :func:`contour`.
+
+    A width is the distance of the corners relative to the mouth at rest. If they come closer by w,
+    the opening narrows by w squared and keeps its area, as rounded lips do; x counts mouth widths
+    at rest. This is not in the paper.
+    """
+    width = np.clip(widths, *_WIDTH_RANGE)
+    points = contour(np.minimum(openings / width**2, MAX_OPENING), num_points)
+    for row, name in enumerate(LINES):
+        factor = width**2 if name.startswith("inner") else width
+        points[:, row, :, 0] = 0.5 + (points[:, row, :, 0] - 0.5) * factor[:, None]
     return points
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from kouxing.services.synthesizer.lips.ferguson.contour import contour
-from kouxing.shared.fonts import font_for
+from kouxing.services.synthesizer.lips.ferguson.contour import rounded_contour
+from kouxing.shared.fonts import text_runs
 
 Array = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
@@ -31,7 +31,7 @@ _TONGUE_BELOW_TEETH, _TONGUE_HALF_WIDTH = 0.045, 0.27
 _LINE_PX_PER_WIDTH = 0.006
 # bounding box of a mouth at any opening, mouth widths
 WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
-_ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # Pillow's names
+_ANCHORS = {"start": 0.0, "middle": 0.5, "end": 1.0}  # share of a label left of its x
 _SUPERSAMPLING = 3
 
 
@@ -66,9 +66,16 @@ class Drawing:
     labels: list[Label] = field(default_factory=list)
 
 
-def mouth(opening: float, center_px: tuple[float, float], width_px: float) -> list[Outline]:
-    """Draw a mouth with opening R, 0 to 5; ``width_px`` is the distance of the corners."""
-    outer_upper, inner_upper, inner_lower, outer_lower = contour([opening], _POINTS_OF_LINE)[0]
+def mouth(
+    opening: float, center_px: tuple[float, float], width_px: float, width: float = 1.0
+) -> list[Outline]:
+    """Draw a mouth with opening R, 0 to 5.
+
+    ``width_px`` is the distance of the corners at rest, and ``width`` their distance relative to
+    it: less than 1 if the lips are rounded.
+    """
+    lines = rounded_contour([opening], [width], _POINTS_OF_LINE)[0]
+    outer_upper, inner_upper, inner_lower, outer_lower = lines
     x, top, bottom = inner_upper[:, 0], inner_upper[:, 1], inner_lower[:, 1]
     # the upper teeth do not move; the lips uncover them
     edge = _TEETH_EDGE + _TEETH_ROUNDNESS * ((x - 0.5) / _TEETH_HALF_WIDTH) ** 2
@@ -119,6 +126,7 @@ class LabeledMouth:
     opening: float  # R
     phone: str
     syllable: str = ""  # a syllable that starts here
+    width: float = 1.0  # relative to the mouth at rest
 
 
 def strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> Drawing:
@@ -141,7 +149,7 @@ def strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> 
             label = Label(labeled.syllable, middle, top + 1.4 * text_px, 1.2 * text_px)
             drawing.labels.append(label)
         center = (middle, mouth_top + HIGHEST * mouth_px)
-        drawing.outlines.extend(mouth(labeled.opening, center, mouth_px))
+        drawing.outlines.extend(mouth(labeled.opening, center, mouth_px, labeled.width))
         below = mouth_top + mouth_height_px
         drawing.labels.append(Label(labeled.phone, middle, below + 1.1 * text_px, text_px))
         time = f"{labeled.time_s:.2f} s"
@@ -157,7 +165,7 @@ def image(labeled: LabeledMouth, width_px: int, height_px: int) -> Drawing:
     text_px = 0.06 * height_px
     mouth_px = min(width_px / WIDTH, (height_px - 3.0 * text_px) / (HIGHEST - LOWEST))
     center = (0.5 * width_px, 0.5 * text_px + HIGHEST * mouth_px)
-    drawing.outlines.extend(mouth(labeled.opening, center, mouth_px))
+    drawing.outlines.extend(mouth(labeled.opening, center, mouth_px, labeled.width))
     below = height_px - text_px
     drawing.labels.append(
         Label(f"{labeled.time_s:.2f} s", text_px, below, text_px, _FAINT_INK, "start")
@@ -212,8 +220,11 @@ def rasterize(drawing: Drawing) -> UInt8:
             width = max(1, round(outline.line_px * _SUPERSAMPLING))
             pen.line(points, fill=outline.color, width=width, joint="curve")
     for label in drawing.labels:
-        font = font_for(label.text, max(label.size_px * _SUPERSAMPLING, 1.0))
-        place = (label.x * _SUPERSAMPLING, label.y * _SUPERSAMPLING)
-        pen.text(place, label.text, label.color, font, _ANCHORS[label.anchor])
+        runs = text_runs(label.text, max(label.size_px * _SUPERSAMPLING, 1.0))
+        length = sum(font.getlength(text) for text, font in runs)
+        x = label.x * _SUPERSAMPLING - length * _ANCHORS[label.anchor]
+        for text, font in runs:
+            pen.text((x, label.y * _SUPERSAMPLING), text, label.color, font, "ls")
+            x += font.getlength(text)
     picture = fine.resize((drawing.width_px, drawing.height_px), Image.Resampling.BOX)
     return np.asarray(picture)
