@@ -2,9 +2,8 @@
 
 A click is detected where the sound leaves the page, after its last audio node. It is heard when the
 browser says that the sound card plays that sample. A picture is seen at the display's first refresh
-after it was drawn. Neither relies on the delay that the page itself assumes. A busy machine draws
-pictures late, which cannot be told from a wrong delay. Therefore only the least late picture near a
-click counts.
+after it was drawn. Neither relies on the delay that the page itself assumes. On a busy machine,
+single pictures are late, so the median of those near a click counts.
 """
 
 from __future__ import annotations
@@ -79,6 +78,6 @@ def offsets_ms(browser: Chromium, period_ms: float, phase_ms: float) -> NDArray[
         heard_ms = np.median(readings)
         is_near = np.abs(seen_ms - heard_ms) < NEAR_MS
         if is_near.sum() >= MIN_PICTURES and seen_ms[-1] > heard_ms + NEAR_MS:
-            shown_ms = (media_ms - seen_ms)[is_near].max() + heard_ms  # the picture at the click
+            shown_ms = np.median((media_ms - seen_ms)[is_near]) + heard_ms  # at the click
             offsets.append((shown_ms - phase_ms + period_ms / 2) % period_ms - period_ms / 2)
     return np.array(offsets)

@@ -61,13 +61,6 @@ def test_the_sound_is_the_audio_that_was_sent(sent: Stream) -> None:
     np.testing.assert_allclose(sound / 32768, SENTENCE, atol=1e-4)
 
 
-def test_int16_stereo_gives_the_phones_of_float_mono(system: System, sent: Stream) -> None:
-    pcm = np.rint(32768 * SENTENCE).clip(-32768, 32767).astype(np.int16)
-    stereo = np.stack([pcm, pcm], axis=1)
-    both = stream(system.control, stereo, encoding="s16le", num_channels=2)
-    assert both.symbols == sent.symbols
-
-
 def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System, sent: Stream) -> None:
     samples = SENTENCE[:32000]
     fast = stream(system.control, samples)

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from kouxing.services.kinds import KINDS
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.system import DEMO, ROOT, System
+from tests.system import CHAIN, DEMO, ROOT, System
 
 STATUS = "document.getElementById('status').textContent"
 WEBRTC_PAGE = ROOT / "docs" / "clients" / "webrtc.md"
@@ -18,7 +17,7 @@ IS_LIVE = f"{STATUS}.includes('live') && window.kouxing.state.voiceToPictureMs !
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    with System(KINDS, tmp_path_factory.mktemp("logs"), restarts=True) as running:
+    with System((*CHAIN, "gateway"), tmp_path_factory.mktemp("logs"), restarts=True) as running:
         yield running
 
 
@@ -57,21 +56,21 @@ def test_shows_the_measured_delay(browser: Browser) -> None:
     assert browser.evaluate(rf"Number({STATUS}.match(/(\d+) ms/)[1])") > 60
 
 
-@pytest.mark.parametrize(
-    ("service", "text"),
-    [
-        ("recognizer", "A service crashed"),
-        ("gateway", "The gateway has stopped"),
-    ],
-)
-def test_reports_a_crash_and_the_microphone_continues(
-    system: System, live: Browser, service: str, text: str
-) -> None:
+def test_reports_a_crash_and_the_microphone_continues(system: System, live: Browser) -> None:
     live.wait_for("document.getElementById('notice').textContent === ''")
     live.evaluate("window.notices = []")
-    system.process(service).kill()
-    live.wait_for(f"window.notices.some((notice) => notice.includes('{text}'))")
+    system.process("recognizer").kill()
+    live.wait_for("window.notices.some((notice) => notice.includes('A service crashed'))")
     live.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
+
+
+def test_the_microphone_continues_in_a_new_session_after_the_gateway_crashed(
+    system: System, live: Browser
+) -> None:
+    before = live.evaluate("window.kouxing.state.session")
+    system.process("gateway").kill()
+    live.wait_for(f"window.kouxing.state.session !== '{before}' && {IS_LIVE}")
+    assert live.evaluate("window.kouxing.state.microphone")
 
 
 def test_the_script_in_the_documentation_speaks_over_webrtc(browser: Browser) -> None:
