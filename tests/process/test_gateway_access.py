@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import LIMIT_S, Gateway, free_port, port_of, start_python, wait_until
+from tests.system import LIMIT_S, Gateway, System, free_port, port_of, start_python, wait_until
 
 NO_CONTROL = "tcp://127.0.0.1:9"
 UPGRADE = {
@@ -197,14 +197,15 @@ def test_only_the_owner_can_read_the_certificate(public: Site) -> None:
     assert stat.S_IMODE(public.certificate.stat().st_mode) == 0o600
 
 
-def gateway_process(**settings: str) -> subprocess.Popen[str]:
+def gateway_process(control: str = NO_CONTROL, **settings: str) -> subprocess.Popen[str]:
     names = {f"KOUXING_{name.upper()}": value for name, value in settings.items()}
     names = {"KOUXING_GATEWAY_PORT": "0", **names}
-    return start_python("-m", "kouxing.services.gateway", control=NO_CONTROL, **names)
+    return start_python("-m", "kouxing.services.gateway", control=control, **names)
 
 
-def test_plain_http_for_a_proxy_creates_and_prints_a_token() -> None:
+def test_plain_http_for_a_proxy_creates_and_prints_a_token(system: System) -> None:
     process = gateway_process(
+        system.control,
         gateway_host="0.0.0.0",  # noqa: S104
         gateway_plain_http="true",
         advertise="127.0.0.1",
