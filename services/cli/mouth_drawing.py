@@ -220,13 +220,14 @@ def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledM
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
     anchors = anchors_of(mouth.phones, mouth.silence) or [(0.0, mouth.silence)]
+    write = load_inventory().write
     middles_s = {phone.onset_s: phone.onset_s + phone.duration_s / 2 for phone in mouth.phones}
     widths = mouth.widths_at([middles_s.get(time_s, time_s) for time_s, _ in anchors])
     return [
         drawing.LabeledMouth(
             time_s,
             float(opening),
-            "" if phone == mouth.silence else phone,
+            "" if phone == mouth.silence else write(phone),
             syllables.get(time_s, ""),
             float(width),
         )
@@ -255,7 +256,8 @@ def _write_picture(output: Path, mouth: _Mouth) -> str:
 
 def _write_video(output: Path, mouth: _Mouth) -> str:
     labels = _labels(mouth, are_pixels=True)
-    symbols = mouth.symbols
+    write = load_inventory().write
+    symbols = [(start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.symbols]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,

@@ -66,7 +66,7 @@ def test_picture_and_svg_show_every_key_frame(tmp_path: Path) -> None:
     texts = [element.text for element in root if element.tag.endswith("text")]
     assert texts.count("四 sì") == texts.count("十 shí") == 6
     assert texts.count("是 shì") == 4
-    assert texts.count("iii") + texts.count("ii") == 16
+    assert texts.count("i") == 16
     pixels = picture.decode((tmp_path / "mouth.png").read_bytes(), "mouth.png")
     assert pixels.shape[:2] == (int(root.attrib["height"]), int(root.attrib["width"]))
 
