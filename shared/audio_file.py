@@ -260,14 +260,17 @@ def raw_audio(
 
     def pieces() -> Iterator[tuple[int, Samples]]:
         guard = CancellationGuard(name, num_channels, remarks)
-        rest, num_left = b"", math.inf if num_bytes is None else num_bytes
+        rest, num_read, num_left = b"", 0, math.inf if num_bytes is None else num_bytes
         while num_left and (more := stream.read(int(min(block_bytes, num_left)))):
             num_left -= len(more)
+            num_read += len(more)
             data = rest + more
             whole = len(data) - len(data) % frame_bytes
             rest = data[whole:]
             channels = to_float(np.frombuffer(data[:whole], raw.dtype)).reshape(-1, num_channels)
             yield raw.sample_rate_hz, guard.mix(channels, channels)
+        read_s, stated_s = (size / frame_bytes / rate_hz for size in (num_read, num_bytes or 0))
+        remarks.extend(_cut_off(name, read_s, stated_s))
 
     blocks = _blocks(pieces(), name, rate_hz, num_channels, BLOCK_S)
     return AudioSource(name, rate_hz, num_channels, None, blocks, remarks)
@@ -367,7 +370,10 @@ def _resample(
 
 def _missing(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
     """Return a remark if a file is shorter than its header states."""
-    missing_s = read_s * ((stated_bytes(begin) or 0) / num_bytes - 1)
-    if missing_s < _MIN_MISSING_S:
+    return _cut_off(path, read_s, read_s * (stated_bytes(begin) or 0) / num_bytes)
+
+
+def _cut_off(path: str, read_s: float, stated_s: float) -> list[str]:
+    if stated_s - read_s < _MIN_MISSING_S:
         return []
-    return [f"{path}: the file is cut off after {read_s:.1f} s of {read_s + missing_s:.1f} s"]
+    return [f"{path}: the file is cut off after {read_s:.1f} s of {stated_s:.1f} s"]

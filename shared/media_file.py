@@ -65,6 +65,8 @@ class MediaSound:
         self.notices: list[str] = []
         self._name = name
         self._mixers: dict[tuple[str, str, int], list[Any]] = {}
+        if begin.startswith(b"RIFX"):  # FFmpeg reads its samples in the wrong byte order
+            raise UserError(f"{name}: this is a big-endian WAV file; export it as wav or flac")
         self._file = _GuardedFile(file, can_seek=not is_pipe)
         try:
             self._container: Any = av.open(
@@ -210,8 +212,13 @@ class MediaSound:
         if kind not in self._mixers:  # PyAV cannot convert planes of eight channels
             layouts = (frame.layout.name, "stereo")
             self._mixers[kind] = [av.AudioResampler("flt", layout) for layout in layouts]
-        all_channels, mixed = (mixer.resample(frame)[0] for mixer in self._mixers[kind])
-        return _samples_of(all_channels), _samples_of(mixed)
+        mixers = self._mixers[kind]
+        channels = _samples_of(mixers[0].resample(frame)[0])
+        try:
+            return channels, _samples_of(mixers[-1].resample(frame)[0])
+        except av.error.ArgumentError:  # FFmpeg cannot mix 9 channels; the guard averages them
+            del mixers[1:]
+            return channels, channels
 
     def _is_continuous(self, ahead_s: float) -> bool:
         """Return whether a difference between timestamps and samples is a gap or an overlap."""
@@ -319,13 +326,15 @@ def pcm_of_wav(begin: bytes) -> WavPcm | None:
     try:
         with av.open(io.BytesIO(begin), mode="r", format="wav") as container:
             codec: Any = container.streams.audio[0].codec_context
+            if codec is None:
+                return None
             place = next(container.demux()).pos
     except (av.error.FFmpegError, ValueError, IndexError, StopIteration):
         return None
     dtype = _WAV_TYPES.get(codec.name)
     if (
         dtype is None
-        or codec.channels > 2
+        or codec.channels not in (1, 2)
         or place is None
         or begin[place - 8 : place - 4] != b"data"
     ):

@@ -81,6 +81,34 @@ def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, sub
     np.testing.assert_allclose(samples, 0.25, atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("place", "field", "message"),
+    [
+        (0, b"RIFX", "big-endian WAV file"),
+        (20, b"\0\0", "the codec of audio track 1 is unknown"),
+        (22, b"\0\0", "nothing can be decoded"),
+        (40, (32_000).to_bytes(4, "little"), "cut off after 0.5 s of 1.0 s"),
+    ],
+)
+def test_reports_a_wrong_wav_header(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, place: int, field: bytes, message: str
+) -> None:
+    path = tmp_path / "a.wav"
+    soundfile.write(path, np.full(8000, 0.25), 16_000)
+    data = bytearray(path.read_bytes())
+    data[place : place + len(field)] = field
+    data[4:8] = (32_036).to_bytes(4, "little")
+    path.write_bytes(data)
+    for open_source in (lambda: open_audio(path), lambda: _open(monkeypatch, bytes(data))):
+        try:
+            source = open_source()
+            assert sum(map(len, source.blocks)) == 8000
+            text = source.remarks[0]
+        except UserError as error:
+            text = str(error)
+        assert message in text
+
+
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
 def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
