@@ -135,7 +135,7 @@ class MediaSound:
         while True:
             try:
                 packet = next(packets, None)
-            except (av.error.FFmpegError, ValueError):
+            except (av.error.FFmpegError, ValueError, IndexError):  # index of a new stream
                 self._file.check()
                 self._on_damage(self._read_end_s)
                 self._is_stopped = True

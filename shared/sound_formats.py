@@ -13,7 +13,8 @@ _SOUND = (
     (0, b"OggS"), (0, b"fLaC"), (0, b"ID3"), (0, b"FORM"), (0, b"caff"), (0, b"#!AMR"),
     (0, b".snd"), (0, b"\x1a\x45\xdf\xa3"), (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"),
     (0, b"wvpk"), (0, b"TTA1"), (0, b"MAC "), (0, b"\0\0\1\xba"), (4, b"ftyp"), (4, b"moov"),
-    (4, b"mdat"), (4, b"wide"),
+    (4, b"mdat"), (4, b"wide"), (0, b".RMF"), (0, b".ra\xfd"), (0, b"Creative Voi"),
+    (0, b"nut/multimed"),
 )  # fmt: skip
 # Codecs whose frames need no container, with the bits of a frame's first two bytes.
 _FRAMED = (
@@ -22,7 +23,8 @@ _FRAMED = (
     ("aac", 0xFFF6, 0xFFF0),
     ("ac3", 0xFFFF, 0x0B77),
 )
-_TS_PACKET, _TS_SYNC = 188, 0x47
+_TS_SYNC = 0x47
+_TS_PACKETS = ((0, 188), (4, 192))  # the place of the first byte, and the packet's size
 MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
 # The place of a file's size, its number of bytes and their order, and the bytes that it leaves out.
 _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
@@ -58,7 +60,8 @@ def needs_more(begin: bytes) -> bool:
     """Return whether more bytes are needed, up to ``NUM_BEGIN_BYTES``, to recognize a format."""
     if len(begin) < 12 or begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
         return True
-    return begin[:1] in (b"\xff", b"\x0b", bytes([_TS_SYNC])) and not is_sound(begin)
+    may_be = begin[0] in (0xFF, 0x0B, _TS_SYNC) or begin[4] == _TS_SYNC
+    return may_be and not is_sound(begin)
 
 
 def other_kind(begin: bytes) -> str:
@@ -97,7 +100,7 @@ def stated_bytes(begin: bytes) -> int | None:
 
 def needs_all(begin: bytes) -> bool:
     """Return whether a file can be decoded only once its end is there."""
-    if begin.startswith(b"caff"):
+    if begin.startswith((b"caff", b"wvpk")):
         return True
     return begin[4:8] in (b"ftyp", b"mdat", b"wide") and not _has_index_first(begin)
 
@@ -116,8 +119,10 @@ def _has_index_first(begin: bytes) -> bool:
 
 
 def _is_transport_stream(begin: bytes) -> bool:
-    places = range(0, min(len(begin), 5 * _TS_PACKET), _TS_PACKET)
-    return len(places) == 5 and all(begin[place] == _TS_SYNC for place in places)
+    return any(
+        len(syncs := begin[place::size]) >= 5 and set(syncs[:5]) == {_TS_SYNC}
+        for place, size in _TS_PACKETS
+    )
 
 
 def _consists_of_frames(begin: bytes, codec: str, mask: int, sync: int) -> bool:

@@ -137,6 +137,35 @@ def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     [*source.blocks]  # noqa: B018 - it ends in the middle of a packet
 
 
+@pytest.mark.parametrize(
+    ("suffix", "codec"),
+    [
+        ("m2ts", "pcm_bluray"),
+        ("rm", "ac3"),
+        ("voc", "pcm_s16le"),
+        ("nut", "mp2"),
+        ("wv", "wavpack"),
+    ],
+)
+def test_recognizes_rare_formats(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, suffix: str, codec: str
+) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write_media(path, codec, SPEECH.repeat(3), 48_000)
+    source = _open(monkeypatch, path.read_bytes())
+    expected, _ = read_audio(path)
+    np.testing.assert_array_equal(np.concatenate([*source.blocks]), expected)
+    assert source.remarks == source.notices == []
+
+
+def test_reports_a_cut_flv_pipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "a.flv"
+    write_media(path, "aac", SPEECH.repeat(3), 48_000)
+    for share in np.linspace(0.4, 0.9, 20):  # FFmpeg takes some of these ends for a new track
+        source = _open(monkeypatch, path.read_bytes()[: int(path.stat().st_size * share)])
+        assert len([*source.blocks]) > 0
+
+
 def test_reads_raw_samples_if_no_format_fits_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     values = np.arange(-1000, 1000, dtype="<i2")
     source = _open(monkeypatch, values.tobytes() + b"\x01")

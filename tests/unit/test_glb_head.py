@@ -215,7 +215,7 @@ def test_rejects_bad_descriptions(
     [
         (b"", "not a binary glTF"),
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
-        (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
+        (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "cut off after 20 of 99 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
         (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "description is damaged"),
     ],

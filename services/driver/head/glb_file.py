@@ -49,8 +49,10 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
     if len(data) < 20 or data[:4] != b"glTF":
         raise BadGlbError("it is not a binary glTF file")
     version, length = struct.unpack_from("<II", data, 4)
-    if version != 2 or length > len(data):
-        raise BadGlbError(f"its header says version {version} and {length} of {len(data)} bytes")
+    if version != 2:
+        raise BadGlbError(f"it has version {version} of glTF; export it as glTF 2.0")
+    if length > len(data):
+        raise BadGlbError(f"it is cut off after {len(data)} of {length} bytes; copy it again")
     chunks: dict[bytes, bytes] = {}
     at = 12
     while at + 8 <= length:
