@@ -127,6 +127,8 @@ def check_output(
     for path in paths:
         if path is None:
             continue
+        if str(path) == "-":
+            raise UserError("-: the output needs a name; standard output is not supported")
         is_new = not _exists(path)
         if not is_new and any(path.samefile(source) for source in sources):
             raise UserError(f"{path}: the output is also an input; give the output another name")

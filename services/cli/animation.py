@@ -107,8 +107,8 @@ def animate(
     reading = progress.add_task("reading", total=None)
     model, predictor = _load_models(mouth)
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
-    settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
     models = [load_lip_model(name=name) for name in lip_models]
+    settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
     transcript = None if text is None else read_text(text, model.inventory)
     samples = read_mono_16k(source, track)
     progress.remove_task(reading)

@@ -17,6 +17,7 @@ from kouxing.shared.control_client import connect
 from kouxing.shared.endpoints import reach_error, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT, CLIENT_ROLES, local_keys, rejection_hint, user_key
+from kouxing.shared.terminal import plural
 
 MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # of the newest heartbeat
@@ -103,7 +104,8 @@ def _check_service(service: ServiceState, bus: Bus) -> Iterator[Finding]:
         address = endpoint.partition(" ")[0]
         if problem := _endpoint_problem(name, endpoint, bus):
             problems.append(f"{name} at {address}: {problem}")
-    about = f"{len(service.endpoints)} addresses, clock {service.clock_offset_ms:+.0f} ms"
+    endpoints = plural(len(service.endpoints), "endpoint")
+    about = f"{endpoints}, clock {round(service.clock_offset_ms):+d} ms"
     yield Finding(service.instance, about, "\n".join(problems))
 
 

@@ -149,7 +149,7 @@ def render(
     if mouth is not None and "learnt" not in models:
         raise UserError("--mouth applies to learnt lips; add --lips learnt")
     *sources, last = files
-    if output is None and len(sources) == 1 and is_output(last):
+    if output is None and len(sources) == 1 and (is_output(last) or not last.exists()):
         pairs = [(sources[0], last)]
     else:
         pairs = pair_outputs(files, output, ".mp4")

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.services.cli.batch import pair_outputs, process_all
+from kouxing.services.cli.main import app
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import check_output
 
@@ -28,6 +29,27 @@ def test_an_output_is_never_an_input(tmp_path: Path) -> None:
     link.symlink_to(source)
     with pytest.raises(UserError, match="the output is also an input"):
         check_output(link, inputs=[None, source, Path("a" * 5000)], force=True)
+
+
+def test_standard_output_is_not_a_file() -> None:
+    with pytest.raises(UserError, match="the output needs a name"):
+        check_output(Path("-"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["me.avi"], r"me\.avi: unknown format; give a name that ends in \.mp4"),
+        (["me.csv", "--lips", "lerned"], "unknown lip model 'lerned'; use one of"),
+    ],
+)
+def test_render_names_a_wrong_format_or_lip_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("me.wav").touch()
+    with pytest.raises(UserError, match=message):
+        app(["render", "me.wav", *arguments], standalone_mode=False)
 
 
 def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) -> None:
