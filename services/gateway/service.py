@@ -316,17 +316,19 @@ class GatewayService(Service):
         self._viewers.forward(sound.session, MessageKind.SOUND, message)
 
     def _on_phone(self, phone: Phone) -> None:
+        syllables = self._sessions[phone.session].syllables
         message = wire.text(
             "phone",
             index=phone.index,
             symbol=phone.symbol,
+            text=syllables.inventory.write(phone.symbol),
             media_time=phone.media_time,
             duration=phone.duration,
             confidence=phone.confidence,
             final=phone.final,
         )
         self._viewers.forward(phone.session, MessageKind.TEXT, message)
-        for syllable in self._sessions[phone.session].syllables.update(phone_of(phone)):
+        for syllable in syllables.update(phone_of(phone)):
             message = wire.text(
                 "syllable",
                 index=syllable.index,

@@ -31,7 +31,7 @@ class SyllableTrack:
     """
 
     def __init__(self, inventory: PhoneInventory, characters: Characters = ()) -> None:
-        self._inventory = inventory
+        self.inventory = inventory
         self._characters = characters
         self._num_dropped = 0  # characters before the first kept phone
         self._phones: dict[int, Phone] = {}
@@ -50,7 +50,7 @@ class SyllableTrack:
         else:
             self._phones[phone.index] = phone
         groups = group_syllables(
-            [phone for _, phone in sorted(self._phones.items())], self._inventory
+            [phone for _, phone in sorted(self._phones.items())], self.inventory
         )
         places = self._places(groups)
         if len(self._phones) > MAX_PHONES:
@@ -74,7 +74,7 @@ class SyllableTrack:
 
     def _places(self, groups: list[list[Phone]]) -> list[int | None]:
         """Return the index of each syllable's character; None: it has no character."""
-        silence = (self._inventory.silence,)
+        silence = (self.inventory.silence,)
         symbols = [tuple(phone.symbol for phone in group) for group in groups]
         spoken = [syllable for syllable in symbols if syllable != silence]
         text = [phones for _, phones in self._characters[self._num_dropped :]]
@@ -85,10 +85,10 @@ class SyllableTrack:
     def _syllable(self, phones: list[Phone], place: int | None, following: list[Phone]) -> Syllable:
         first, last = phones[0], phones[-1]
         # The vowel of an initial may still follow.
-        is_complete = last.symbol not in self._inventory.initials or any(
+        is_complete = last.symbol not in self.inventory.initials or any(
             phone.final for phone in following[:1]
         )
-        spelling = self._inventory.spell(tuple(phone.symbol for phone in phones))
+        spelling = self.inventory.spell(tuple(phone.symbol for phone in phones))
         return Syllable(
             index=first.index,
             text=spelling if place is None else self._characters[place][0],

@@ -11,7 +11,7 @@ const SILENCE_SIGN = "·";
 
 /** The phones or syllables of a session, and which of them to show at a media time. */
 export class PhoneTrack {
-  #phones = []; // { index, symbol, begin, end }, by index
+  #phones = []; // { index, symbol, text, begin, end }, by index
 
   reset() {
     this.#phones = [];
@@ -21,8 +21,8 @@ export class PhoneTrack {
    * Add a phone. The same index again revises the phone, or removes it if the revision is final and
    * has no duration. Times are in samples at 16 kHz.
    */
-  add({ index, symbol, media_time: begin, duration, final }) {
-    const phone = { index, symbol, begin, end: begin + duration };
+  add({ index, symbol, text = symbol, media_time: begin, duration, final }) {
+    const phone = { index, symbol, text, begin, end: begin + duration };
     const known = this.#phones.findIndex((other) => other.index === index);
     if (final && duration === 0) this.#phones.splice(known, known >= 0 ? 1 : 0);
     else if (known >= 0) this.#phones[known] = phone;
@@ -35,7 +35,7 @@ export class PhoneTrack {
   }
 
   /**
-   * Return { current: symbol at a media time or the last one before it, past: the symbols before it,
+   * Return { current: text at a media time or the last one before it, past: the texts before it,
    * opacity: 0 to 1; at 0 nothing is current }.
    */
   at(mediaTime) {
@@ -44,8 +44,8 @@ export class PhoneTrack {
     const left = last === -1 ? 0 : begun[last].end + SHOWN_AFTER_END + FADE - mediaTime;
     const past = left > 0 ? begun.slice(0, last) : begun;
     return {
-      current: left > 0 ? begun[last].symbol : "",
-      past: past.slice(-MAX_PAST).map(({ symbol }) => (symbol === SILENCE ? SILENCE_SIGN : symbol)),
+      current: left > 0 ? begun[last].text : "",
+      past: past.slice(-MAX_PAST).map(({ symbol, text }) => (symbol === SILENCE ? SILENCE_SIGN : text)),
       opacity: Math.max(0, Math.min(1, left / FADE)),
     };
   }
