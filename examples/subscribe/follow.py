@@ -10,6 +10,7 @@ proto/PROTOCOL.md describes all messages and lists the names of the weights.
 import itertools
 import json
 import os
+import signal
 import struct
 import sys
 import time
@@ -17,6 +18,8 @@ from pathlib import Path
 
 import msgpack
 import zmq
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program without a traceback
 
 wanted, control_address = (*sys.argv[1:], *("", "tcp://127.0.0.1:5550")[len(sys.argv) - 1 :])
 state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
