@@ -37,6 +37,7 @@ const CHINESE = {
   "the sound is longer than an hour; use a shorter file": "声音长于一小时，请用较短的文件",
   "another file is being read; try again in a few seconds": "正在读取另一个文件，请几秒后重试",
   "the file is larger than {size} MiB; use a smaller one": "文件大于 {size} MiB，请用较小的文件",
+  "this is a big-endian WAV file; export it as wav or flac": "这是大端序的 WAV 文件，请导出为 wav 或 flac",
   "the file cannot be decoded; export it again": "文件无法解码，请重新导出",
   "reading the file took too long; use a shorter file": "读取时间太长，请用较短的文件",
 
