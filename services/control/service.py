@@ -8,7 +8,6 @@ After a restart, control learns the sessions from the services that serve them.
 
 from __future__ import annotations
 
-import heapq
 import secrets
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from typing import Any
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.faults import Faults
 from kouxing.services.control.kind import KIND
+from kouxing.services.control.move_repeats import MoveRepeats
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.refusal import Refusal
 from kouxing.services.control.registry import Registry
@@ -49,7 +49,6 @@ from kouxing.shared.wire.session import (
     ErrorCode,
     FlushSession,
     OpenSession,
-    SessionMoved,
     StatusRequest,
 )
 from kouxing.shared.wire.speech import Speech
@@ -58,7 +57,6 @@ STOPPED = "stopped"  # reason for a service that shut down
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # until a session without a worker is closed
 MAX_PAUSE_S = 0.1  # a longer pause between ticks is control's, not the services'
-REPEAT_MOVED_S = (1.0, 2.0, 4.0, 8.0)  # after a move; the client's connection may have broken
 SERVICE_EVENTS = (EventName.ERROR, EventName.RECORDED)  # events that a service may publish
 
 
@@ -80,7 +78,7 @@ class ControlService(Service):
         self._idle_limit_s = config.idle_limit_s
         self._num_events = 0
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
-        self._moves_to_repeat: list[tuple[float, str, SessionMoved]] = []  # heap by time
+        self._move_repeats = MoveRepeats()
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         public = self.key.public if self.key else ""
@@ -128,8 +126,10 @@ class ControlService(Service):
         for instance in self._registry.overdue(now_s):
             self._on_service_lost(instance, "no heartbeat")
         self._faults.report(now_s)
-        while self._moves_to_repeat and self._moves_to_repeat[0][0] <= now_s:
-            self._repeat_move(heapq.heappop(self._moves_to_repeat)[2])
+        for moved in self._move_repeats.due(now_s):
+            record = self._sessions.get(moved.session)
+            if record is not None and record.epoch == moved.epoch:
+                self._commands.send(moved, to=record.client)
         for record in self._sessions.pending():
             self._check_timeout(record, now_s)
 
@@ -139,7 +139,7 @@ class ControlService(Service):
             self._end_session(record, "control stops")
         return True
 
-    # --- requests of clients -------------------------------------------------------------------
+    # --- requests of clients ---
 
     def _open_session(self, message: OpenSession, sender: Peer) -> Message | None:
         known = self._sessions.find_by_request(message, sender)
@@ -187,7 +187,7 @@ class ControlService(Service):
         shows_token = self._requests.may_see_token(sender)
         return self._status.report(message, time.monotonic(), shows_token=shows_token)
 
-    # --- messages of services ------------------------------------------------------------------
+    # --- messages of services ---
 
     def _service_handler(self, handle: Callable[[Any, str], None]) -> Handler:
         """Return a handler that passes on messages of registered services, with the instance."""
@@ -314,7 +314,7 @@ class ControlService(Service):
         for record in self._sessions.mark_worker_lost(instance, time.monotonic()):
             self._move_session(record)
 
-    # --- sessions ------------------------------------------------------------------------------
+    # --- sessions ---
 
     def _restore_sessions(self) -> None:
         """Restore sessions whose workers are all back; at the deadline, restore the rest."""
@@ -373,15 +373,7 @@ class ControlService(Service):
         self._publish(EventName.SESSION_MOVED, record.name)
         workers = ", ".join(sorted({*record.workers.values()}))
         LOG.info("session moved to %s", workers, extra={"session": record.name})
-        now_s = time.monotonic()
-        for delay_s in REPEAT_MOVED_S:
-            heapq.heappush(self._moves_to_repeat, (now_s + delay_s, record.name, moved))
-
-    def _repeat_move(self, moved: SessionMoved) -> None:
-        """Tell a client again where its session is, unless it has moved since."""
-        record = self._sessions.get(moved.session)
-        if record is not None and record.epoch == moved.epoch:
-            self._commands.send(moved, to=record.client)
+        self._move_repeats.add(moved, time.monotonic())
 
     def _stop_waiting(self, record: SessionRecord) -> None:
         """Continue without observers that did not start a session; end it without a worker."""

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
+from kouxing.services.control import move_repeats, takeover
 from kouxing.services.control import service as control_service
-from kouxing.services.control import takeover
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
@@ -128,7 +128,7 @@ def test_stops_unknown_sessions_only_after_the_deadline(stage: Stage) -> None:
 def test_repeats_session_moved_to_the_client(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_service, "REPEAT_MOVED_S", (0.1, 0.2))
+    monkeypatch.setattr(move_repeats, "REPEAT_AFTER_S", (0.1, 0.2))
     recognizer, synthesizer = stage.services
     client.send(OpenSession(session="mine", request="1"))
     for service in stage.services:

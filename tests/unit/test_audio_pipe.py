@@ -99,9 +99,9 @@ def test_reports_a_wrong_wav_header(
     data[place : place + len(field)] = field
     data[4:8] = (32_036).to_bytes(4, "little")
     path.write_bytes(data)
-    for open_source in (lambda: open_audio(path), lambda: _open(monkeypatch, bytes(data))):
+    for is_pipe in (False, True):
         try:
-            source = open_source()
+            source = _open(monkeypatch, bytes(data)) if is_pipe else open_audio(path)
             assert sum(map(len, source.blocks)) == 8000
             text = source.remarks[0]
         except UserError as error:

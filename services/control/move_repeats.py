@@ -1,0 +1,27 @@
+"""Moves that clients are told again, because their connection may have broken."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+
+from kouxing.shared.wire.session import SessionMoved
+
+REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)
+
+
+class MoveRepeats:
+    """The messages to repeat, in order of time."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[float, str, SessionMoved]] = []
+
+    def add(self, moved: SessionMoved, now_s: float) -> None:
+        """Repeat a message several times from now on."""
+        for delay_s in REPEAT_AFTER_S:
+            heapq.heappush(self._heap, (now_s + delay_s, moved.session, moved))
+
+    def due(self, now_s: float) -> Iterator[SessionMoved]:
+        """Remove and yield the messages to repeat now."""
+        while self._heap and self._heap[0][0] <= now_s:
+            yield heapq.heappop(self._heap)[2]
