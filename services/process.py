@@ -47,6 +47,9 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     raise_file_limit()
     try:
         service = make_service()
+    except ImportError as error:
+        print(f"{name}: {error}; install kouxing again (in a checkout: make)", file=sys.stderr)
+        return 2
     except UserError as error:
         print(with_name(name, str(error)), file=sys.stderr)
         return 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from kouxing_client import Client, KouxingError
+from kouxing_client import Client, KouxingError, Refused
 from kouxing_client.keys import Key
 
 from kouxing.shared.errors import UserError
@@ -22,5 +22,7 @@ def connect(control: str, *, key: Key | None = None, timeout_s: float = 10.0) ->
         insecure = " " not in control
         with Client(control, key=key, insecure=insecure, timeout_s=timeout_s) as client:
             yield client
+    except Refused as refusal:
+        raise UserError(refusal.text) from refusal
     except KouxingError as error:
         raise UserError(str(error)) from error

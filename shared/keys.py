@@ -179,7 +179,7 @@ def key_text(key: Key) -> str:
 def add_key_hint(roles: Collection[str]) -> str:
     """Return the command that creates a key, for messages about a missing key."""
     options = "".join(f" --role {role}" for role in roles)
-    return f"kouxing keys add NAME{options} (then copy the file here)"
+    return f"kouxing keys add NAME{options} (then copy the file here, and start this again)"
 
 
 def read_grants() -> dict[str, Grant]:

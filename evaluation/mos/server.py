@@ -28,7 +28,9 @@ from kouxing.shared.logs import LOG
 
 FOLDER = Path(__file__).parent / "page"
 FILES = {name: FOLDER / name for name in ("index.html", "main.js", "style.css")}
-FILES |= {name: http.PAGE / name for name in ("language.js", "texts.js", "icon.svg")}
+FILES |= {
+    name: http.PAGE / name for name in ("language.js", "texts.js", "gateway-texts.js", "icon.svg")
+}
 MAX_BODY_BYTES = 1024
 _POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
 

@@ -53,8 +53,16 @@ class CommandGroup(TyperGroup):
             self._add_entry_points()
         command = super().get_command(ctx, cmd_name)
         if command is not None:
-            _name_values(command, ctx)
+            _name_values(command.get_params(ctx), ctx)
+            for subcommand in getattr(command, "commands", {}).values():
+                _name_values(subcommand.get_params(ctx), ctx)
         return command
+
+    def get_params(self, ctx: Any) -> Any:
+        """Return the options of the group itself."""
+        parameters = super().get_params(ctx)
+        _name_values(parameters, ctx)
+        return parameters
 
     def _add_entry_points(self) -> None:
         for entry_point in entry_points(group=ENTRY_POINTS):
@@ -64,18 +72,16 @@ class CommandGroup(TyperGroup):
                 self.add_command(command)
 
 
-def _name_values(command: Any, ctx: Any) -> None:
+def _name_values(parameters: Any, ctx: Any) -> None:
     """Show TEXT or PATH in the help of options instead of Python's types.
 
     Flags and arguments show nothing: their names are enough.
     """
-    for parameter in command.get_params(ctx):
+    for parameter in parameters:
         if not isinstance(parameter, TyperOption):
             parameter.display_type = lambda ctx: ""
         elif parameter.metavar is None:
             parameter.metavar = _VALUE_NAMES.get(parameter.display_type(ctx))
-    for subcommand in getattr(command, "commands", {}).values():
-        _name_values(subcommand, ctx)
 
 
 app = typer.Typer(

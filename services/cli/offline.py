@@ -338,10 +338,13 @@ def lips(
 
 
 def _format(form: PhoneFormat | None, output: Path | None) -> PhoneFormat:
-    if form is None and output is not None:
-        form = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
-        if form is None:
-            raise UserError(
-                f"{output}: unknown format; give a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
-            )
-    return form or PhoneFormat.TABLE
+    if output is None:
+        return form or PhoneFormat.TABLE
+    of_suffix = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
+    if of_suffix is None:
+        raise UserError(
+            f"{output}: unknown format; give a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
+        )
+    if form not in (None, of_suffix):
+        raise UserError(f"{output}: --format {form} does not fit this name; leave out the option")
+    return of_suffix

@@ -73,9 +73,8 @@ class Supervisor:
                 f"{log_folder}: cannot be written: {error.strerror}; start kouxing in a folder that"
                 " you can write to, or add --set driver.out=FOLDER"
             ) from None
-        paths = {name: log_folder / f"{name}.log" for name in self._names}
-        check_output(*paths.values(), force=True)
-        self._logs = {name: LogFile(path, self._warn) for name, path in paths.items()}
+        check_output(*(log_folder / f"{name}.log" for name in self._names), force=True)
+        self._logs: dict[str, LogFile] = {}
 
     def start(self) -> None:
         """Start every service."""
@@ -213,9 +212,11 @@ class Supervisor:
         self._process_ended.set()
 
     def _copy_log(self, name: str, stream: IO[bytes]) -> None:
+        new = LogFile(self._log_folder / f"{name}.log", self._warn)
+        log = self._logs.setdefault(name, new)
         with stream:
             for line in stream:
-                self._logs[name].write(line)
+                log.write(line)
                 if text := _console_text(line):
                     self._console.print(with_name(name, text), markup=False, highlight=False)
 
