@@ -14,6 +14,7 @@ def main() -> None:
     from kouxing.services.cli.main import main as run_command_line
 
     signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     run_command_line()
 
 

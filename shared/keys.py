@@ -111,23 +111,25 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     """
     import zmq  # noqa: PLC0415 (slow to import)
 
+    roles_of = {**kinds, CLIENT: CLIENT_ROLES}
+    keys = {name: load_key(name, roles) for name, roles in roles_of.items()}
+    grants = read_grants()  # also of keys that were just created
+    names = {grant.name for grant in grants.values()}
     reasons: list[str] = []
     revoked: list[str] = []
     removed: list[str] = []
-    for name, roles in {**kinds, CLIENT: CLIENT_ROLES}.items():
-        key, path = load_key(name, roles), key_folder() / f"{name}.key"
+    for name, key in keys.items():
+        path, grant = key_folder() / f"{name}.key", grants.get(key.public, Grant("", ()))
         if _credential(path.name):
             continue
-        grants = read_grants()
-        grant = grants.get(key.public, Grant("", ()))
         if zmq.curve_public(key.secret.encode()) != key.public.encode():
             reasons.append(f"{path}: the secret key does not belong to the public key")
-        elif name != CONTROL and not {*roles} <= {*grant.roles}:
+        elif name != CONTROL and not {*roles_of[name]} <= {*grant.roles}:
             reasons.append(f"{key_folder() / _ALLOWED} does not allow {path}")
         else:
             continue
         removed.append(str(key_folder() / ("*" if name == CONTROL else path.name)))
-        revoked += [f"kouxing keys revoke {name}"] * (name in {g.name for g in grants.values()})
+        revoked += [f"kouxing keys revoke {name}"] * (name in names)
     if reasons:
         fix = "; ".join([*revoked, f"rm {' '.join(removed)}"])
         raise UserError(f"{reasons[0]}; run: {fix}")

@@ -49,7 +49,8 @@ def make_captions(
 ) -> Captions | None:
     """Return the captions of a video of this size, if any.
 
-    Raises ``UserError`` if characters are required and the text has none, or no font has them.
+    Raises ``UserError`` if characters are required, but there is no text with characters, or no
+    font has them.
     """
     if kind is None:
         return None

@@ -51,23 +51,23 @@ def examine(given: str) -> Iterator[Finding]:
         except UserError as error:
             yield Finding("keys", "cannot be used", str(error))
             return
-    accepted: list[Key | None] = []
+    accepted: list[tuple[Key | None, str]] = []
     for name, key in keys.items():
-        finding = _check_key(name, key, with_key(address, key.control if key else ""))
+        endpoint = with_key(address, key.control if key else "")
+        finding = _check_key(name, key, endpoint)
         if not finding.fix:
-            accepted.append(key)
+            accepted.append((key, endpoint))
         yield finding
     if not accepted:
         return
+    key, endpoint = accepted[0]
     try:
-        key = accepted[0]
-        endpoint = with_key(address, key.control if key else "")
         with connect(endpoint, key=key, timeout_s=5.0) as client:
             services = client.status().services
     except UserError as error:
         yield Finding("status", "control does not answer", str(error))
         return
-    with Bus(accepted[0]) as bus:
+    with Bus(key) as bus:
         for service in services:
             yield from _check_service(service, bus)
     for name in MIN_SERVICES:

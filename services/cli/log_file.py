@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO
@@ -18,7 +17,7 @@ class LogFile:
     """Appends lines to a file that only this user can read, without the page's token.
 
     Writing never raises. Lines that cannot be written are counted; ``warn`` reports the first one
-    and, when lines can be written again, the number. Any thread may write.
+    and, when lines can be written again, the number.
     """
 
     def __init__(
@@ -29,40 +28,34 @@ class LogFile:
         self._max_bytes = max_bytes
         self._file: IO[bytes] | None = None
         self._num_dropped = 0
-        self._lock = threading.Lock()
 
     def write(self, line: bytes) -> None:
         """Append a line."""
-        with self._lock:
-            try:
-                self._append(_TOKEN.sub(rb"\1...", line))
-            except OSError as error:
-                self._close()
-                if not self._num_dropped:
-                    self._warn(f"{self._path}: cannot be written: {error.strerror}")
-                self._num_dropped += 1
-            else:
-                if self._num_dropped:
-                    self._warn(f"{self._path}: {self._num_dropped} lines were dropped")
-                self._num_dropped = 0
+        try:
+            self._append(_TOKEN.sub(rb"\1...", line))
+        except OSError as error:
+            self.close()
+            if not self._num_dropped:
+                self._warn(f"{self._path}: cannot be written: {error.strerror}")
+            self._num_dropped += 1
+        else:
+            if self._num_dropped:
+                self._warn(f"{self._path}: {self._num_dropped} lines were dropped")
+            self._num_dropped = 0
 
     def close(self) -> None:
         """Close the file; a later line opens it again."""
-        with self._lock:
-            self._close()
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
 
     def _append(self, line: bytes) -> None:
         if self._file is not None and self._file.tell() > self._max_bytes:
-            self._close()
+            self.close()
             self._path.replace(self._path.with_name(f"{self._path.name}.1"))
         if self._file is None:
             flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
             self._file = os.fdopen(os.open(self._path, flags, 0o600), "ab", buffering=0)
             os.fchmod(self._file.fileno(), 0o600)
         self._file.write(line)
-
-    def _close(self) -> None:
-        if self._file is not None:
-            with contextlib.suppress(OSError):
-                self._file.close()
-            self._file = None

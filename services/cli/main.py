@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable
 from importlib.metadata import entry_points, version
@@ -134,7 +133,6 @@ for kind in KINDS.values():
 
 def main() -> None:
     """Run the command line. A user error gives one line on standard error and exit status 2."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # also when it is a log file
     try:

@@ -71,7 +71,7 @@ class CaptionKind(StrEnum):
 
 
 class DrawnLips(StrEnum):
-    """What gives the width of a mouth that is drawn in two dimensions."""
+    """Source of the width of a mouth that is drawn in two dimensions."""
 
     VISEMES = "dynamic-visemes"
     LEARNT = "learnt"

@@ -73,8 +73,7 @@ class Supervisor:
                 f"{log_folder}: cannot be written: {error.strerror}; start kouxing in a folder that"
                 " you can write to, or add --set driver.out=FOLDER"
             ) from None
-        check_output(*(log_folder / f"{name}.log" for name in self._names), force=True)
-        self._logs: dict[str, LogFile] = {}
+        check_output(*map(self._log_path, self._names), force=True)
 
     def start(self) -> None:
         """Start every service."""
@@ -163,8 +162,6 @@ class Supervisor:
                 process.kill()
                 process.wait()
         self._processes.clear()
-        for log in self._logs.values():
-            log.close()
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
@@ -211,10 +208,12 @@ class Supervisor:
         process.wait()
         self._process_ended.set()
 
+    def _log_path(self, name: str) -> Path:
+        return self._log_folder / f"{name}.log"
+
     def _copy_log(self, name: str, stream: IO[bytes]) -> None:
-        new = LogFile(self._log_folder / f"{name}.log", self._warn)
-        log = self._logs.setdefault(name, new)
-        with stream:
+        log = LogFile(self._log_path(name), self._warn)
+        with stream, contextlib.closing(log):
             for line in stream:
                 log.write(line)
                 if text := _console_text(line):

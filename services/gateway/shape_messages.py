@@ -53,7 +53,7 @@ class ShapeEncoder:
 
 
 def parse_shape_query(query: Mapping[str, str]) -> ShapeEncoder | None:
-    """Return the encoder that a URL's query asks for; None if it asks for no shapes.
+    """Return the encoder for the shapes in a URL's query; None without shapes.
 
     Raises ``UserError`` if the shape set or the format does not exist.
     """

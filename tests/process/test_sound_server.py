@@ -9,8 +9,8 @@ from collections.abc import Generator, Iterator
 import numpy as np
 import pytest
 
-from kouxing.evaluation.system.chromium import wait_until
 from kouxing.shared.sound_devices import monitor, sound_devices
+from tests.system import wait_until
 
 RATE_HZ, TONE_HZ = 16_000, 1000
 MAX_BLOCKS = 1000  # 20 s: playback without a loudspeaker may start late

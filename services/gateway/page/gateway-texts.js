@@ -1,4 +1,4 @@
-// Chinese for the texts of the gateway. {name} stands for a value, which is translated too.
+// Chinese for the texts of the gateway. {name} is a placeholder for a value, which is also translated.
 
 const CHINESE = {
   // Files: the same texts as those of the commands
