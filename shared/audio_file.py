@@ -26,9 +26,9 @@ from kouxing.shared.media_file import (
 from kouxing.shared.sound_formats import (
     NUM_BEGIN_BYTES,
     is_sound,
-    needs_all,
     needs_more,
-    other_kind,
+    needs_whole_file,
+    non_audio_kind,
     stated_bytes,
 )
 
@@ -141,7 +141,7 @@ def _open_pipe(
     if not begin:
         raise UserError(f"{name}: no sound arrived; check the command that writes it")
     if not is_sound(begin):
-        if kind := other_kind(begin):
+        if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")
         raw = raw or RawFormat()
         source = raw_audio(pipe, raw, name)
@@ -156,7 +156,7 @@ def _open_pipe(
             f"{name}: the format of this sound states its rate and channels; leave out --rate and"
             " --channels, or add --raw if these are raw samples"
         )
-    if stream.seekable() or needs_all(begin):
+    if stream.seekable() or needs_whole_file(begin):
         file = stream if stream.seekable() else pipe.read_all()
         file.seek(0)
         return _with_file(file, lambda: _open_file(file, name, name, block_s, track))

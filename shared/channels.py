@@ -50,6 +50,7 @@ class CancellationGuard:
         if not self._has_remarked:
             self._has_remarked = True
             self._remarks.append(
-                f"{self._name}: mixed, the channels are silent; only channel {loudest + 1} is used"
+                f"{self._name}: the channels cancel out when mixed;"
+                f" only channel {loudest + 1} is used"
             )
         return channels[:, [loudest] * self._num_channels]

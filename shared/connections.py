@@ -356,11 +356,11 @@ class ConnectionLimiter:
         for connection in connections:
             connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
         _disconnect_heaviest(
-            connections, lambda c: c.undelivered, MAX_UNDELIVERED, "too much waits for delivery"
+            connections, lambda c: c.undelivered, MAX_UNDELIVERED, "too much undelivered data"
         )
         max_incomplete = MAX_INCOMPLETE + SMALL_INCOMPLETE * len(connections)
         _disconnect_heaviest(
-            connections, lambda c: c.incomplete, max_incomplete, "too many messages do not end"
+            connections, lambda c: c.incomplete, max_incomplete, "too many incomplete messages"
         )
         _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
         if self._trims_s and now_s >= self._trims_s[0]:

@@ -64,7 +64,7 @@ def needs_more(begin: bytes) -> bool:
     return may_be and not is_sound(begin)
 
 
-def other_kind(begin: bytes) -> str:
+def non_audio_kind(begin: bytes) -> str:
     """Return what a file is that is not sound, and what to do; empty if unknown."""
     for mark, kind in _OTHER.items():
         if begin.startswith(mark):
@@ -75,7 +75,7 @@ def other_kind(begin: bytes) -> str:
 
 def why_unreadable(begin: bytes, reason: str) -> str:
     """Return why FFmpeg cannot read a file with these first bytes."""
-    if kind := other_kind(begin):
+    if kind := non_audio_kind(begin):
         return f"cannot read audio: this is {kind}"
     if not any(begin):
         return "cannot read audio: the file has only zeros; copy or record it again"
@@ -98,7 +98,7 @@ def stated_bytes(begin: bytes) -> int | None:
     return None
 
 
-def needs_all(begin: bytes) -> bool:
+def needs_whole_file(begin: bytes) -> bool:
     """Return whether a file can be decoded only once its end is there."""
     if begin.startswith((b"caff", b"wvpk")):
         return True

@@ -27,6 +27,7 @@ ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
 VOWELS_FILE = ROOT / "tests" / "sounds" / "vowels-male.wav"  # a o e i u ü, with pauses between
 CHAIN = ("control", "recognizer", "synthesizer")
+NODE = Path(sys.executable).with_name("node")
 LIMIT_S = 60.0  # for anything that takes no time on an idle machine
 PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused

@@ -189,7 +189,7 @@ def express(
         list[str] | None,
         typer.Argument(
             metavar="[SESSION] [NAME=STRENGTH]...",
-            help="A session, by default the face at rest and every session. Expressions with"
+            help="Session name. Default: the face at rest and every session. Expressions with"
             f" strengths from 0 to 1: {', '.join(ExpressionName)}.",
         ),
     ] = None,

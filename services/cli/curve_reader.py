@@ -171,12 +171,12 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
     steps_s = np.diff(times_s)
     if (steps_s < 0).any():
         number = int(np.argmax(steps_s < 0)) + 2
-        raise UserError(f"{path}, frame {number}: its time is earlier than that of the last frame")
+        raise UserError(f"{path}, frame {number}: its time is earlier than the previous frame's")
     times_s, first = np.unique(times_s - times_s[0], return_index=True)
     rate_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 1 else 50.0
     num_frames = round(times_s[-1] * rate_hz) + 1
     if not 1.0 <= rate_hz <= 1000.0 or num_frames > 10 * len(times_s) + 1000:
-        raise UserError(f"{path}: the times are not those of 1 to 1000 frames per second")
+        raise UserError(f"{path}: the times do not match a rate of 1 to 1000 frames per second")
     grid_s = np.arange(num_frames) / rate_hz
     columns = [np.interp(grid_s, times_s, column) for column in faps[first].T]
     return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))

@@ -25,10 +25,9 @@ from tests.browser import Browser, serve_folder
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file
 from tests.glb_writer import Mesh, write_glb
-from tests.system import DEMO, ROOT, Gateway, System
+from tests.system import DEMO, NODE, ROOT, Gateway, System
 
 SPEECH = DEMO / "hello-female.wav"
-NODE = Path(sys.executable).with_name("node")
 JAVASCRIPT_CLIENT = ROOT / "clients" / "javascript"
 PYTHON_CLIENT = ROOT / "clients" / "python"
 

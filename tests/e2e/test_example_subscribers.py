@@ -14,12 +14,11 @@ import soundfile
 from kouxing_client import Client
 
 from tests.e2e.following import Stream, samples_of_file
-from tests.system import CHAIN, ROOT, VOWELS_FILE, System, free_port
+from tests.system import CHAIN, NODE, ROOT, VOWELS_FILE, System, free_port
 
 FOLDER = ROOT / "examples" / "subscribe"
 STREAM_CLIENTS = ROOT / "examples" / "stream"
 STREAM = ROOT / "examples" / "unity" / "KouxingStream.cs"
-NODE = str(Path(sys.executable).with_name("node"))
 SAMPLES = samples_of_file(VOWELS_FILE)
 
 
@@ -33,7 +32,7 @@ def programs(tmp_path: Path) -> list[list[str]]:
     subprocess.run(["cc", FOLDER / "follow.c", "-o", program, *options], check=True)
     return [
         [sys.executable, str(FOLDER / "follow.py")],
-        [NODE, str(tmp_path / "follow.mjs")],
+        [str(NODE), str(tmp_path / "follow.mjs")],
         [str(program)],
     ]
 
@@ -44,7 +43,7 @@ def clients(tmp_path: Path, programs: list[list[str]]) -> list[list[str]]:
     shutil.copy(STREAM_CLIENTS / "client.mjs", tmp_path)
     return [
         [sys.executable, str(STREAM_CLIENTS / "client.py")],
-        [NODE, str(tmp_path / "client.mjs")],
+        [str(NODE), str(tmp_path / "client.mjs")],
     ]
 
 

@@ -20,7 +20,6 @@ from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System
 
 EXAMPLES = ROOT / "examples" / "stream"
-NODE = str(Path(sys.executable).with_name("node"))
 KEY_FILE = "~/.local/state/kouxing/client.key"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
-from tests.system import ROOT
+from tests.system import NODE, ROOT
 
 CLIENT = ROOT / "clients" / "javascript"
 ARKIT = ["jawOpen", "mouthPucker", "eyeBlinkLeft", "eyeBlinkRight"]
@@ -113,7 +113,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]
         if kind:
             change(paths[-1], kind)
     result = subprocess.run(
-        ["node", "look.js", *paths], cwd=folder, capture_output=True, text=True, check=True
+        [NODE, "look.js", *paths], cwd=folder, capture_output=True, text=True, check=True
     )
     return dict(zip(FILES, map(json.loads, result.stdout.splitlines()), strict=True))
 

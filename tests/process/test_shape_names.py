@@ -9,7 +9,7 @@ from pathlib import Path
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shape_names import choose_set, find_shapes
-from tests.system import ROOT
+from tests.system import NODE, ROOT
 
 MESHES = [
     "Face.jawOpen mouthPucker mouthSmile.L mouthSmileR BROWINNERUP eyeLookOut_L head_A",
@@ -104,7 +104,7 @@ def expected() -> list[list[object]]:
 
 
 def test_javascript_finds_the_same_shapes() -> None:
-    command: list[str | Path] = ["node", "--input-type=module", "-e", JAVASCRIPT]
+    command: list[str | Path] = [NODE, "--input-type=module", "-e", JAVASCRIPT]
     meshes = json.dumps([mesh.split() for mesh in MESHES])
     assert output(command, meshes, ROOT / "clients" / "javascript") == expected()
 

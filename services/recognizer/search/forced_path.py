@@ -162,7 +162,7 @@ def viterbi_path(
         first_node = max(low, end - step * num_skipped)  # the path cannot come from before
         inputs = block_of(start, first_node, end)
         back = _origins(row[first_node - low : end - low], *inputs, num_skipped)
-        _trace(back, first_node, num_skipped, piece)
+        _backtrace(back, first_node, num_skipped, piece)
     return path, float(totals.max())
 
 
@@ -230,7 +230,7 @@ def _origins(
 
 
 @numba.njit(cache=True, nogil=True)
-def _trace(back: NDArray[np.int8], low: int, num_skipped: int, path: NDArray[np.int64]) -> None:
+def _backtrace(back: NDArray[np.int8], low: int, num_skipped: int, path: NDArray[np.int64]) -> None:
     """Fill a block of the path, (frames + 1,), from its last node."""
     for frame in range(len(path) - 1, 0, -1):
         origin = back[frame - 1, path[frame] - low]
