@@ -47,6 +47,7 @@ MIN_BUDGET = 100.0  # of a new connection: enough for an honest client of a key 
 PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
+MANY_ENDED = 50  # connections, with about 1 MB; giving memory back takes up to 60 ms
 _EVENT = struct.Struct("=HI")  # of a monitor: event and descriptor
 _WARNINGS = RateLimit()
 
@@ -253,6 +254,7 @@ class ConnectionLimiter:
         self._sockets: list[LimitedSocket] = []
         self._topic_bytes = 0  # at most; the socket's thread only
         self._trims_s: list[float] = []  # when to give memory back
+        self._num_ended = 0  # connections that ended since memory was given back
         self._stops = threading.Event()
         self._thread = threading.Thread(target=self._run, name="connections", daemon=True)
 
@@ -365,6 +367,7 @@ class ConnectionLimiter:
         _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
         if self._trims_s and now_s >= self._trims_s[0]:
             del self._trims_s[0]
+            self._num_ended = 0
             trim_heap()
 
     def _limit_number(self, connections: list[Connection]) -> None:
@@ -386,7 +389,8 @@ class ConnectionLimiter:
         for connection in [c for c in list(self._connections.values()) if not _exists(c)]:
             del self._connections[connection.inode]
             connection.socket.ended.append(connection.inode)
-            if connection.is_cut or connection.unread:
+            self._num_ended += 1
+            if connection.is_cut or connection.unread or self._num_ended >= MANY_ENDED:
                 self._trims_s = [now_s + delay_s for delay_s in TRIMS_S]
             self.save_budget(connection)
         for owner in [owner for owner, kept in self._budgets.items() if kept.left >= BUDGET]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 from typing import cast
+from unittest import mock
 
 import pytest
 
@@ -12,9 +13,11 @@ from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
     BUDGET,
     BUDGET_PER_S,
+    MANY_ENDED,
     MAX_QUEUED,
     MIN_BUDGET,
     PENALTY_S,
+    TRIMS_S,
     Budget,
     Connection,
     ConnectionLimiter,
@@ -126,6 +129,18 @@ def test_silent_connections_make_room(scene: Scene) -> None:
     scene.enforce_limits(0.0)
     assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 7
     assert not talker.is_cut
+
+
+@pytest.mark.parametrize(("number", "trims"), [(MANY_ENDED - 1, 0), (MANY_ENDED, 1)])
+def test_gives_memory_back_after_many_peers_left(scene: Scene, number: int, trims: int) -> None:
+    trim = mock.Mock()
+    scene.patch.setattr(connections, "trim_heap", trim)
+    for descriptor in range(number):
+        scene.deliver(descriptor, f"key {descriptor}")
+        scene.ended.add(descriptor)
+        scene.enforce_limits(0.0)
+    scene.enforce_limits(TRIMS_S[0])
+    assert trim.call_count == trims
 
 
 def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scene) -> None:
