@@ -36,7 +36,8 @@ MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of mem
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
 MAX_CONNECTIONS = 1024
-MAX_SHARE = 0.75  # of them, from one address or with one key
+MAX_SHARE = 0.75  # of them, with one key or, until the key is known, from one address
+SERVICES_SHARE = 0.1  # of them, only for services
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
@@ -243,11 +244,17 @@ class LimitedSocket:
 class ConnectionLimiter:
     """Watches the connections to all bound sockets of a process.
 
-    It allows ``extra_connections`` in addition to ``MAX_CONNECTIONS``.
+    It allows ``extra_connections`` in addition to ``MAX_CONNECTIONS``. ``is_service`` returns
+    whether a key belongs to a service.
     """
 
-    def __init__(self, extra_connections: int = 0) -> None:
+    def __init__(
+        self,
+        extra_connections: int = 0,
+        is_service: Callable[[str], bool] = lambda key: False,
+    ) -> None:
         self._extra_connections = extra_connections
+        self._is_service = is_service
         self._max_connections = 0
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
@@ -296,16 +303,9 @@ class ConnectionLimiter:
         return [c for c in connections if c.socket is socket and not c.is_cut]
 
     def restore_budget(self, connection: Connection) -> None:
-        """Start a connection with the budget that its owner's earlier ones left.
-
-        Disconnect it if its key has too many connections.
-        """
+        """Start a connection with the budget that its owner's earlier ones left."""
         if (kept := self._budgets.get(connection.owner)) is not None:
             connection.budget = Budget(max(MIN_BUDGET, kept.left))
-        same_key = [c for c in list(self._connections.values()) if c.key == connection.key]
-        max_shared = MAX_SHARE * self._max_connections
-        if connection.key and sum(not c.is_cut for c in same_key) > max_shared:
-            connection.disconnect("its key has too many connections")
 
     def save_budget(self, connection: Connection) -> None:
         """Keep what is left of a connection's budget for its owner's next connections."""
@@ -371,19 +371,39 @@ class ConnectionLimiter:
             trim_heap()
 
     def _limit_number(self, connections: list[Connection]) -> None:
-        """Disconnect silent peers, oldest first, then the newest ones, if there are too many."""
+        """Disconnect some peers if there are too many: silent ones first, services last.
+
+        The owner with the most connections loses its oldest silent or else its newest one first.
+        """
         max_shared = MAX_SHARE * self._max_connections
-        shares = Counter(connection.address for connection in connections)
-        if not shares or max(shares.total() * MAX_SHARE, *shares.values()) <= max_shared:
+        if len(connections) <= max_shared:
             return
-        silent = [connection for connection in connections if not connection.num_delivered]
-        others = [connection for connection in connections if connection.num_delivered]
-        for connection in (*silent, *reversed(others)):
-            if shares.total() > self._max_connections:
-                connection.disconnect("there are too many connections")
-            elif shares[connection.address] > max_shared:
-                connection.disconnect("its address has too many connections")
-            shares[connection.address] -= connection.is_cut
+        max_others = (1 - SERVICES_SHARE) * self._max_connections
+        silent: list[Connection] = []
+        known: list[Connection] = []
+        services: list[Connection] = []
+        for connection in connections:
+            is_service = self._is_service(connection.key)
+            is_known = connection.num_delivered > 0
+            (services if is_service else known if is_known else silent).append(connection)
+        ranks: dict[Connection, int] = {}
+        shares: Counter[str] = Counter()
+        for connection in (*services, *known, *reversed(silent)):
+            shares[connection.owner] += 1
+            ranks[connection] = -shares[connection.owner]
+        known.reverse()  # of owners with equal shares, the newest connection is first
+        others = [*sorted(silent, key=ranks.__getitem__), *sorted(known, key=ranks.__getitem__)]
+        max_services = self._max_connections - min(len(others), max_others)
+        services.sort(key=ranks.__getitem__)
+        for group, max_number in ((others, max_others), (services, max_services)):
+            num_excess = len(group) - max_number
+            for connection in group:
+                if num_excess > 0:
+                    connection.disconnect("there are too many connections")
+                elif -ranks[connection] > max_shared:
+                    owner = "key" if connection.key else "address"
+                    connection.disconnect(f"its {owner} has too many connections")
+                num_excess -= connection.is_cut
 
     def _forget_ended(self, now_s: float) -> None:
         for connection in [c for c in list(self._connections.values()) if not _exists(c)]:

@@ -10,7 +10,7 @@ from zmq.utils import z85
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.kernel_sockets import network_of
-from kouxing.shared.keys import Grants, grants_file, read_grants
+from kouxing.shared.keys import Grant, Grants, grants_file, read_grants
 from kouxing.shared.logs import LOG
 
 
@@ -60,6 +60,11 @@ class Zap:
             return 0, 0
         return about.st_ino, about.st_mtime_ns
 
+    def is_service(self, public: str) -> bool:
+        """Return whether a key belongs to a service."""
+        grant = self.grants.get(public)
+        return grant is not None and _has_role(grant, "service")
+
     def may_connect(self, public: str, domain: str) -> bool:
         """Return whether a key may connect to a socket, given its configuration key."""
         self.refresh()
@@ -67,7 +72,11 @@ class Zap:
         if grant is None:
             return False
         required = self.required_roles.get(domain)
-        return required is None or any(role.partition(":")[0] == required for role in grant.roles)
+        return required is None or _has_role(grant, required)
+
+
+def _has_role(grant: Grant, name: str) -> bool:
+    return any(role.partition(":")[0] == name for role in grant.roles)
 
 
 def answer_handshakes(

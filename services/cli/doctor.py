@@ -105,7 +105,7 @@ def _check_service(service: ServiceState, bus: Bus) -> Iterator[Finding]:
         if problem := _endpoint_problem(name, endpoint, bus):
             problems.append(f"{name} at {address}: {problem}")
     endpoints = plural(len(service.endpoints), "endpoint")
-    about = f"{endpoints}, clock {round(service.clock_offset_ms):+d} ms"
+    about = f"{endpoints}, clock {service.clock_offset_ms:+.0f} ms"
     yield Finding(service.instance, about, "\n".join(problems))
 
 

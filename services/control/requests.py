@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from kouxing.services.control.refusal import Refusal
 from kouxing.shared.bus import Bus
-from kouxing.shared.keys import Grant, Peer
+from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
@@ -91,21 +91,21 @@ class Requests:
 
         Raises ``Refusal`` if the key lacks these roles.
         """
-        if self._bus.zap is None or not roles:
-            return
-        grant = self._grant(sender)
-        if grant is None or not set(roles) & set(grant.roles):
+        if roles and not self.has_role(sender.key, *roles):
             text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
             raise Refusal(ErrorCode.NOT_ALLOWED, text)
 
-    def may_see_token(self, sender: Peer) -> bool:
-        """Return whether a sender may have the page's token: it opens sessions, or is a service."""
+    def has_role(self, key: str, *roles: str) -> bool:
+        """Return whether a key has one of ``roles``; True if ``insecure``."""
         if self._bus.zap is None:
             return True
-        grant = self._grant(sender)
-        return grant is not None and any(
-            role == "client" or role.startswith("service:") for role in grant.roles
-        )
+        grant = self._bus.zap.grants.get(key)
+        return grant is not None and not set(roles).isdisjoint(grant.roles)
+
+    def may_see_token(self, sender: Peer) -> bool:
+        """Return whether a sender may have the page's token: it opens sessions, or is a service."""
+        zap, key = self._bus.zap, sender.key
+        return zap is None or self.has_role(key, "client") or zap.is_service(key)
 
     def changed_keys(self, heartbeat: Heartbeat) -> dict[str, AllowedKey] | None:
         """Return the list of allowed keys for a worker, unless it has the list already."""
@@ -130,6 +130,3 @@ class Requests:
         return (
             self.defers and refusal.code in TEMPORARY_ERRORS and len(self._deferred) < MAX_DEFERRED
         )
-
-    def _grant(self, sender: Peer) -> Grant | None:
-        return None if self._bus.zap is None else self._bus.zap.grants.get(sender.key)

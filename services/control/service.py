@@ -117,6 +117,7 @@ class ControlService(Service):
         self._registry.exclude_pause(self._tick_stall.check(now_s))
         if self.bus.zap is not None:
             self.bus.zap.refresh()
+            self._end_revoked_sessions()
         if self._takeover.is_active and now_s > self._takeover.end_s:
             self._takeover.is_active = self._requests.defers = False
             self._restore_sessions()
@@ -399,6 +400,14 @@ class ControlService(Service):
         self._sessions.remove(record, time.monotonic())
         self._publish(EventName.SESSION_CLOSED, record.name, detail=reason)
         LOG.info("session closed: %s", reason, extra={"session": record.name})
+
+    def _end_revoked_sessions(self) -> None:
+        """End the sessions of keys that were revoked or may open no sessions now."""
+        has_role = self._requests.has_role
+        revoked = {key for key in self._sessions.client_keys() if not has_role(key, "client")}
+        for record in self._sessions if revoked else ():
+            if record.client.key in revoked:
+                self._end_session(record, "its client's key was revoked")
 
     def _publish(
         self, name: EventName, session: str = "", *, detail: str = "", media_time: int = 0

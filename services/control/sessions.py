@@ -80,6 +80,10 @@ class Sessions:
         records = list(self._records.values())
         return records[bisect_left(records, number, key=attrgetter("number")) :]
 
+    def client_keys(self) -> list[str]:
+        """Return the public keys of the clients that have sessions."""
+        return [key for key, number in self._num_per_key.items() if number]
+
     def pending(self) -> list[SessionRecord]:
         """Return the sessions that wait for a service, or whose client must be informed."""
         for record in list(self._pending.values()):

@@ -15,7 +15,6 @@ from kouxing.shared.wire.message import (
     EndpointMap,
     Message,
     Name,
-    Nanoseconds,
     Probability,
     Samples,
     Seconds,
@@ -66,7 +65,7 @@ class Heartbeat(Message):
     instance: Name  # new at every start of the process
     role: Role  # a worker is placed in sessions, an observer takes part in all of them
     state: ServiceStatus
-    sent_ns: Nanoseconds  # the sender's clock
+    sent_ns: int  # the sender's clock, which may be wrong
     endpoints: EndpointMap = field(default_factory=dict)  # that it provides, by name
     needs: Annotated[list[Name], Meta(max_length=16)] = field(
         default_factory=list
@@ -92,9 +91,9 @@ class AllowedKey:
 class HeartbeatReply(Message):
     """Control's answer to a heartbeat; the four timestamps give the offset of the clocks."""
 
-    sent_ns: Nanoseconds  # as in the heartbeat
-    received_ns: Nanoseconds  # control's clock
-    replied_ns: Nanoseconds  # control's clock
+    sent_ns: int  # as in the heartbeat
+    received_ns: int  # control's clock
+    replied_ns: int  # control's clock
     control: Name  # generated when control starts; when it changes, control has restarted
     keys: Annotated[dict[Name, AllowedKey], Meta(max_length=MAX_KEYS)] | None = (
         None  # that may connect to the worker's sockets, by public key; None: as before

@@ -90,11 +90,7 @@ def some_type(kind: msgspec.inspect.UnionType) -> msgspec.inspect.Type:
 
 
 def number_text(value: float) -> str:
-    for exponent in (53, 63):
-        for power, text in ((2**exponent, f"2^{exponent}"), (2**exponent - 1, f"2^{exponent} - 1")):
-            if value == power:
-                return text
-    return f"{value:.10g}"
+    return "2^53" if value == 2**53 else f"{value:.10g}"
 
 
 def span_text(low: float | None, high: float | None, unit: str = "") -> str:

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from kouxing.shared.keys import user_key
+from kouxing.shared.bus import Bus
+from kouxing.shared.keys import add_key, read_key, revoke_key, user_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
 from kouxing.shared.wire.session import OpenSession, SessionOpened
@@ -34,6 +35,20 @@ def test_a_repeated_request_gets_the_same_answer(stage: Stage) -> None:
     first = stage.open(client, "mine")
     assert isinstance(first, SessionOpened)
     assert stage.open(client, "mine") == first
+
+
+@pytest.mark.parametrize("stage", [False], indirect=True)
+def test_sessions_end_when_their_key_is_revoked(stage: Stage, tmp_path: Path) -> None:
+    add_key("laptop", ["client"], tmp_path / "laptop.key")
+    laptop = stage.stranger(read_key(tmp_path / "laptop.key"))
+    assert isinstance(stage.open(laptop, "revoked"), SessionOpened)
+    with Bus(user_key()) as bus:
+        client = bus.connect_dealer(stage.control.endpoints["commands"])
+        client.send(OpenSession(request="2", session="kept"))
+        stage.step_until(lambda: client.wait(0.0))
+        revoke_key("laptop")
+        stage.step_until(lambda: stage.control._sessions.get("revoked") is None)
+        assert stage.control._sessions.get("kept") is not None
 
 
 class Link:

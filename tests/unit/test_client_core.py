@@ -205,3 +205,14 @@ def test_asks_where_a_silent_session_of_another_program_is(is_there: bool) -> No
         scene.answer("error", code="unknown-session", text="x")
         assert inbox.is_over
         assert inbox.failure is None
+
+
+def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
+    scene = Scene()
+    inbox = scene.subscribe()
+    for is_refused in (True, False, True, True):  # the first refusal is short
+        scene.commands.on_refused(is_refused)
+        assert not inbox.is_over
+        scene.pass_time(6.0)
+    assert inbox.is_over
+    assert "refuses this client" in str(inbox.failure)

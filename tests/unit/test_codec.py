@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kouxing.shared.wire.codec import BadMessage, decode, encode
+from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import OpenSession
 from tests.samples import SAMPLES
@@ -64,6 +66,16 @@ def test_rejects_another_version_and_says_what_to_do() -> None:
 def test_fields_with_defaults_are_optional_and_unknown_fields_are_ignored() -> None:
     message = decode(parts_of("open-session", request="r", color="red"))
     assert message == OpenSession(session="s", request="r")
+
+
+@pytest.mark.parametrize("clock_ns", [-(2**63), -1, 2**63, 2**64 - 1])
+def test_heartbeats_of_a_wrong_clock_count(clock_ns: int) -> None:
+    heartbeat = SAMPLES["heartbeat"]
+    assert isinstance(heartbeat, Heartbeat)
+    wrong = replace(heartbeat, sent_ns=clock_ns)
+    assert decode(encode(wrong)) == wrong
+    reply = HeartbeatReply(sent_ns=clock_ns, received_ns=-1, replied_ns=clock_ns, control="c")
+    assert decode(encode(reply)) == reply
 
 
 @given(st.lists(st.binary(max_size=200), max_size=4))

@@ -38,9 +38,9 @@ class Scene:
         patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 5560)
         patch.setattr(kernel_sockets, "address_of", lambda d: self.addresses.get(d, "loopback"))
         patch.setattr(kernel_sockets, "traffic_of", lambda d: self.traffic.get(d, Traffic()))
-        patch.setattr(connections, "MAX_CONNECTIONS", 8)
+        patch.setattr(connections, "MAX_CONNECTIONS", 10)
         patch.setattr("threading.Thread.start", lambda _thread: None)
-        self.limiter = ConnectionLimiter()
+        self.limiter = ConnectionLimiter(is_service=lambda key: key == "service")
         raw = SimpleNamespace(setsockopt=lambda *_: None, get_monitor_socket=lambda *_: None)
         self.socket = self.limiter.limit(raw, AUDIO)  # type: ignore[arg-type]
         self.socket.port = 5560
@@ -112,22 +112,33 @@ def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
     assert not other.is_cut
 
 
-@pytest.mark.parametrize("shares", ["key", "address"])
-def test_one_peer_cannot_take_all_connections(scene: Scene, shares: str) -> None:
+@pytest.mark.parametrize("key", ["key", ""])
+def test_one_peer_cannot_take_all_connections(scene: Scene, key: str) -> None:
     made = []
-    for number in range(1, 9):
-        scene.addresses[number] = "10.0.0.1" if shares == "address" else f"10.0.1.{number}"
-        made.append(scene.deliver(number, "key" if shares == "key" else f"key {number}"))
+    for number in range(1, 10):
+        made.append(scene.deliver(number, key))
         scene.enforce_limits(0.0)
-    assert [connection.is_cut for connection in made] == [False] * 6 + [True] * 2
+    assert [connection.is_cut for connection in made] == [False] * 7 + [True] * 2
+
+
+def test_services_and_other_keys_of_a_machine_keep_their_connections(scene: Scene) -> None:
+    scene.limiter._max_connections = 20
+    honest = [scene.deliver(1, "service"), scene.deliver(2, "laptop")]
+    for number in range(10, 40):
+        scene.deliver(number, f"flood {number % 2}")
+        scene.enforce_limits(0.0)
+    honest += [scene.deliver(3, "service"), scene.deliver(4, "laptop")]
+    scene.enforce_limits(0.0)
+    assert not any(connection.is_cut for connection in honest)
+    assert len(scene.limiter.connections_to(scene.socket)) == 20
 
 
 def test_silent_connections_make_room(scene: Scene) -> None:
     scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
-    silent = [scene.limiter.find(number, scene.socket) for number in range(8)]
-    talker = scene.deliver(8, "talker")
+    silent = [scene.limiter.find(number, scene.socket) for number in range(9)]
+    talker = scene.deliver(9, "talker")
     scene.enforce_limits(0.0)
-    assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 7
+    assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 8
     assert not talker.is_cut
 
 

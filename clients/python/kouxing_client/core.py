@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -59,7 +60,7 @@ class ClientCore:
         self._timeout_s = timeout_s
         self._make_signal = make_signal
         self._requests: dict[str, _Request] = {}
-        self._is_refused = False
+        self._refused_s = math.inf  # since when control refuses this key
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
         self._asked_s: dict[str, float] = {}  # when control was asked about a silent session
         self._events: Connection | None = None
@@ -129,6 +130,9 @@ class ClientCore:
                 self._requests.pop(name).answer.set_exception(KouxingError(self._timeout_error()))
             elif now_s >= request.retry_s:
                 self._send(request)
+        if now_s > self._refused_s + self._timeout_s:  # shorter refusals are penalties
+            for session in self.sessions:
+                session.end(KouxingError(self._timeout_error()))
         for session in list(self.sessions):
             session.tick()
             if session.is_over:
@@ -148,7 +152,8 @@ class ClientCore:
 
     def _connect(self) -> Connection:
         def set_refused(is_refused: bool) -> None:
-            self._is_refused = is_refused
+            now_s = self._sockets.now_s
+            self._refused_s = min(self._refused_s, now_s) if is_refused else math.inf
 
         return self._sockets.connect(self._control, self._on_command, on_refused=set_refused)
 
@@ -162,7 +167,7 @@ class ClientCore:
 
     def _timeout_error(self) -> str:
         address, _, key = self._control.partition(" ")
-        if not self._is_refused:
+        if self._refused_s == math.inf:
             return f"control at {address} does not answer. Start it with 'kouxing run'"
         return f"control at {address} " + (
             "does not accept this key. If it runs on this machine, restart it; otherwise run there"
