@@ -13,13 +13,18 @@ would save fewer lines than its adapters need.
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
 import os
+import textwrap
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -114,7 +119,7 @@ Texts = Annotated[tuple[str, ...], BeforeValidator(_split)]
 class ServiceConfig(BaseModel):
     """The keys that every service has."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     safe_alternative: ClassVar[str] = "bind a loopback address"
     """What to do instead of binding an unencrypted address that other machines can reach."""
@@ -239,7 +244,7 @@ class Settings:
                 origin=given[key].origin if key in given else _default_origin(config, field),
                 default=_default(field),
                 allowed=allowed(field),
-                meaning=_field_help(field),
+                meaning=_key_help(config_type, key),
             )
             for key, field in config_type.model_fields.items()
         ]
@@ -376,9 +381,9 @@ def _default_origin(config: ServiceConfig, field: FieldInfo) -> str:
     return "default"
 
 
-def _field_help(field: FieldInfo) -> str:
-    meaning = " ".join((field.description or "").split())
-    factory = field.default_factory
+def _key_help(config_type: type[ServiceConfig], key: str) -> str:
+    meaning = _docstrings(config_type).get(key, "")
+    factory = config_type.model_fields[key].default_factory
     if isinstance(factory, DependentDefault):
         names: dict[float, list[str]] = {}
         for name, value in factory.defaults.items():
@@ -387,6 +392,19 @@ def _field_help(field: FieldInfo) -> str:
         others = [f"{v:g} with {factory.key} = {' or '.join(n)}" for v, n in names.items()]
         meaning += f" Other defaults: {', '.join(others)}."
     return meaning
+
+
+@cache
+def _docstrings(config_type: type[ServiceConfig]) -> dict[str, str]:
+    """Return the text below each key in the source. pydantic would parse it at every start."""
+    texts = {}
+    for base in config_type.__mro__[-3::-1]:  # from ServiceConfig, after BaseModel and object
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        for statement, text in pairwise(getattr(definition, "body", [])):
+            match statement, text:
+                case ast.AnnAssign(ast.Name(key)), ast.Expr(ast.Constant(str(meaning))):
+                    texts[key] = " ".join(meaning.split())
+    return texts
 
 
 def _hint(name: str, known: Iterable[str]) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 
 from aiohttp import web
 
-ADDRESS_SHARE = 0.75  # of the quota for one address; many people can share a proxy's address
 BURST_S = 5.0  # allowed lead over real time; a network that stalled delivers a burst
 COMMAND_S = 0.05  # a command costs as much as this duration of audio
 

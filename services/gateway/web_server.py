@@ -17,7 +17,8 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
-from kouxing.services.gateway.limits import ADDRESS_SHARE, ConnectionQuota
+from kouxing.services.gateway.config import ADDRESS_SHARE
+from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 

@@ -12,6 +12,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from kouxing.services.recognizer.acoustic.load import load_live_model
@@ -19,6 +20,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
@@ -75,7 +77,12 @@ class RecognizerService(Service):
             "phones": config.reachable(self._phones.endpoint),
             "unpaced_audio": config.reachable(self._unpaced_audio.endpoint),
         }
-        model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
+        with ThreadPoolExecutor(max_workers=1) as executor:  # a restart must be quick
+            loading = executor.submit(
+                load_live_model, config.acoustic, look_ahead_ms=config.look_ahead_ms
+            )
+            load_numba()
+            model = loading.result()
         self._recognizer = Recognizer(model, config.output_rule)
         self.facts = SessionFacts(language=model.inventory.language)
         self._lip_predictor = lip_predictor or lip_predictor_for(model)

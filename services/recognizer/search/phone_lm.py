@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,37 +69,52 @@ class PhoneLanguageModel:
     @cached_property
     def graph(self) -> Graph:
         """The tree as a graph of contexts."""
-        num_phones = len(self.inventory)
-        children = self.num_children.astype(np.int64)
-        num_nodes = len(children)
-        levels = self.levels
-        parent = np.concatenate([[-1], np.repeat(np.arange(num_nodes), children)])
-        key = parent * num_phones + self.phone  # ascending
-        backoff_state = np.zeros(num_nodes, np.int64)
-        for first, end in pairwise(levels[2:]):
-            at, phone = backoff_state[parent[first:end]], self.phone[first:end]
-            left = np.arange(first, end)
-            while len(left):
-                node = np.minimum(np.searchsorted(key, at * num_phones + phone), num_nodes - 1)
-                hit = key[node] == at * num_phones + phone
-                backoff_state[left[hit]] = node[hit]
-                left, at, phone = left[~hit], backoff_state[at[~hit]], phone[~hit]
-        is_context = children > 0
-        is_context[: levels[2]] = True
-        context = np.cumsum(is_context) - 1
-        for first, end in pairwise(levels[2:]):
-            level = slice(first, end)
-            context[level] = np.where(
-                is_context[level], context[level], context[backoff_state[level]]
-            )
+        context, is_context, backoff_state = _contexts(self.num_children, self.phone)
         contexts = np.flatnonzero(is_context)
-        ends = np.cumsum(children)[contexts]
+        end = np.cumsum(self.num_children, dtype=np.int32)
         return Graph(
-            first_arc=np.concatenate([[0], ends]).astype(np.int32),
+            first_arc=np.append(np.int32(0), end[contexts]),
             arc_phone=self.phone[1:],
             arc_log_prob=self.log_prob[1:],
-            arc_context=context[1:].astype(np.int32),
-            backoff_state=context[backoff_state[contexts]].astype(np.int32),
+            arc_context=context[1:],
+            backoff_state=context[backoff_state[contexts]],
             log_backoff=self.log_backoff[contexts],
             last_phone=self.phone[contexts],
         )
+
+
+@numba.njit(cache=True)
+def _contexts(
+    num_children: NDArray[np.uint8], phone: NDArray[np.uint8]
+) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
+    """Return each node's context, whether it is one itself, and the node of its back-off context.
+
+    A node that is not a context leads to its back-off context.
+    """
+    num_nodes, num_phones = len(num_children), num_children[0]
+    first_child = np.empty(num_nodes + 1, np.int32)
+    first_child[0] = 1
+    for node in range(num_nodes):
+        first_child[node + 1] = first_child[node] + num_children[node]
+    context = np.zeros(num_nodes, np.int32)
+    is_context = np.empty(num_nodes, np.bool_)
+    backoff_state = np.zeros(num_nodes, np.int32)
+    num_contexts = 0
+    for node in range(num_nodes):
+        is_context[node] = num_children[node] > 0 or node <= num_phones
+        if is_context[node]:
+            context[node] = num_contexts
+            num_contexts += 1
+        else:
+            context[node] = context[backoff_state[node]]
+        for child in range(first_child[node], first_child[node + 1] if node else 0):
+            shorter = backoff_state[node]
+            while True:
+                match = first_child[shorter]
+                while match < first_child[shorter + 1] and phone[match] < phone[child]:
+                    match += 1
+                if match < first_child[shorter + 1] and phone[match] == phone[child]:
+                    backoff_state[child] = match
+                    break
+                shorter = backoff_state[shorter]
+    return context, is_context, backoff_state
