@@ -9,6 +9,7 @@ judges cannot find out which condition they see.
 from __future__ import annotations
 
 import asyncio
+import json
 import signal
 import time
 from collections.abc import Callable
@@ -24,7 +25,6 @@ from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
 from kouxing.services.gateway.web_server import WebServer, bind_port
-from kouxing.shared.logs import LOG
 
 FOLDER = Path(__file__).parent / "page"
 FILES = {name: FOLDER / name for name in ("index.html", "main.js", "style.css")}
@@ -54,7 +54,6 @@ class ListeningTest:
             middlewares=[access.middleware({route.path for route in routes})],
             client_max_size=MAX_BODY_BYTES,
         )
-        application.on_response_prepare.append(http.add_headers)
         application.add_routes([*routes, web.get("/", _send_file), web.get("/{name}", _send_file)])
         return application
 
@@ -115,13 +114,7 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     listening = bind_port(config.host, config.port)
     endpoint = make_page_endpoint(config, listening.getsockname()[1])
-    server = WebServer(
-        listening,
-        endpoint.tls,
-        on_refused=lambda address: LOG.warning("rejected %s: too many connections", address),
-        on_bad_request=lambda: LOG.warning("dropped a request that is not HTTP"),
-        address_share=config.address_share,
-    )
+    server = WebServer(listening, endpoint.tls, config.address_share)
     await server.start(ListeningTest(study, store).make_application(endpoint.access), ())
     on_ready(endpoint.url)
     await stop.wait()
@@ -137,7 +130,7 @@ async def _send_file(request: web.Request) -> web.StreamResponse:
 
 async def _read_answer(request: web.Request) -> dict[str, Any]:
     try:
-        answer: dict[str, Any] = await request.json()
+        answer: dict[str, Any] = json.loads(await request.read())
         numbers = [answer[name] for name in ("place", *SCALES)]
         is_valid = all(type(number) is int for number in numbers)
         if is_valid and {*numbers[1:]} <= {1, 2, 3, 4, 5} and answer["language"] in LANGUAGES:

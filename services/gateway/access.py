@@ -29,6 +29,8 @@ class AccessPolicy:
     """Secret that private paths require. If empty, they require no token."""
     allowed_origins: Collection[str] = ()
     """Origins of other pages that may connect."""
+    proxy_schemes: Collection[str] = ()
+    """Schemes of the page's origin that a proxy may use, in addition to the connection's."""
 
     def middleware(self, private_paths: Collection[str]) -> Middleware:
         """Return middleware that rejects requests with status 403.
@@ -72,8 +74,11 @@ class AccessPolicy:
         origin = request.headers.get("Origin")
         if origin is None or origin in self.allowed_origins:  # None: not a browser
             return
-        if urlsplit(origin).netloc != request.headers.get("Host"):
-            text = f"pages of {origin} may not connect; add the origin to gateway.allowed_origins\n"
+        schemes = {request.scheme, *self.proxy_schemes}
+        if origin not in {f"{scheme}://{request.headers.get('Host')}" for scheme in schemes}:
+            text = (
+                f"pages of {origin!r} may not connect; add the origin to gateway.allowed_origins\n"
+            )
             raise web.HTTPForbidden(text=text)
 
     def _cors(self, request: web.Request) -> dict[str, str]:
@@ -85,6 +90,6 @@ class AccessPolicy:
     def _check_token(self, request: web.Request) -> None:
         bearer = request.headers.get("Authorization", "").removeprefix("Bearer ")
         given = request.query.get("token", bearer)
-        if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
+        if self.token and not secrets.compare_digest(ascii(given), ascii(self.token)):
             text = "the token is missing or wrong; use the whole address that kouxing printed\n"
             raise web.HTTPForbidden(text=text)

@@ -1,4 +1,4 @@
-"""The web application: the page's files, security headers, and open WebSockets."""
+"""The web application: the page's files, its security policy, and open WebSockets."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
 PING_S = 20.0  # a browser that has vanished is detected within this time
 MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message, unless it has audio
+DISCARD_S = 5.0
 LINGER_S = 1.0  # data is still read, and discarded, after an invalid message
 MAX_REASON_BYTES = 123  # of a close frame, RFC 6455
-MAX_UPLOAD_BYTES = 8 * 1024 * 1024
+MAX_BODY_BYTES = 128 * 1024  # unless a handler reads the body in pieces
 FACE_MESH_FRAME = "face-mesh.html"
 _CLOSE_REASONS: dict[int, str] = {  # of the closes that aiohttp makes
     WSCloseCode.OK: "the connection has ended",
@@ -36,12 +37,6 @@ _CLOSE_REASONS: dict[int, str] = {  # of the closes that aiohttp makes
 }
 _PAGE_SUFFIXES = {".html", ".js", ".css", ".svg", ".glb", ".webp"}
 _FACE_MESH_SUFFIXES = {".js", ".wasm", ".data", ".binarypb"}
-_HEADERS = {  # of every answer
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-cache",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-}
 # The face mesh's WebAssembly glue compiles text into functions. It runs in a frame that permits
 # this but has no access to the camera or the microphone.
 _FACE_MESH_POLICIES = {
@@ -138,9 +133,8 @@ def make_application(
     """
     application = web.Application(
         middlewares=[access.middleware({route.path for route in routes})],
-        client_max_size=MAX_UPLOAD_BYTES,
+        client_max_size=MAX_BODY_BYTES,
     )
-    application.on_response_prepare.append(add_headers)
     modules = _modules_folder()
     if modules is None:
         LOG.warning("%s", _NO_MODULES)
@@ -171,9 +165,12 @@ def make_application(
     return application
 
 
-async def add_headers(_request: web.Request, response: web.StreamResponse) -> None:
-    """Add the security headers of every answer."""
-    response.headers.update(_HEADERS)
+async def discard_body(request: web.Request) -> None:
+    """Discard the rest of an upload for a while, because a browser reads no answer before."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(DISCARD_S):
+            while await request.content.readany():
+                pass
 
 
 def _modules_folder() -> Path | None:

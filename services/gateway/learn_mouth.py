@@ -15,11 +15,12 @@ from typing import Any
 
 from aiohttp import web
 
-from kouxing.services.gateway.http import MAX_UPLOAD_BYTES
+from kouxing.services.gateway.http import discard_body
 from kouxing.services.mouth_profiles import worker
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
+MAX_BYTES = 8 << 20
 UPLOAD_LIMIT_S = 60.0
 LEARNING_LIMIT_S = 180.0
 PRESENCE_CHECK_S = 0.5  # interval at which a disconnected browser is noticed
@@ -52,13 +53,16 @@ class MouthLearner:
         if self._is_closing:
             return _error(503, "the gateway is stopping")
         if self._is_busy:
+            await discard_body(request)
             return _error(503, "another mouth is being learned; try again in a minute")
         self._is_busy = True
         try:
-            recording = await asyncio.wait_for(request.read(), UPLOAD_LIMIT_S)
+            upload = request.clone(client_max_size=MAX_BYTES)
+            recording = await asyncio.wait_for(upload.read(), UPLOAD_LIMIT_S)
             return web.json_response(await self._learn_from(request, recording))
         except web.HTTPRequestEntityTooLarge:
-            return _error(413, f"the recording is larger than {MAX_UPLOAD_BYTES >> 20} MiB")
+            await discard_body(request)
+            return _error(413, f"the recording is larger than {MAX_BYTES >> 20} MiB")
         except TimeoutError:
             return _error(408, f"the recording did not arrive within {UPLOAD_LIMIT_S:g} s")
         except UserError as error:

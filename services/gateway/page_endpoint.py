@@ -48,5 +48,6 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
         ),
         token=token,
         allowed_origins=config.allowed_origins,
+        proxy_schemes=("https",) if config.plain_http else (),
     )
     return PageEndpoint(f"{'https' if tls else 'http'}://{address}/{fragment}", tls, access)

@@ -11,6 +11,7 @@ import numpy as np
 from kouxing.shared.errors import UserError
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
+MAX_OBJECT_BYTES = 128 * 1024  # of a JSON message
 RATES_HZ = (8000, 48000)
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
@@ -61,7 +62,8 @@ class PcmFormat:
 
         Raises ``UserError`` if it is JSON.
         """
-        if message[:1] == b"{" and _is_json(message):
+        is_short = len(message) <= MAX_OBJECT_BYTES
+        if is_short and message[:1] == b"{" and _is_json(message):
             raise UserError(f"expected {self}; this is JSON: send it as a text message")
 
     def check_samples(self, pcm: bytes, *, is_first: bool) -> None:

@@ -51,7 +51,7 @@ class SendersApi:
     async def serve_post(self, request: web.Request) -> web.StreamResponse:
         """Start or stop a sender, or delay all; answer with their state or with an error."""
         try:
-            command = wire.parse_object(await request.text())
+            command = wire.parse_object(await request.read())
             start, stop, delay_ms = (command.get(key) for key in ("start", "stop", "delay_ms"))
             if isinstance(start, str):
                 self._senders.start(self._allowed_target(start))

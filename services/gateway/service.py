@@ -122,15 +122,7 @@ class GatewayService(Service):
             frame_ancestors=" ".join(config.frame_ancestors),
             routes=self._routes,
         )
-        self._server = WebServer(
-            listening,
-            endpoint.tls,
-            on_refused=lambda address: self.warn(
-                "connections", f"refused a connection from {address}: too many are open"
-            ),
-            on_bad_request=lambda: self.warn("bad-http", "dropped a request that is not HTTP"),
-            address_share=share,
-        )
+        self._server = WebServer(listening, endpoint.tls, share)
         self._tasks: set[asyncio.Task[None]] = set()
         self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is playing
         self._sample_characters: Characters = ()  # computed on first use

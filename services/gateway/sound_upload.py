@@ -16,6 +16,7 @@ from urllib.parse import quote
 from aiohttp import web
 
 from kouxing.services.gateway import sound_decoder
+from kouxing.services.gateway.http import discard_body
 from kouxing.shared.logs import LOG
 
 MAX_BYTES = 200 << 20
@@ -47,6 +48,7 @@ class SoundUpload:
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Answer a file with its sound, or with an error."""
         if self._is_busy:
+            await discard_body(request)
             return _error(503, "another file is being read; try again in a few seconds")
         self._is_busy = True
         try:
@@ -63,6 +65,7 @@ class SoundUpload:
         source.parent.mkdir()
         is_small = await asyncio.wait_for(_store(request, source), UPLOAD_LIMIT_S)
         if not is_small:
+            await discard_body(request)
             return _error(413, f"the file is larger than {MAX_BYTES >> 20} MiB; use a smaller one")
         status, messages = await self._decode(source, target)
         if status == sound_decoder.REJECTED:

@@ -1,26 +1,25 @@
-"""The gateway's HTTP server: it limits connections and closes those that are idle."""
+"""The gateway's HTTP server: it limits connections, closes idle ones, and answers errors."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
-import logging
 import math
 import socket
 import ssl
+import sys
 import time
-from collections.abc import Callable, Collection
-from typing import cast
+import traceback
+from collections.abc import Collection
+from typing import Any, cast
 
 from aiohttp import web
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
 from kouxing.services.gateway.config import ADDRESS_SHARE
-from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.logs import LOG, RateLimit
 
 MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # until a request arrives, and until the next one
@@ -29,8 +28,23 @@ ANSWER_TIMEOUT_S = 120.0  # to send a file; a head has 5 MB
 BACKLOG = 128
 KEEPALIVE_S = 20  # without data, until a client that has vanished is looked for
 _KEEPALIVE_PROBES, _PROBE_S = 3, 5
+LOG_PERIOD_S = 60.0  # between two log lines about errors at the same place
 _CHECK_S = 1.0
+_SHUTDOWN_S = 0.5  # until handlers are cancelled
 _RETRY_S = 1.0  # when the system has no free descriptor
+_HEADERS = {  # of every answer
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-cache",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+_OPTIONS: dict[str, Any] = {
+    "access_log": None,
+    "auto_decompress": False,
+    "keepalive_timeout": IDLE_TIMEOUT_S,
+    "lingering_time": 0,  # a refused body is not read
+}
 
 
 def bind_port(host: str, port: int) -> socket.socket:
@@ -67,57 +81,136 @@ def _enable_keepalive(connection: socket.socket) -> None:
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
+class _ErrorResponse(web.Response):
+    """An answer to a request that no application has seen, so that the signals are not sent."""
+
+    async def _prepare_headers(self) -> None:
+        await super()._prepare_headers()
+        await _set_headers(None, self)
+
+
+class _Connection(web.RequestHandler):
+    """One connection. It answers errors that handlers do not answer, without a traceback."""
+
+    def __init__(self, server: web.Server, address: str, log_limit: RateLimit) -> None:
+        super().__init__(server, loop=asyncio.get_running_loop(), **_OPTIONS)
+        self.address = address
+        self.set_timeout(IDLE_TIMEOUT_S)
+        self.request: web.BaseRequest | None = None  # while its handler runs
+        self.is_lost = asyncio.Event()
+        self._log_limit = log_limit
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        """Release the connection's place."""
+        super().connection_lost(exc)
+        self.is_lost.set()
+
+    def set_timeout(self, timeout_s: float) -> None:
+        """Close the connection after a time; infinite: its client keeps its place."""
+        self.changed_s = time.monotonic()
+        self.deadline_s = self.changed_s + timeout_s
+
+    def on_body_end(self, request: web.BaseRequest) -> None:
+        """Let a request whose body is complete take any time."""
+        if self.request is request:
+            self.set_timeout(math.inf)
+
+    def handle_error(
+        self,
+        request: web.BaseRequest,
+        status: int = 500,
+        exc: BaseException | None = None,
+        message: str | None = None,
+    ) -> web.StreamResponse:
+        """Answer a request whose handler raised an exception."""
+        if isinstance(exc, ConnectionError):
+            raise exc
+        if isinstance(exc, HttpProcessingError | web.RequestPayloadError):
+            status, text = 400, "this is not a valid HTTP request"
+            self._warn("dropped a request that is not HTTP")
+        elif isinstance(exc, OSError) and exc.errno == errno.ENAMETOOLONG:
+            status, text = 404, "the path is too long"
+        elif isinstance(exc, ValueError):
+            status, text = 400, "the request contains an invalid value"
+            self._warn(f"{request.path[:80]!r}: rejected a request: {exc!r:.200}", exc)
+        else:
+            text = "internal error; see the log of the service"
+            self.log_exception("%r: a request failed", request.path[:80])
+        if request.writer.output_size > 0:  # the client has received a part of an answer
+            raise ConnectionResetError
+        response = _ErrorResponse(status=status, text=f"{text}\n")
+        response.force_close()
+        return response
+
+    def log_exception(self, *args: object, **_options: object) -> None:
+        """Log the current exception, once a minute for each place in the code."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError) and self._log_limit.allows(_place(error)):
+            LOG.error(*args, exc_info=True)
+
+    def _warn(self, text: str, error: BaseException | None = None) -> None:
+        if self._log_limit.allows(_place(error) or text):
+            LOG.warning("%s", text)
+
+
+def _place(error: BaseException | None) -> str:
+    frames = traceback.extract_tb(error.__traceback__, -1) if error else []
+    return "".join(f"{frame.filename}:{frame.lineno}" for frame in frames)
+
+
+async def _set_headers(_request: web.Request | None, response: web.StreamResponse) -> None:
+    response.headers.update(_HEADERS)
+    response.headers.popall("Server", None)  # it contains the versions of Python and aiohttp
+
+
 class WebServer:
     """Accepts connections and serves them with an aiohttp application.
 
-    ``listening`` is from ``bind_port``. ``on_refused`` is called with the address of each
-    connection that exceeds a limit, ``on_bad_request`` when data arrives that is not HTTP.
+    ``listening`` is from ``bind_port``. One address gets at most ``address_share`` of all places.
+    If all are taken, a new connection replaces another one, except a connection with a complete
+    request for an unlimited path. It replaces the one that has waited for the longest time.
     """
 
     def __init__(
         self,
         listening: socket.socket,
         tls: ssl.SSLContext | None,
-        *,
-        on_refused: Callable[[str], None],
-        on_bad_request: Callable[[], None],
         address_share: float = ADDRESS_SHARE,
     ) -> None:
         self._listening = listening
         self._tls = tls
-        self._on_refused = on_refused
-        self._on_bad_request = on_bad_request
-        self._quota = ConnectionQuota(MAX_CONNECTIONS, "connections", address_share)
-        self._connections: set[asyncio.Task[None]] = set()
-        self._deadlines_s: dict[asyncio.BaseProtocol, float] = {}
+        self._max_per_address = math.ceil(address_share * MAX_CONNECTIONS)
+        self._connections: dict[_Connection, asyncio.Task[None]] = {}
+        self._log_limit = RateLimit(LOG_PERIOD_S)
 
     async def start(self, application: web.Application, unlimited: Collection[str]) -> None:
         """Start serving an application.
 
-        Answers of the ``unlimited`` paths have no time limit once the whole request has arrived.
+        Handlers of the ``unlimited`` paths have no time limit once the whole request has arrived.
         """
 
         @web.middleware
-        async def set_deadline(request: web.Request, handler: Handler) -> web.StreamResponse:
-            is_limited = request.path not in unlimited
-            timeout_s = ANSWER_TIMEOUT_S if is_limited else BODY_TIMEOUT_S
-            self._deadlines_s[request.protocol] = time.monotonic() + timeout_s
-            if not is_limited:
-                request.content.on_eof(lambda: self._remove_deadline(request.protocol))
-            return await handler(request)
+        async def limit(request: web.Request, handler: Handler) -> web.StreamResponse:
+            connection = cast(_Connection, request.protocol)
+            connection.request = request
+            is_unlimited = request.path in unlimited
+            connection.set_timeout(BODY_TIMEOUT_S if is_unlimited else ANSWER_TIMEOUT_S)
+            if is_unlimited:
+                request.content.on_eof(lambda: connection.on_body_end(request))
+            if request.headers.get("Content-Encoding", "identity").lower() != "identity":
+                raise web.HTTPUnsupportedMediaType(text="send the body without Content-Encoding\n")
+            try:
+                return await handler(request)
+            finally:
+                connection.request = None
+                connection.set_timeout(ANSWER_TIMEOUT_S)
 
-        application.middlewares.insert(0, set_deadline)
-        log = LOG.getChild("http")
-        log.addFilter(self._filter_client_errors)
-        self._runner = web.AppRunner(
-            application,
-            access_log=None,
-            logger=log,
-            keepalive_timeout=IDLE_TIMEOUT_S,
-            shutdown_timeout=0.5,
-        )
+        application.middlewares.insert(0, limit)
+        application.on_response_prepare.append(_set_headers)
+        self._runner = web.AppRunner(application, shutdown_timeout=_SHUTDOWN_S)
         await self._runner.setup()
         self._server = cast(web.Server, self._runner.server)
+        self._monitor = asyncio.create_task(self._close_late_connections())
         self._listening.setblocking(False)
         self._start_accepting()
 
@@ -126,13 +219,10 @@ class WebServer:
         asyncio.get_running_loop().remove_reader(self._listening)
         self._listening.close()
         await self._runner.cleanup()
-        for connection in self._connections:
-            connection.cancel()
-        await asyncio.gather(*self._connections, return_exceptions=True)
-
-    def _remove_deadline(self, connection: asyncio.BaseProtocol) -> None:
-        if connection in self._deadlines_s:  # still open
-            self._deadlines_s[connection] = math.inf
+        tasks = [self._monitor, *self._connections.values()]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     def _start_accepting(self) -> None:
         if self._listening.fileno() >= 0:
@@ -149,37 +239,49 @@ class WebServer:
             loop.remove_reader(self._listening)
             loop.call_later(_RETRY_S, self._start_accepting)
             return
-        if not self._quota.acquire(address):
+        if not self._make_room(address):
             accepted.close()
-            self._on_refused(address)
+            if self._log_limit.allows("refused"):
+                LOG.warning("refused a connection from %s: too many are open", address)
             return
         _enable_keepalive(accepted)
-        connection = loop.create_task(self._serve(accepted))
-        self._connections.add(connection)
-        connection.add_done_callback(self._connections.discard)
-        connection.add_done_callback(lambda _: self._quota.release(address))
+        connection = _Connection(self._server, address, self._log_limit)
+        self._connections[connection] = loop.create_task(self._serve(connection, accepted))
 
-    async def _serve(self, accepted: socket.socket) -> None:
-        """Serve a connection until it is closed or its deadline passes."""
-        handler = self._server()
-        self._deadlines_s[handler] = time.monotonic() + IDLE_TIMEOUT_S
-        with contextlib.suppress(OSError):  # a TLS handshake that fails or takes too long
-            await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: handler,
+    def _make_room(self, address: str) -> bool:
+        """Close a connection if all places are taken; return False if none may be closed."""
+        rivals = [other for other in self._connections if other.address == address]
+        if len(rivals) < self._max_per_address:
+            if len(self._connections) < MAX_CONNECTIONS:
+                return True
+            rivals = [*self._connections]
+        rivals = [other for other in rivals if other.deadline_s < math.inf]
+        if rivals:
+            closed = min(rivals, key=lambda other: other.changed_s)
+            self._connections.pop(closed).cancel()
+        return bool(rivals)
+
+    async def _close_late_connections(self) -> None:
+        while True:
+            await asyncio.sleep(_CHECK_S)
+            for connection, task in self._connections.items():
+                if time.monotonic() > connection.deadline_s:
+                    task.cancel()
+
+    async def _serve(self, connection: _Connection, accepted: socket.socket) -> None:
+        """Serve a connection until it is lost or this task is cancelled."""
+        transport: asyncio.Transport | None = None
+        try:
+            transport, _ = await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: connection,
                 accepted,
                 ssl=self._tls,
                 ssl_handshake_timeout=IDLE_TIMEOUT_S if self._tls else None,
             )
-        try:
-            while handler.transport is not None and time.monotonic() < self._deadlines_s[handler]:
-                await asyncio.sleep(_CHECK_S)
+            await connection.is_lost.wait()
+        except OSError:  # a TLS handshake that fails or takes too long
+            pass
         finally:
-            del self._deadlines_s[handler]
-            handler.force_close()
-
-    def _filter_client_errors(self, record: logging.LogRecord) -> bool:
-        """Filter errors that clients can cause at will: data that is not HTTP, partial bodies."""
-        error = record.exc_info[1] if record.exc_info else None
-        if isinstance(error, HttpProcessingError):
-            self._on_bad_request()
-        return not isinstance(error, HttpProcessingError | ConnectionResetError)
+            self._connections.pop(connection, None)
+            if transport is not None:
+                transport.abort()  # close() waits for a client that reads nothing

@@ -79,7 +79,6 @@ class WhipClients:
         """Answer an SDP offer and open a session."""
         if request.content_type != SDP:
             raise web.HTTPUnsupportedMediaType(text=f"expected an SDP offer ({SDP})\n")
-        offer = (await request.read()).decode(errors="replace")
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
         try:
@@ -89,6 +88,7 @@ class WhipClients:
         name, client = secrets.token_urlsafe(12), _Client(shape_encoder)
         async with contextlib.AsyncExitStack() as stack:
             stack.enter_context(self._quota.hold(request))
+            offer = (await request.read()).decode(errors="replace")
             self._clients[name] = client
             stack.push_async_callback(self._remove, name)
             try:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from kouxing.services.gateway.pcm_format import RATES_HZ, PcmFormat, check_text
+from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmFormat, check_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
@@ -141,11 +141,13 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     return FaceSettings(**settings) if settings else None
 
 
-def parse_object(message: str) -> dict[str, object]:
+def parse_object(message: str | bytes) -> dict[str, object]:
     """Return the object of a JSON message.
 
-    Raises ``UserError`` if the message is not a JSON object.
+    Raises ``UserError`` if the message is not a JSON object, or too long.
     """
+    if len(message) > MAX_OBJECT_BYTES:
+        raise UserError(f"a JSON message is longer than {MAX_OBJECT_BYTES >> 10} KiB")
     try:
         fields = json.loads(message)
     except (ValueError, RecursionError):

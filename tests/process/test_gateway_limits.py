@@ -27,6 +27,8 @@ from kouxing.shared.metrics import Metrics
 from tests.process.web_clients import async_test
 from tests.system import Gateway, port_of
 
+LONG = b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n"
+SLOW = b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n"
 UPGRADE = b"GET /long HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: upgrade\r\n\r\n"
 SDP = {"Content-Type": "application/sdp"}
 UNUSED: Any = None
@@ -37,11 +39,21 @@ class Served:
     """A server with short and endless answers."""
 
     address: tuple[str, int]
-    refused: list[str] = field(default_factory=list)
     writers: list[asyncio.StreamWriter] = field(default_factory=list)
+    has_ended: asyncio.Event = field(default_factory=asyncio.Event)  # the endless answer
 
-    async def connect(self, request: bytes = b"") -> asyncio.StreamReader:
-        reader, writer = await asyncio.open_connection(*self.address)
+    async def write_endlessly(self, request: web.Request) -> web.StreamResponse:
+        response = web.StreamResponse()
+        await response.prepare(request)
+        try:
+            while True:
+                await response.write(bytes(1 << 20))
+        finally:
+            self.has_ended.set()
+
+    async def connect(self, request: bytes = b"", source: str = "") -> asyncio.StreamReader:
+        local = (source, 0) if source else None
+        reader, writer = await asyncio.open_connection(*self.address, local_addr=local)
         writer.write(request)
         self.writers.append(writer)
         return reader
@@ -61,6 +73,10 @@ async def answer(_request: web.Request) -> web.StreamResponse:
     return web.Response(text="here")
 
 
+async def fail(request: web.Request) -> web.StreamResponse:
+    raise {"value": ValueError, "other": RuntimeError}[request.query["error"]]
+
+
 async def never_end(request: web.Request) -> web.StreamResponse:
     await request.read()
     response = web.StreamResponse()
@@ -73,14 +89,20 @@ async def never_end(request: web.Request) -> web.StreamResponse:
 @asynccontextmanager
 async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[Served]:
     """Serve with other limits; ``/long`` has no time limit."""
-    for name, limit in {"_CHECK_S": 0.02, **limits}.items():
+    for name, limit in {"_CHECK_S": 0.02, "_SHUTDOWN_S": 0.01, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
     bound = web_server.bind_port("127.0.0.1", 0)
     served = Served(bound.getsockname())
-    server = WebServer(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
+    server = WebServer(bound, None)
     application = web.Application()
     application.add_routes(
-        [web.get("/", answer), web.get("/slow", never_end), web.route("*", "/long", never_end)]
+        [
+            web.get("/", answer),
+            web.get("/fail", fail),
+            web.get("/slow", never_end),
+            web.get("/endless", served.write_endlessly),
+            web.route("*", "/long", never_end),
+        ]
     )
     await server.start(application, {"/long"})
     try:
@@ -117,8 +139,8 @@ async def test_ends_slow_answers_except_on_unlimited_paths(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2, ANSWER_TIMEOUT_S=0.5) as served:
-        long = await served.connect(b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n")
-        slow = await served.connect(b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n")
+        long = await served.connect(LONG)
+        slow = await served.connect(SLOW)
         assert b"begun" in await read_to_end(slow)
         await check_open(long)
 
@@ -147,20 +169,58 @@ async def test_a_body_has_a_deadline_and_its_answer_has_none(
     assert not caplog.records
 
 
+INCOMPLETE = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1"
+MANY = [f"127.0.1.{number}" for number in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("part", "sources"),
+    [
+        (b"", ["127.0.0.1"]),
+        (b"GET / HT", ["127.0.0.2"]),
+        (b"GET / HT", MANY),
+        (SLOW, ["127.0.0.1"]),
+        (INCOMPLETE, MANY),
+    ],
+)
 @async_test
-async def test_refuses_connections_above_the_limit_until_one_closes(
-    monkeypatch: pytest.MonkeyPatch,
+async def test_a_client_takes_the_place_of_one_without_a_complete_request(
+    monkeypatch: pytest.MonkeyPatch, part: bytes, sources: list[str]
 ) -> None:
-    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.5, MAX_CONNECTIONS=6) as served:
-        accepted = [await served.connect() for _ in range(5)]
-        with contextlib.suppress(ConnectionResetError):
-            assert await (await served.connect()).read() == b""
-        assert served.refused == ["127.0.0.1"]
-        for reader in accepted:
-            assert await read_to_end(reader) == b""
+    async with serve(monkeypatch, MAX_CONNECTIONS=6) as served:
+        clients = [await served.connect(LONG)]
+        for n in range(9):
+            await served.connect(part, sources[n % len(sources)])
+        clients += [await served.connect(LONG, source) for source in ("127.0.0.1", "127.0.0.3")]
+        for reader in clients:
+            await check_open(reader)
+
+
+@async_test
+async def test_refuses_connections_while_all_places_have_complete_requests(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serve(monkeypatch, MAX_CONNECTIONS=6) as served:
+        clients = [await served.connect(LONG) for _ in range(5)]
+        for reader in clients:
+            await asyncio.wait_for(reader.readuntil(b"begun"), 20)
+        for _ in range(2):
+            with contextlib.suppress(ConnectionResetError):
+                assert await read_to_end(await served.connect()) == b""
+        served.writers[0].close()
         async with asyncio.timeout(20):
             while not await served.answers():
                 await asyncio.sleep(0.02)
+    assert [record.getMessage() for record in caplog.records] == [
+        "refused a connection from 127.0.0.1: too many are open"
+    ]
+
+
+@async_test
+async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serve(monkeypatch, ANSWER_TIMEOUT_S=0.3) as served:
+        await served.connect(b"GET /endless HTTP/1.1\r\nHost: a\r\n\r\n")
+        await asyncio.wait_for(served.has_ended.wait(), 20)
 
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {
@@ -248,6 +308,22 @@ async def test_whip_without_aiortc_says_what_to_install(monkeypatch: pytest.Monk
     assert len(clients) == 0
 
 
+@pytest.mark.parametrize(("error", "status"), [("value", 400), ("other", 500), ("", 500)])
+@async_test
+async def test_logs_an_unexpected_error_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: str, status: int
+) -> None:
+    async with serve(monkeypatch) as served, aiohttp.ClientSession() as http:
+        for _ in range(3):
+            url = "http://{}:{}/fail?error=".format(*served.address)
+            async with http.get(url + error) as response:
+                assert response.status == status
+                assert "Server" not in response.headers
+                assert response.headers["X-Content-Type-Options"] == "nosniff"
+    assert len(caplog.records) == 1
+    assert ("Traceback" in caplog.text) == (status == 500)
+
+
 @async_test
 async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     class Exhausted(socket.socket):
@@ -259,7 +335,7 @@ async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPat
     failures = ["Too many open files"]
     monkeypatch.setattr(web_server, "_RETRY_S", 0.05)
     exhausted = Exhausted(fileno=web_server.bind_port("127.0.0.1", 0).detach())
-    server = WebServer(exhausted, None, on_refused=lambda _: None, on_bad_request=lambda: None)
+    server = WebServer(exhausted, None)
     application = web.Application()
     application.add_routes([web.get("/", answer)])
     await server.start(application, set())

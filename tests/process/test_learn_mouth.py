@@ -16,8 +16,8 @@ import pytest
 from aiohttp import web
 
 from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.http import MAX_UPLOAD_BYTES, make_application
-from kouxing.services.gateway.learn_mouth import MouthLearner
+from kouxing.services.gateway.http import make_application
+from kouxing.services.gateway.learn_mouth import MAX_BYTES, MouthLearner
 from kouxing.services.mouth_profiles.worker import Learn
 from kouxing.shared.errors import UserError
 from tests.process.web_clients import async_test
@@ -111,9 +111,9 @@ async def test_answers_with_the_error(learn: Learn, error: str) -> None:
 @async_test
 async def test_rejects_a_recording_that_is_too_large() -> None:
     async with serve(reverse) as gateway:
-        status, answer = await gateway.post(bytes(MAX_UPLOAD_BYTES + 1))
+        status, answer = await gateway.post(bytes(MAX_BYTES + 1))
         assert (status, answer) == (413, {"error": "the recording is larger than 8 MiB"})
-        assert (await gateway.post(bytes(MAX_UPLOAD_BYTES)))[0] == 200
+        assert (await gateway.post(bytes(MAX_BYTES)))[0] == 200
 
 
 @async_test
