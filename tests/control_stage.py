@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import zmq
 from kouxing_client.keys import Key
@@ -18,7 +19,7 @@ from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import OpenSession
+from kouxing.shared.wire.session import Error, OpenSession
 
 LOCAL = "tcp://127.0.0.1:*"
 PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
@@ -41,6 +42,7 @@ class Stage:
                 control=LOCAL, events=LOCAL, insecure=insecure, lost_after_s=60.0, max_load=1000.0
             )
         )
+        self.refusal: Error | None = None  # of the services, instead of starting a session
         self.buses = []
         self.services = []
         for kind in PROVIDED:
@@ -91,5 +93,10 @@ class Stage:
 
     def _start(self, service: Socket) -> None:
         for received in service.receive():
-            if isinstance(start := received.message, StartSession):
+            if not isinstance(start := received.message, StartSession):
+                continue
+            if self.refusal is not None:
+                refusal = replace(self.refusal, session=start.session, request=start.request)
+                service.send(refusal)
+            else:
                 service.send(SessionStarted(session=start.session, request=start.request))

@@ -178,7 +178,7 @@ class _Streaming:
             while True:
                 drawn_s = self._drawn_s(DRIVER_TIMEOUT_S)
                 if drawn_s < newest_s:
-                    raise UserError("the driver restarted, so no video was written; try again")
+                    raise UserError("the driver restarted, so the video is not complete; try again")
                 newest_s = drawn_s
                 progress.update(task, completed=drawn_s - drawn_before_s)
                 for event in self._events.available(STATUS_S):

@@ -33,8 +33,8 @@ class Placement:
 
         A worker that is chosen for one endpoint also serves its other endpoints. Workers in
         ``kept`` stay. A session that moves needs a worker of its ``language``. If ``may_refuse``, a
-        session without room is refused; a session that moves or is not paced never is. Raises
-        ``Refusal`` if no ready worker provides one of the endpoints, or all workers are busy.
+        session without room is refused; a session that moves never is. Raises ``Refusal`` if no
+        ready worker provides one of the endpoints, or all workers are busy.
         """
         workers: dict[str, str] = {}
         needed = list(CLIENT_NEEDS)

@@ -98,6 +98,7 @@ class ControlService(Service):
                 StatusRequest: requests.handler(self._report_status),
                 Heartbeat: self._on_heartbeat,
                 SessionStarted: self._service_handler(self._on_session_started),
+                Error: self._service_handler(self._on_start_refused),
                 Speech: self._service_handler(self._on_speech),
                 Event: self._service_handler(self._on_service_event),
             },
@@ -288,6 +289,14 @@ class ControlService(Service):
             self._send_start(record, deferred)
             self._announce_if_started(record)
 
+    def _on_start_refused(self, error: Error, instance: str) -> None:
+        """Refuse a session that one of its services refuses, unless its client already uses it."""
+        record = self._sessions.get(error.session)
+        if record is None or record.announced or error.request != record.start_request:
+            return
+        if instance in record.waiting_for:
+            self._refuse_session(record, error)
+
     def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)
         if record is None or (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
@@ -384,11 +393,17 @@ class ControlService(Service):
             self._announce_if_started(record)
             return
         text = f"{', '.join(sorted(missing))} did not start the session in {START_TIMEOUT_S:g} s"
-        if not record.announced:
-            request = record.opening.request
-            error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text, request=request)
-            self._requests.answer(record.client, request, error)
-        self._end_session(record, text)
+        if record.announced:
+            self._end_session(record, text)
+        else:
+            error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text)
+            self._refuse_session(record, error)
+
+    def _refuse_session(self, record: SessionRecord, error: Error) -> None:
+        """End a session that its client does not have yet."""
+        request = record.opening.request
+        self._requests.answer(record.client, request, replace(error, request=request))
+        self._end_session(record, error.text)
 
     def _move_session(self, record: SessionRecord) -> None:
         if self._sessions.move(record, time.monotonic()):

@@ -37,6 +37,9 @@ class DriverConfig(FaceConfig):
     """Session to show. "newest" shows the session that was opened last."""
     out: str = "out"
     """Folder for recorded videos."""
+    max_videos: Annotated[int, Field(ge=1, le=1000)] = 8
+    """Maximum number of videos that are being written. One key can write at most three quarters
+    of them."""
     head: str = "woman"
     """Name of a built-in head, or an avatar (.glb, .gltf, .vrm, or an imported .npz)."""
     background: str = "studio"

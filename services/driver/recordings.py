@@ -1,125 +1,187 @@
-"""The open videos of recorded sessions, drawn in small steps."""
+"""The videos of recorded sessions. A process draws and writes them while there are any."""
 
 from __future__ import annotations
 
-import time
+import contextlib
+import math
+import multiprocessing
+import threading
 from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from kouxing.services.driver import recorder
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.video.writer import remove_unfinished
 
-from kouxing.services.driver.video.recording import Recording
-from kouxing.shared.errors import UserError
+MAX_KEY_SHARE = 0.75  # of the videos, for one key
+MAX_QUEUED = 100_000  # commands that the process has not read
+IDLE_S = 10.0  # without a video, until the process ends and its memory is free
+CLOSE_LIMIT_S = 3.0
+KILL_LIMIT_S = 1.0
 
-Float32 = NDArray[np.float32]
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+class _RecorderProcess:
+    """The process, and a thread that sends commands to it so that the driver never waits."""
+
+    def __init__(self, config: DriverConfig) -> None:
+        self.connection, child_end = _SPAWN.Pipe()
+        self.process = _SPAWN.Process(target=recorder.run, args=(child_end, config), daemon=True)
+        self.process.start()
+        child_end.close()
+        self.commands: SimpleQueue[tuple[object, ...] | None] = SimpleQueue()
+        threading.Thread(target=self._send, daemon=True).start()
+
+    def _send(self) -> None:
+        with contextlib.suppress(OSError):  # the process has ended
+            while command := self.commands.get():
+                self.connection.send(command)
+            self.connection.send(None)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join(KILL_LIMIT_S)
+        self.commands.put(None)  # ends the thread
 
 
 class Recordings:
-    """Passes each session's frames and sound to its video, and draws images when time permits.
+    """Passes each session's frames and sound to its video.
 
-    ``make`` opens the video of a session. ``on_failed`` receives the session and the reason why it
-    has no video.
+    ``on_written`` receives the session and the path of its video, ``on_failed`` the session and the
+    reason why it has no complete video.
     """
 
     def __init__(
         self,
-        make: Callable[[str], Recording],
+        config: DriverConfig,
         *,
-        on_written: Callable[[str, Recording], None],
+        on_written: Callable[[str, Path], None],
         on_failed: Callable[[str, str], None],
-        on_image: Callable[[], None] = lambda: None,
+        on_image: Callable[[], None],
     ) -> None:
-        self._make = make
+        self._config = config
         self._on_written = on_written
         self._on_failed = on_failed
         self._on_image = on_image
-        self._open: dict[str, Recording] = {}
-        self._ending: list[tuple[str, Recording]] = []  # complete, but not all images are drawn
+        self._numbers = count()
+        self._open: dict[str, int] = {}  # numbers of the videos that accept frames, by session
+        self._unfinished: dict[int, tuple[str, str]] = {}  # session and key by number
+        self._recorder: _RecorderProcess | None = None
+        self._busy_s = 0.0  # when a video was last unfinished
 
     @property
-    def is_done(self) -> bool:
-        """Whether no video is open."""
-        return not self._open and not self._ending
+    def unfinished(self) -> list[str]:
+        """The sessions whose videos are not written yet."""
+        return [session for session, _ in self._unfinished.values()]
 
     def is_open(self, session: str) -> bool:
         """Return whether a session's video still accepts frames."""
         return session in self._open
 
-    def begin(self, session: str) -> None:
-        """Open a session's video, unless it is already open."""
-        if session in self._open:
-            return
+    def refusal(self, key: str) -> str:
+        """Return why a key cannot record another session now; empty if it can."""
+        limit = self._config.max_videos
+        if len(self._unfinished) >= limit:
+            reason = f"the driver is writing {limit} videos, the limit of driver.max_videos"
+        else:
+            limit = math.ceil(MAX_KEY_SHARE * limit)
+            num_of_key = sum(owner == key for _, owner in self._unfinished.values())
+            if not key or num_of_key < limit:
+                return ""
+            reason = f"your key has its maximum of unfinished videos, {limit}"
+        return f"{reason}; wait until one is written, or open the session without 'record'"
+
+    def begin(self, session: str, key: str) -> None:
+        """Open a session's video."""
+        path = Path(self._config.out) / f"{session}.mp4"
         try:
-            self._open[session] = self._make(session)
-        except (UserError, OSError) as error:
-            self._on_failed(session, str(error))
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            self._on_failed(session, f"cannot create {path.parent}: {error.strerror}")
+            return
+        number = self._open[session] = next(self._numbers)
+        self._unfinished[number] = session, key
+        self._recorder = self._recorder or _RecorderProcess(self._config)
+        self._send(session, "begin", key, path)
 
-    def add_frame(self, session: str, time_s: float, faps: Float32) -> None:
-        """Add a FAP frame (68,), if the session is recorded."""
-        if session in self._open:
-            self._open[session].add_frame(time_s, faps)
+    def add_frame(self, session: str, time_s: float, values: bytes) -> None:
+        """Add a FAP frame (68 values), if the session is recorded."""
+        self._send(session, "add_frame", time_s, values)
 
-    def add_sound(self, session: str, media_time: int, samples: Float32) -> None:
-        """Add sound (n,), 16 kHz, if the session is recorded."""
-        if session in self._open:
-            try:
-                self._open[session].add_sound(media_time, samples)
-            except UserError as error:
-                self._fail(session, self._open.pop(session), error)
+    def add_sound(self, session: str, media_time: int, pcm: bytes) -> None:
+        """Add 16-bit sound, 16 kHz, if the session is recorded."""
+        self._send(session, "add_sound", media_time, pcm)
 
     def end(self, session: str) -> None:
         """Finish a session's video with the frames that have arrived."""
-        if session in self._open:
-            self._ending.append((session, self._open.pop(session)))
+        self._send(session, "end")
+        self._open.pop(session, None)
 
-    def draw_until(self, end_s: float) -> None:
-        """Draw due images of all videos in turn, until a time of the monotonic clock."""
-        due = list(self._open)
-        while due and time.monotonic() < end_s:
-            due = [session for session in due if self._draw_image(session)]
-        while self._ending and time.monotonic() < end_s:
-            self._finish_first()
+    def tick(self, now_s: float) -> None:
+        """Handle what the process reports, and end it when it has been idle for a while."""
+        if self._recorder is None:
+            return
+        self._receive(timeout_s=0.0)
+        if self._unfinished:
+            self._busy_s = now_s
+        elif now_s > self._busy_s + IDLE_S:
+            self._kill()
 
-    def close_early(self) -> list[str]:
-        """Save the finished part of every video; return their sessions."""
-        for session in list(self._open):
-            self.end(session)
-        cut_short = [session for session, _ in self._ending]
-        for session, recording in self._ending:
-            self._close(session, recording)
-        self._ending.clear()
-        return cut_short
+    def close(self) -> None:
+        """Save the finished part of every video."""
+        if self._recorder is not None:
+            self._recorder.commands.put(None)
+            while self._unfinished and self._receive(CLOSE_LIMIT_S):
+                pass
+            self._kill()
 
-    def _draw_image(self, session: str) -> bool:
+    def _send(self, session: str, command: str, *arguments: object) -> None:
+        number = self._open.get(session)
+        if number is None or self._recorder is None:
+            return
+        self._recorder.commands.put((command, number, *arguments))
+        if self._recorder.commands.qsize() > MAX_QUEUED:
+            self._fail_all("the process that draws videos hangs")
+
+    def _receive(self, timeout_s: float) -> bool:
+        """Handle the reports that arrive until the timeout; return whether there was one."""
+        has_received = False
         try:
-            has_drawn = self._open[session].step()
-        except UserError as error:
-            self._fail(session, self._open.pop(session), error)
-            return False
-        if has_drawn:
+            while self._recorder is not None and self._recorder.connection.poll(timeout_s):
+                self._on_report(*self._recorder.connection.recv())
+                has_received, timeout_s = True, 0.0
+        except (EOFError, OSError):
+            self._fail_all("the process that draws videos has ended; see the driver's log")
+        return has_received
+
+    def _on_report(self, kind: str, number: int, detail: Any = None) -> None:
+        session, _ = self._unfinished[number]
+        if kind == "image":
             self._on_image()
-        return has_drawn
-
-    def _finish_first(self) -> None:
-        session, recording = self._ending[0]
-        try:
-            if recording.step():
-                self._on_image()
-                return
-        except UserError as error:
-            self._fail(session, recording, error)
+            return
+        if kind != "short":
+            del self._unfinished[number]
+        if self._open.get(session) == number:
+            del self._open[session]
+        if kind == "written":
+            self._on_written(session, detail)
         else:
-            self._close(session, recording)
-        self._ending.pop(0)
+            self._on_failed(session, detail)
 
-    def _close(self, session: str, recording: Recording) -> None:
-        try:
-            recording.close()
-        except UserError as error:
-            self._fail(session, recording, error)
-        else:
-            self._on_written(session, recording)
+    def _fail_all(self, reason: str) -> None:
+        self._kill()
+        sessions = self.unfinished
+        self._open.clear()
+        self._unfinished.clear()
+        for session in sessions:
+            self._on_failed(session, reason)
 
-    def _fail(self, session: str, recording: Recording, error: UserError) -> None:
-        recording.discard()
-        self._on_failed(session, str(error))
+    def _kill(self) -> None:
+        if self._recorder is not None:
+            self._recorder.kill()
+            self._recorder = None
+            remove_unfinished(Path(self._config.out))

@@ -2,7 +2,7 @@
 
 Reacts to: start-session, close-session (control), fap-frame, end-of-faps (synthesizer), sound
 (recognizer).
-Emits: recorded, error (control).
+Emits: session-started, recorded, error (control).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.kind import KIND
 from kouxing.services.driver.poses import Poses
 from kouxing.services.driver.recordings import Recordings
-from kouxing.services.driver.video.recording import Recording
+from kouxing.services.driver.video.writer import remove_unfinished
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.idle_motion import STALL_S
@@ -32,10 +32,10 @@ from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.session import Error, ErrorCode
 
-DRAW_BUDGET_S = 0.2  # time for videos per loop iteration; heartbeats must continue
 LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
+RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
 
 
 @dataclass(slots=True)
@@ -59,8 +59,8 @@ class DriverService(Service):
         self._was_stalled = False
         self.poses = Poses(config.session, config.idle_motion_seed)
         self.view = View(config, self.poses.switch)
-        self._recordings = Recordings(
-            self._make_recording,
+        self.recordings = Recordings(
+            config,
             on_written=self._report_written,
             on_failed=self._report_failure,
             on_image=lambda: self.metrics.count("video_ms", round(1000 / config.frame_rate_hz)),
@@ -82,11 +82,15 @@ class DriverService(Service):
             self._leave(session)  # a different session with the same name
             session = None
         if session is None:
+            key = start.client_key or ""
+            if start.record and (reason := self.recordings.refusal(key)):
+                self._refuse(start, reason)
+                return False
             session = self._sessions[start.session] = self._make_session(start)
             self.poses.add(start.session, time.monotonic())
+            if start.record:
+                self.recordings.begin(start.session, key)
         session.start = start
-        if start.record:  # after a crash the same video continues
-            self._recordings.begin(start.session)
         session.follower.start(start.epoch, start.endpoints)
         return False
 
@@ -95,10 +99,18 @@ class DriverService(Service):
         left = self._sessions.get(session)
         if left is None:
             return
-        if not self._recordings.is_open(session):
+        if not self.recordings.is_open(session):
             self._leave(left)
         elif left.leave_by_s is None:
             left.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
+
+    def gauges(self) -> dict[str, float]:
+        """Return the number of videos that are not written yet."""
+        return {"unfinished_videos": len(self.recordings.unfinished)}
+
+    def on_startup(self) -> None:
+        """Remove what a killed driver left."""
+        remove_unfinished(Path(self._config.out))
 
     def on_tick(self, now_s: float) -> None:
         """Draw what is due."""
@@ -108,19 +120,20 @@ class DriverService(Service):
         if self.view.is_live:
             self._warn_if_stalled(now_s)
             self.view.show(self.poses.faps(now_s), self.poses.caption(now_s), now_s)
-        self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
+        self.recordings.tick(now_s)
 
     def on_drain(self) -> bool:
         """Finish the open videos."""
         for session in list(self._sessions.values()):
             self._leave(session)
-        self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
-        return self._recordings.is_done
+        self.recordings.tick(time.monotonic())
+        return not self.recordings.unfinished
 
     def on_shutdown(self) -> None:
         """Save the unfinished part of the remaining videos."""
-        for session in self._recordings.close_early():
+        for session in self.recordings.unfinished:
             LOG.warning("the driver stopped, so the video ends early", extra={"session": session})
+        self.recordings.close()
         self.view.close()
 
     def session_inputs(self) -> dict[str, SessionInput]:
@@ -146,15 +159,14 @@ class DriverService(Service):
     def _on_frame(self, frame: FapFrame) -> None:
         faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
         self.poses.update(frame.session, faps, time.monotonic())
-        self._recordings.add_frame(frame.session, to_seconds(frame.media_time), faps)
+        self.recordings.add_frame(frame.session, to_seconds(frame.media_time), frame.values)
 
     def _on_sound(self, sound: Sound) -> None:
-        samples = np.frombuffer(sound.pcm, "<i2").astype(np.float32) / np.float32(32768)
-        self._recordings.add_sound(sound.session, sound.media_time, samples)
+        self.recordings.add_sound(sound.session, sound.media_time, sound.pcm)
 
     def _on_end(self, end: EndOfFaps) -> None:
         self.poses.end(end.session)
-        self._recordings.end(end.session)
+        self.recordings.end(end.session)
         session = self._sessions[end.session]
         if session.leave_by_s is not None:
             self._leave(session)
@@ -165,7 +177,7 @@ class DriverService(Service):
         del self._sessions[name]
         session.follower.close()
         self.poses.remove(name)
-        self._recordings.end(name)
+        self.recordings.end(name)
 
     def _warn_if_stalled(self, now_s: float) -> None:
         is_stalled = self.poses.is_stalled(now_s)
@@ -179,15 +191,23 @@ class DriverService(Service):
 
     # --- videos --------------------------------------------------------------------------------
 
-    def _make_recording(self, session: str) -> Recording:
-        path = Path(self._config.out) / f"{session}.mp4"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return Recording(path, self.view.renderer(), self._config.frame_rate_hz, overwrite=False)
+    def _refuse(self, start: StartSession, reason: str) -> None:
+        """Let control refuse a session that cannot be recorded."""
+        LOG.info(reason, extra={"session": start.session})
+        self.send_to_control(
+            Error(
+                session=start.session,
+                request=start.request,
+                code=ErrorCode.BUSY,
+                text=reason,
+                retry_after_s=RETRY_AFTER_S,
+            )
+        )
 
-    def _report_written(self, session: str, recording: Recording) -> None:
+    def _report_written(self, session: str, path: Path) -> None:
         self.metrics.count("videos")
-        LOG.info("wrote %s", recording.path, extra={"session": session})
-        self.publish_event(EventName.RECORDED, session, str(recording.path))
+        LOG.info("wrote %s", path, extra={"session": session})
+        self.publish_event(EventName.RECORDED, session, str(path))
 
     def _report_failure(self, session: str, reason: str) -> None:
         LOG.error(reason, extra={"session": session})

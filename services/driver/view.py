@@ -38,12 +38,11 @@ class View:
                 "driver.background: windows and MP4 files cannot be transparent; give a color"
             )
         self._camera = camera(self._head, config.camera)
-        self._renderer: Renderer | None = None
         self._window = self._open_window(on_switch)
         self._is_window_open = self._window is not None
         self._virtual_camera: VirtualCamera | None = None
         if config.virtual_camera:
-            self._virtual_camera = VirtualCamera(self.renderer(), config.frame_rate_hz)
+            self._virtual_camera = VirtualCamera(self._camera_renderer(), config.frame_rate_hz)
             LOG.info("the virtual camera is %s", self._virtual_camera.device)
 
     @property
@@ -58,27 +57,24 @@ class View:
             self._is_window_open = self._window.draw(faps)
             if not self._is_window_open:
                 LOG.info("the window was closed")
-                self._window.hide()  # open videos continue to use its context
+                self._window.hide()  # the virtual camera uses its context
         if self._virtual_camera is not None:
             self._virtual_camera.draw(faps, now_s)
-
-    def renderer(self) -> Renderer:
-        """Return the renderer of videos and virtual camera; it is created once."""
-        if self._renderer is None:
-            self._renderer = Renderer(
-                self._head,
-                self._config.width_px,
-                self._config.height_px,
-                background=self._background,
-                camera=self._camera,
-                context=None if self._window is None else self._window.context,
-            )
-        return self._renderer
 
     def close(self) -> None:
         """Release the virtual camera."""
         if self._virtual_camera is not None:
             self._virtual_camera.close()
+
+    def _camera_renderer(self) -> Renderer:
+        return Renderer(
+            self._head,
+            self._config.width_px,
+            self._config.height_px,
+            background=self._background,
+            camera=self._camera,
+            context=None if self._window is None else self._window.context,
+        )
 
     def _open_window(self, on_switch: Callable[[int], None]) -> Window | None:
         config = self._config

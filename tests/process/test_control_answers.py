@@ -16,7 +16,7 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.keys import add_key, read_key, revoke_key, user_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
-from kouxing.shared.wire.session import OpenSession, SessionOpened
+from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
 from tests.control_stage import Stage
 
 
@@ -49,6 +49,17 @@ def test_sessions_end_when_their_key_is_revoked(stage: Stage, tmp_path: Path) ->
         revoke_key("laptop")
         stage.step_until(lambda: stage.control._sessions.get("revoked") is None)
         assert stage.control._sessions.get("kept") is not None
+
+
+def test_a_service_can_refuse_a_session(stage: Stage) -> None:
+    client = stage.stranger(stage.control.key and user_key())
+    stage.refusal = Error(code="busy", text="too many videos", retry_after_s=5.0)
+    refused = stage.open(client, "mine")
+    assert isinstance(refused, Error)
+    assert (refused.code, refused.text, refused.retry_after_s) == ("busy", "too many videos", 5.0)
+    assert refused.request == "1"
+    stage.refusal = None
+    assert isinstance(stage.open(client, "mine", "2"), SessionOpened)
 
 
 class Link:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -10,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kouxing.services.driver import recordings
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.wire.control import Event, SessionInput, SessionStarted
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.session import Error
 from tests.fake_control import FakeControl
 from tests.system import wait_until
 
@@ -24,6 +27,7 @@ class Stage:
 
     def __init__(self, folder: Path, control: FakeControl) -> None:
         self.control = control
+        self.folder = folder
         self.driver = DriverService(
             DriverConfig(
                 control=control.address,
@@ -32,6 +36,7 @@ class Stage:
                 out=str(folder),
                 width_px=64,
                 height_px=48,
+                max_videos=4,
             )
         )
         self.step_until(lambda: control.heartbeats)
@@ -43,6 +48,9 @@ class Stage:
         num_started = len(self.control.of(SessionStarted))
         self.control.send_start(session, epoch=epoch, record=record)
         self.step_until(lambda: len(self.control.of(SessionStarted)) > num_started)
+
+    def unfinished(self) -> list[Path]:
+        return list(self.folder.glob(".*.part"))
 
     def publish(self, session: str, number: int, value: float, epoch: int = 1) -> None:
         frame = FapFrame(
@@ -85,6 +93,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
     with FakeControl() as control:
         stage = Stage(tmp_path, control)
         yield stage
+        stage.driver.on_shutdown()
         stage.driver.bus.close()
 
 
@@ -146,3 +155,62 @@ def test_reports_an_unwritable_video_to_control(tmp_path: Path, stage: Stage) ->
     stage.end("film")
     stage.step_until(lambda: stage.events("error"))
     assert stage.events("error")[0].detail.startswith("no-video: ")
+
+
+def test_refuses_more_videos_than_the_limit(stage: Stage) -> None:
+    for number in range(4):
+        stage.start(f"film-{number}", record=True)
+    stage.control.send_start("one-more", record=True)
+    stage.step_until(lambda: stage.control.of(Error))
+    (refusal,) = stage.control.of(Error)
+    assert (refusal.session, refusal.request) == ("one-more", "start-one-more-1")
+    assert refusal.code == "busy"
+    assert "max_videos" in refusal.text
+    stage.start("unrecorded")
+    stage.end("film-0")
+    stage.step_until(lambda: len(stage.events("recorded")) == 1)
+    stage.start("one-more", record=True)
+
+
+def test_limits_the_videos_of_one_key(stage: Stage) -> None:
+    videos = stage.driver.recordings
+    for number in range(3):
+        assert videos.refusal("greedy") == ""
+        videos.begin(f"film-{number}", "greedy")
+    assert "your key has its maximum of unfinished videos, 3" in videos.refusal("greedy")
+    assert videos.refusal("other") == ""
+
+
+def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(stage: Stage) -> None:
+    stage.start("film", record=True)
+    stage.publish("film", 0, 100.0)
+    stage.step_until(stage.unfinished)
+    (process,) = multiprocessing.active_children()
+    process.kill()
+    stage.step_until(lambda: stage.events("error"))
+    assert stage.events("error")[0].detail.startswith("no-video: ")
+    assert stage.unfinished() == []
+    stage.start("next", record=True)
+    stage.publish("next", 0, 100.0)
+    stage.end("next")
+    stage.step_until(partial(stage.has_recorded, 1))
+
+
+def test_the_recorder_ends_when_there_is_no_video(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recordings, "IDLE_S", 0.0)
+    stage.start("film", record=True)
+    stage.publish("film", 0, 100.0)
+    stage.end("film")
+    stage.step_until(partial(stage.has_recorded, 1))
+    stage.step_until(lambda: not multiprocessing.active_children())
+
+
+def test_a_stopping_driver_saves_the_finished_part_of_a_video(stage: Stage) -> None:
+    stage.start("film", record=True)
+    for number in range(26):
+        stage.publish("film", number, 100.0)
+    stage.step_until(lambda: stage.driver.metrics.counts["video_ms"])
+    stage.driver.on_shutdown()
+    assert [path.name for path in stage.folder.iterdir()] == ["film.mp4"]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import resource
+import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ from PIL import Image, ImageSequence
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.recording import Recording
-from kouxing.services.driver.video.writer import VideoWriter, open_writer
+from kouxing.services.driver.video.writer import VideoWriter, open_writer, remove_unfinished
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 
@@ -145,6 +148,48 @@ def test_rejects_invalid_settings(
     with pytest.raises(UserError, match=said):
         open_writer(tmp_path / name, **(used | settings))
     assert not list(tmp_path.iterdir())
+
+
+# --- unfinished files ---
+
+
+def test_deletes_the_unfinished_videos_of_killed_processes_only(tmp_path: Path) -> None:
+    stale = tmp_path / ".out.mp4.0123abcd.part"
+    foreign = tmp_path / ".download.part"
+    for path in (stale, foreign):
+        path.touch()
+    with VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, None) as writer:
+        assert not stale.exists()
+        remove_unfinished(tmp_path)
+        writer.write_image(np.zeros((48, 64, 3), np.uint8))
+    assert {path.name for path in tmp_path.iterdir()} == {"out.mp4", foreign.name}
+
+
+def test_a_full_disk_leaves_no_file(tmp_path: Path) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (60, 48, 64, 3), np.uint8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    with pytest.raises(UserError, match="cannot write"):  # noqa: PT012
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
+        try:
+            with VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, None) as writer:
+                for image in images:
+                    writer.write_image(image)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            signal.signal(signal.SIGXFSZ, handler)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_deleted_in_between_is_reported(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    writer = VideoWriter(folder / "out.mp4", 64, 48, 25.0, None)
+    writer.write_image(np.zeros((48, 64, 3), np.uint8))
+    shutil.rmtree(folder)
+    with pytest.raises(UserError, match=r"out\.mp4"):
+        writer.close()
+    assert not folder.exists()
 
 
 # --- recordings of sessions ---

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.services.driver.config import Framing
+from kouxing.services.driver.config import DriverConfig, Framing
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import DEFAULT_HEAD, Detail, Head
-from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera
+from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera, Renderer
 from kouxing.shared.errors import UserError
 
 COLORS = {
@@ -75,3 +75,18 @@ def background(text: str) -> Background:
         )
     color = tuple(int(code[i : i + 2], 16) / 255 for i in (0, 2, 4))
     return color, color
+
+
+def open_renderer(config: DriverConfig) -> Renderer:
+    """Open a renderer for the driver's videos.
+
+    Raises ``UserError`` if OpenGL cannot start, or a setting is invalid.
+    """
+    head = load_head(config.head)
+    return Renderer(
+        head,
+        config.width_px,
+        config.height_px,
+        background=background(config.background),
+        camera=camera(head, config.camera),
+    )

@@ -63,6 +63,11 @@ class Recording:
         """Length of the picture so far."""
         return self.num_images / self._frame_rate_hz
 
+    @property
+    def num_queued(self) -> int:
+        """Number of frames that have arrived and are still needed."""
+        return len(self._frames)
+
     def add_frame(self, time_s: float, faps: Faps) -> None:
         """Add a FAP frame; times do not decrease."""
         if not self._frames or time_s > self._frames[-1][0]:

@@ -18,14 +18,16 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
+import os
 import re
 import secrets
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
@@ -163,14 +165,13 @@ class VideoWriter:
         sound_codec = None if sample_rate_hz is None else form.sound
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz
-        # Another process may be writing a video of the same name.
-        self._unfinished = self._path.with_name(f".{self._path.name}.{secrets.token_hex(4)}.part")
-        self._delete_unfinished = weakref.finalize(self, self._unfinished.unlink, missing_ok=True)
         self._num_images = self._num_samples = 0
         try:
             if self._path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
-            self._unfinished.touch()  # FFmpeg opens it only with the first packet
+            remove_unfinished(self._path.parent)
+            self._unfinished, lock = _create_unfinished(self._path)
+            self._delete_unfinished = weakref.finalize(self, _delete, self._unfinished, lock)
             container = self._path.suffix.removeprefix(".") or "mp4"
             self._container = av.open(
                 str(self._unfinished), "w", format=container, options=form.options
@@ -218,7 +219,7 @@ class VideoWriter:
         frame.pts = self._num_images
         frame.time_base = self._video.codec_context.time_base
         self._num_images += 1
-        self._mux(self._video.encode(frame))
+        self._encode(self._video, frame)
 
     def write_sound(self, samples: Float32) -> None:
         """Append mono sound (N,), -1 to 1."""
@@ -230,31 +231,35 @@ class VideoWriter:
         frame.pts = self._num_samples
         frame.time_base = Fraction(1, self._sample_rate_hz or 1)
         self._num_samples += len(samples)
-        self._mux(self._sound.encode(frame))
+        self._encode(self._sound, frame)
 
-    def _mux(self, packets: list[Any]) -> None:
+    def _encode(self, stream: Any, frame: Any) -> None:
+        with self._discards_on_error():
+            self._container.mux(stream.encode(frame))
+
+    @contextlib.contextmanager
+    def _discards_on_error(self) -> Iterator[None]:
         try:
-            self._container.mux(packets)
-        except OSError as error:
+            yield
+        except (OSError, av.FFmpegError) as error:
             self.discard()
             raise _write_error(self._path, error) from error
 
     def close(self) -> Path:
         """Finish the file under its final name; return its path."""
-        self._mux(self._video.encode(None))
+        self._encode(self._video, None)
         if self._num_samples:
-            self._mux(self._sound.encode(None))
-        try:
+            self._encode(self._sound, None)
+        with self._discards_on_error():
             self._container.close()
             path = self._path if self._overwrite else _create_unique(self._path)
-            return self._unfinished.replace(path)
-        except OSError as error:
-            self._delete_unfinished()
-            raise _write_error(self._path, error) from error
+            self._unfinished.replace(path)
+        self._delete_unfinished()
+        return path
 
     def discard(self) -> None:
         """Delete the unfinished file."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, av.FFmpegError):
             self._container.close()
         self._delete_unfinished()
 
@@ -305,6 +310,35 @@ def write_picture(path: Path, image: UInt8) -> None:
         raise _write_error(path, error) from error
 
 
+def remove_unfinished(folder: Path) -> None:
+    """Delete the unfinished videos of processes that were killed."""
+    for path in filter(_is_unfinished, folder.glob(".*.part")):
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails if a process writes the video
+            path.unlink()
+
+
+def _is_unfinished(path: Path) -> bool:
+    return re.fullmatch(r"\..+\.[0-9a-f]{8}\.part", path.name) is not None
+
+
+def _create_unfinished(path: Path) -> tuple[Path, BinaryIO]:
+    """Create a file for an unfinished video, locked while this process writes the video."""
+    while True:
+        # another process may be writing a video of the same name
+        unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+        file = unfinished.open("xb")
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file.fileno()).st_nlink:
+            return unfinished, file
+        file.close()  # another process deleted it before it was locked
+
+
+def _delete(path: Path, lock: BinaryIO) -> None:
+    path.unlink(missing_ok=True)
+    lock.close()
+
+
 def _create_unique(path: Path) -> Path:
     """Create an empty file with this name or, if it exists, with the next free one; return it."""
     free, number = path, 1
@@ -318,7 +352,9 @@ def _create_unique(path: Path) -> Path:
             return free
 
 
-def _write_error(path: Path, error: OSError) -> UserError:
+def _write_error(path: Path, error: OSError | av.FFmpegError) -> UserError:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return UserError(f"cannot write {path}: the disk is full; free some space")
     return UserError(
         f"cannot write {path} ({error.strerror or error}); give a path in an existing, writable"
         " folder"

@@ -1,0 +1,159 @@
+"""The process that draws and writes the driver's videos.
+
+OpenGL and the encoder hold Python's lock for up to a second, so they would delay the heartbeats of
+the driver. They also keep memory until their process ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.scene import open_renderer
+from kouxing.services.driver.video.recording import Recording
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG, configure
+
+MAX_QUEUED_FRAMES = 180_000  # of one video: an hour at 50 frames per second, 75 MB
+MAX_TURN = 500  # commands before the next image
+
+
+class Recorder:
+    """Draws the images of all videos in turn: each client's key gets the same number of images.
+
+    ``make`` opens a video. ``report`` is called with ``("image", number)``, ``("written", number,
+    path)``, ``("failed", number, reason)`` or, if a video must end before its session,
+    ``("short", number, reason)``.
+    """
+
+    def __init__(self, make: Callable[[Path], Recording], report: Callable[..., None]) -> None:
+        self._make = make
+        self._report = report
+        self._recordings: dict[int, Recording] = {}  # in the order of their turns
+        self._keys: dict[int, str] = {}
+        self._newest_turn: Counter[str] = Counter()  # by key
+        self._num_turns = 0
+        self._ended: set[int] = set()
+
+    def begin(self, number: int, key: str, path: Path) -> None:
+        """Open a video of a client."""
+        self._keys[number] = key
+        with self._reports_failure(number):
+            self._recordings[number] = self._make(path)
+
+    def add_frame(self, number: int, time_s: float, values: bytes) -> None:
+        """Add a FAP frame (68,), unless the video has ended."""
+        if not self._is_open(number):
+            return
+        recording = self._recordings[number]
+        recording.add_frame(time_s, np.frombuffer(values, "<f4"))
+        if recording.num_queued >= MAX_QUEUED_FRAMES:
+            self.end(number)
+            reason = (
+                f"the video ends after {time_s / 60:.0f} minutes: {MAX_QUEUED_FRAMES} FAP frames"
+                " are not drawn yet, the limit; send audio in real time, or use 'kouxing render'"
+            )
+            self._report("short", number, reason)
+
+    def add_sound(self, number: int, media_time: int, pcm: bytes) -> None:
+        """Add 16-bit sound, 16 kHz, unless the video has ended."""
+        if self._is_open(number):
+            samples = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(32768)
+            with self._reports_failure(number):
+                self._recordings[number].add_sound(media_time, samples)
+
+    def end(self, number: int) -> None:
+        """Finish a video once the frames that have arrived are drawn."""
+        if number in self._recordings:
+            self._ended.add(number)
+
+    def draw_image(self) -> bool:
+        """Draw the next due image, or complete a video; return False if nothing is due."""
+        for number in sorted(self._recordings, key=lambda n: self._newest_turn[self._keys[n]]):
+            with self._reports_failure(number):
+                if self._recordings[number].step():
+                    self._recordings[number] = self._recordings.pop(number)  # the last now
+                    self._num_turns += 1
+                    self._newest_turn[self._keys[number]] = self._num_turns
+                    self._report("image", number)
+                    return True
+                if number in self._ended:
+                    self._close(number)
+                    return True
+        return False
+
+    def close_early(self) -> None:
+        """Save the finished part of every video."""
+        for number in list(self._recordings):
+            with self._reports_failure(number):
+                self._close(number)
+
+    def _is_open(self, number: int) -> bool:
+        return number in self._recordings and number not in self._ended
+
+    def _close(self, number: int) -> None:
+        recording = self._recordings[number]
+        recording.close()
+        del self._recordings[number]
+        self._report("written", number, recording.path)
+
+    @contextmanager
+    def _reports_failure(self, number: int) -> Iterator[None]:
+        """Report an error as the end of one video; the others continue."""
+        try:
+            yield
+        except Exception as error:
+            if not isinstance(error, UserError):
+                LOG.exception("a video failed")
+            if recording := self._recordings.pop(number, None):
+                recording.discard()
+            self._report("failed", number, str(error))
+
+
+def run(connection: Connection, config: DriverConfig) -> None:
+    """Process main: call the methods of a ``Recorder`` that arrive, until None or the end arrives.
+
+    Videos that are unfinished then end early.
+    """
+    os.setsid()  # Ctrl-C in the terminal reaches only the driver, which stops this process
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    configure("driver", config.log_level)
+    renderers: list[Renderer] = []
+
+    def make(path: Path) -> Recording:
+        if not renderers:
+            renderers.append(open_renderer(config))
+        return Recording(path, renderers[0], config.frame_rate_hz, overwrite=False)
+
+    def report(*result: object) -> None:
+        with contextlib.suppress(OSError):  # the driver was killed
+            connection.send(result)
+
+    recorder = Recorder(make, report)
+    is_drawing = False
+    try:
+        while True:
+            for _ in range(MAX_TURN):
+                if not connection.poll(0.0 if is_drawing else None):
+                    break
+                command = connection.recv()
+                if command is None:
+                    return
+                getattr(recorder, command[0])(*command[1:])
+                is_drawing = True
+            is_drawing = recorder.draw_image()
+    except (EOFError, OSError):
+        LOG.warning("the driver ended, so its videos end early")
+    finally:
+        recorder.close_early()

@@ -1,0 +1,109 @@
+"""The order in which the driver draws its videos, and how they end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kouxing.services.driver import recorder
+from kouxing.services.driver.recorder import Recorder
+from kouxing.shared.errors import UserError
+
+FRAME = np.zeros(68, "<f4").tobytes()
+
+
+class FakeRecording:
+    """A video of one image per frame, which fails at an image."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.num_queued = 0
+        self.is_discarded = False
+
+    def add_frame(self, _time_s: float, _faps: NDArray[np.float32]) -> None:
+        self.num_queued += 1
+
+    def step(self) -> bool:
+        if self.path.name == "bad":
+            raise RuntimeError("the encoder failed")
+        self.num_queued -= 1
+        return self.num_queued >= 0
+
+    def close(self) -> None:
+        pass
+
+    def discard(self) -> None:
+        self.is_discarded = True
+
+
+class Stage:
+    """A recorder of fake videos."""
+
+    def __init__(self) -> None:
+        self.reports: list[tuple[object, ...]] = []
+        self.made: list[FakeRecording] = []
+        self.recorder = Recorder(self._make, lambda *report: self.reports.append(report))
+
+    def _make(self, path: Path) -> Any:
+        if path.name == "unwritable":
+            raise UserError("cannot write unwritable")
+        self.made.append(FakeRecording(path))
+        return self.made[-1]
+
+    def begin(self, number: int, key: str, num_frames: int, path: str = "video") -> None:
+        self.recorder.begin(number, key, Path(path))
+        for frame in range(num_frames):
+            self.recorder.add_frame(number, frame / 50, FRAME)
+
+    def draw(self) -> list[object]:
+        """Draw what is due; return the numbers of the videos in order."""
+        while self.recorder.draw_image():
+            pass
+        return [report[1] for report in self.reports if report[0] == "image"]
+
+
+@pytest.fixture
+def stage() -> Stage:
+    return Stage()
+
+
+def test_every_key_gets_the_same_number_of_images(stage: Stage) -> None:
+    for number in range(3):
+        stage.begin(number, "greedy", 2)
+    stage.begin(3, "other", 2)
+    assert stage.draw() == [0, 3, 1, 3, 2, 0, 1, 2]
+
+
+def test_completes_a_video_once_its_frames_are_drawn(stage: Stage) -> None:
+    stage.begin(0, "a", 2)
+    stage.recorder.end(0)
+    stage.recorder.add_frame(0, 9.0, FRAME)
+    assert stage.draw() == [0, 0]
+    assert stage.reports[-1] == ("written", 0, Path("video"))
+
+
+def test_an_error_ends_one_video_only(stage: Stage) -> None:
+    stage.begin(0, "a", 1, "bad")
+    stage.begin(1, "a", 1, "unwritable")
+    stage.begin(2, "a", 1)
+    assert stage.draw() == [2]
+    assert stage.reports[:2] == [
+        ("failed", 1, "cannot write unwritable"),
+        ("failed", 0, "the encoder failed"),
+    ]
+    assert stage.made[0].is_discarded
+
+
+def test_ends_a_video_early_when_drawing_is_too_far_behind(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_QUEUED_FRAMES", 3)
+    stage.begin(0, "a", 2)
+    stage.begin(1, "a", 4)
+    assert stage.draw() == [0, 1, 0, 1, 1]
+    ends = [report[:2] for report in stage.reports if report[0] != "image"]
+    assert ends == [("short", 1), ("written", 1)]
