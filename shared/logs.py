@@ -8,6 +8,7 @@ import sys
 import time
 
 LOG = logging.getLogger("kouxing")
+LIBRARY_PERIOD_S = 60.0
 
 
 class _JsonFormatter(logging.Formatter):
@@ -46,9 +47,22 @@ class RateLimit:
 
 
 def configure(service: str, level: str) -> None:
-    """Send the log of this process to standard error as JSON lines."""
-    handler = logging.StreamHandler(sys.stderr)
+    """Send the log of this process to standard error as JSON lines.
+
+    A library's line is logged once per ``LIBRARY_PERIOD_S``, because clients may cause it. Lines
+    about their closed connections are not logged.
+    """
+
+    def is_logged(line: logging.LogRecord) -> bool:
+        is_disconnect = line.exc_info is not None and isinstance(line.exc_info[1], OSError)
+        return not is_disconnect and limit.allows(f"{line.pathname}:{line.lineno}")
+
+    handler, for_libraries = logging.StreamHandler(sys.stderr), logging.StreamHandler(sys.stderr)
     handler.setFormatter(_JsonFormatter(service))
     LOG.handlers[:] = [handler]
     LOG.setLevel(level.upper())
     LOG.propagate = False
+    limit = RateLimit(LIBRARY_PERIOD_S)
+    for_libraries.setFormatter(_JsonFormatter(service))
+    for_libraries.addFilter(is_logged)
+    logging.basicConfig(handlers=[for_libraries], level=logging.WARNING)

@@ -7,6 +7,7 @@ hangs. Neither names a session, so readers do not learn who speaks.
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -26,7 +27,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import BUCKETS_MS, Distribution, Metrics
 
 REQUEST_LIMIT_S = 5.0  # for a peer to send its request and read the answer
-MAX_REQUESTS = 16  # at the same time; the server closes further connections
+MAX_REQUESTS = 16  # at the same time; then the oldest connection is closed
 # Counters with these prefixes become one metric with a label: name, label and help text.
 LABELED = {
     "in_": ("messages_received", "kind", "Messages received."),
@@ -108,7 +109,7 @@ class MetricsServer(ThreadingHTTPServer):
         self.registry = CollectorRegistry()
         self.registry.register(MetricsCollector(metrics, service))
         self.is_alive = is_alive
-        self._free_slots = threading.BoundedSemaphore(MAX_REQUESTS)
+        self._open: dict[socket.socket, None] = {}  # in the order in which they connected
         try:
             super().__init__((host, port), _Handler)
         except OSError as error:
@@ -123,18 +124,21 @@ class MetricsServer(ThreadingHTTPServer):
         self.server_close()
 
     def process_request(self, request: socket.socket, client_address: object) -> None:  # type: ignore[override]
-        """Answer a request in a thread, or close the connection if there are too many."""
-        if self._free_slots.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        """Answer a request in a thread. Close the oldest connection if there are too many."""
+        if len(self._open) >= MAX_REQUESTS:
+            oldest = next(iter(self._open))
+            self._open.pop(oldest)
+            with contextlib.suppress(OSError):  # the client has disconnected
+                oldest.shutdown(socket.SHUT_RDWR)
+        self._open[request] = None
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: socket.socket, client_address: object) -> None:  # type: ignore[override]
         """Answer a request."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free_slots.release()
+            self._open.pop(request, None)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore peers that disconnect."""
@@ -143,6 +147,11 @@ class MetricsServer(ThreadingHTTPServer):
 class _Handler(MetricsHandler):
     timeout = REQUEST_LIMIT_S
     server: MetricsServer
+
+    def send_header(self, keyword: str, value: str) -> None:
+        """Send a header, except ``Server``, which contains the version of Python."""
+        if keyword != "Server":
+            super().send_header(keyword, value)
 
     def do_GET(self) -> None:  # noqa: N802 - a name of http.server
         if self.path == "/metrics":

@@ -123,8 +123,8 @@ class _Connection(web.RequestHandler):
         message: str | None = None,
     ) -> web.StreamResponse:
         """Answer a request whose handler raised an exception."""
-        if isinstance(exc, ConnectionError):
-            raise exc
+        if _is_disconnect(exc):
+            raise ConnectionResetError
         if isinstance(exc, HttpProcessingError | web.RequestPayloadError):
             status, text = 400, "this is not a valid HTTP request"
             self._warn("dropped a request that is not HTTP")
@@ -145,12 +145,18 @@ class _Connection(web.RequestHandler):
     def log_exception(self, *args: object, **_options: object) -> None:
         """Log the current exception, once a minute for each place in the code."""
         error = sys.exception()
-        if not isinstance(error, ConnectionError) and self._log_limit.allows(_place(error)):
+        if not _is_disconnect(error) and self._log_limit.allows(_place(error)):
             LOG.error(*args, exc_info=True)
 
     def _warn(self, text: str, error: BaseException | None = None) -> None:
         if self._log_limit.allows(_place(error) or text):
             LOG.warning("%s", text)
+
+
+def _is_disconnect(error: BaseException | None) -> bool:
+    # asyncio raises AttributeError if a client disconnects while it receives a file over TLS
+    context = error and error.__context__
+    return isinstance(error, ConnectionError) or isinstance(context, ConnectionError)
 
 
 def _place(error: BaseException | None) -> str:

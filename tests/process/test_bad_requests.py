@@ -10,6 +10,10 @@ import pytest
 
 from tests.system import LIMIT_S, Gateway, port_of
 
+UPGRADE = (
+    b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+)
 BODY = b"Content-Length: 2\r\n\r\n{}"
 LONG = b"a" * 300
 
@@ -23,6 +27,7 @@ def gateway() -> Iterator[Gateway]:
     assert gateway.process.returncode == 0
     assert "Traceback" not in log
     assert "traceback" not in log
+    assert log.count("overlap") == 1, "a library's line is logged once a minute"
 
 
 def ask(gateway: Gateway, request: bytes) -> str:
@@ -55,6 +60,8 @@ def ask(gateway: Gateway, request: bytes) -> str:
         (b"POST /senders?token=secret", b"Content-Length: 1000000\r\n\r\n" + b"a" * 200_000, 413),
         (b"POST /senders?token=secret", b"Transfer-Encoding: chunked\r\n\r\nz\r\n", 400),
         (b"GET /viewer?token=secret", b"Upgrade: websocket\r\n\r\n", 400),
+        (b"GET /viewer?token=secret", UPGRADE + b"Sec-WebSocket-Protocol: a\r\n\r\n", 101),
+        (b"GET /viewer?token=secret", UPGRADE + b"Sec-WebSocket-Protocol: b\r\n\r\n", 101),
         (b"POST /senders?token=secret", b"Content-Encoding: gzip\r\n" + BODY, 415),
         (b"POST /sound", b"Content-Encoding: br\r\n" + BODY, 415),
         (b"POST /unknown", b"Content-Encoding: deflate\r\n" + BODY, 415),

@@ -44,13 +44,23 @@ def test_serves_metrics_and_health(server: MetricsServer) -> None:
         get(server, "/")
 
 
-def test_closes_connections_beyond_the_limit(server: MetricsServer) -> None:
+def test_answers_while_too_many_connections_send_no_request(server: MetricsServer) -> None:
     address = ("127.0.0.1", server.server_port)
     with ExitStack() as connections:
-        for _ in range(MAX_REQUESTS):
-            connections.enter_context(socket.create_connection(address))
-        with closing(socket.create_connection(address, timeout=30)) as refused:
-            assert refused.recv(1) == b""
+        for _ in range(MAX_REQUESTS + 1):
+            connection = socket.create_connection(address, timeout=30)
+            connections.enter_context(connection).sendall(b"GET /metr")
+        assert get(server, "/healthz") == "alive\n"
+
+
+@pytest.mark.parametrize("request_line", [b"GET /healthz HTTP/1.1", b"\xff\xff / HTTP/9"])
+def test_sends_no_version(server: MetricsServer, request_line: bytes) -> None:
+    with closing(socket.create_connection(("127.0.0.1", server.server_port), 30)) as client:
+        client.sendall(request_line + b"\r\n\r\n")
+        answer = client.makefile("rb").read()
+    assert answer
+    assert b"Server:" not in answer
+    assert b"Python" not in answer
 
 
 def test_a_port_in_use_is_an_error_that_names_it(server: MetricsServer) -> None:
