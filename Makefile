@@ -5,7 +5,7 @@
 # make quick        the tests to run while editing, under a minute
 # make check        style, types and import rules
 # make check-wheel  installs the wheel in an empty environment, and runs it
-# make lock         updates the locked versions of all Python packages
+# make lock         updates the locked versions and hashes of all Python packages
 #
 # test and check run all their stages, report each failure, and then exit with an error.
 PYTHON ?= python3
@@ -24,11 +24,19 @@ CLIENT := proto/node
 JAVASCRIPT := clients/javascript
 AVATAR := examples/browser-vrm
 BLENDER := examples/blender/.venv
+BLENDER_LOCK := examples/blender/requirements.lock
 SAMPLE := shared/demo/hello-female.wav
+# pip installs only packages with these hashes. The dev lock lacks torch: the CPU build has other hashes.
 LOCK := requirements.lock
+LOCK_DEV := requirements-dev.lock
+LOCK_TORCH := requirements-torch.lock
+LOCK_TORCH_CPU := requirements-torch-cpu.lock
 TORCH := torch==2.13.0
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --retries 0 --timeout 10
-PIP := $(BIN)/python -m pip install --quiet
+BPY := bpy==4.5.15
+INSTALL := -m pip install --quiet
+PIP := $(BIN)/python $(INSTALL)
+PIP_LOCK := $(PIP) --require-hashes --requirement
 NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --no-audit --no-fund --loglevel=error --prefix
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -52,7 +60,7 @@ wheel: .venv/installed $(PAGE)/node_modules/.package-lock.json
 	rm -rf build dist $(PAGE)/vendor
 	mkdir $(PAGE)/vendor
 	tar -C $(PAGE)/node_modules -cf - $(PAGE_MODULES) | tar -C $(PAGE)/vendor -xf -
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .; status=$$?; \
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .; status=$$?; \
 		rm -rf build $(PAGE)/vendor; exit $$status
 	ls -l dist
 
@@ -107,11 +115,19 @@ check-docker:
 check-wheel: wheel
 	$(PYTHON) deploy/check_wheel.py dist/kouxing-*.whl
 
-# One lock for every system and Python >= 3.11. The version of torch is fixed: training depends on it.
-lock: .venv/installed
-	$(PIP) uv
-	echo '$(TORCH)' | $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras \
-		--no-annotate --custom-compile-command 'make lock' --output-file $(LOCK) pyproject.toml -
+# The locks suit every system and Python >= 3.11. The version of torch is fixed: training depends on it.
+# When it changes, copy the hashes of its CPU builds from the index of TORCH_CPU to LOCK_TORCH_CPU.
+COMPILE := $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
+	--no-annotate --custom-compile-command 'make lock'
+BUILD_REQUIRES := sed -n 's/^requires = \["\(.*\)"\]/\1/p' pyproject.toml
+WITHOUT_TORCH := sed -n -E 's/^((torch|triton|cuda-|nvidia-)[^=]*)==.*/--no-emit-package \1/p' $(LOCK_TORCH)
+
+lock: .venv/installed-dev
+	echo '$(TORCH)' | $(COMPILE) --output-file $(LOCK_TORCH) -
+	$(BUILD_REQUIRES) | $(COMPILE) --all-extras --constraint $(LOCK_TORCH) $$($(WITHOUT_TORCH)) \
+		--output-file $(LOCK_DEV) pyproject.toml -
+	$(BUILD_REQUIRES) | $(COMPILE) --extra page --constraint $(LOCK_DEV) --output-file $(LOCK) pyproject.toml -
+	echo '$(BPY)' | $(COMPILE) --output-file $(BLENDER_LOCK) -
 
 clean:
 	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
@@ -120,13 +136,14 @@ clean:
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
 	$(PYTHON) -m venv .venv
-	$(PIP) --constraint $(LOCK) --editable '.[page]'
+	$(PIP_LOCK) $(LOCK)
+	$(PIP) --no-deps --no-build-isolation --editable .
 	touch $@
 
-.venv/installed-dev: .venv/installed
+.venv/installed-dev: .venv/installed $(LOCK_DEV) $(LOCK_TORCH) $(LOCK_TORCH_CPU)
 	sh deploy/system_packages.sh test
-	$(PIP) $(TORCH_CPU) $(TORCH) || $(PIP) $(TORCH)
-	$(PIP) --constraint $(LOCK) --editable '.[page,dev,neural-training]'
+	$(PIP_LOCK) $(LOCK_TORCH_CPU) --no-deps $(TORCH_CPU) || $(PIP_LOCK) $(LOCK_TORCH)
+	$(PIP_LOCK) $(LOCK_DEV)
 	touch $@
 
 $(PAGE)/node_modules/.package-lock.json: $(PAGE)/package-lock.json | .venv/installed
@@ -143,9 +160,9 @@ $(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR)
 	touch $@
 
 # Blender needs Python 3.11 and an older numpy. Without it, its test is skipped.
-$(BLENDER)/installed:
+$(BLENDER)/installed: $(BLENDER_LOCK)
 	$(PYTHON) -m venv $(BLENDER)
-	$(BLENDER)/bin/python -m pip install --quiet bpy==4.5.15
+	$(BLENDER)/bin/python $(INSTALL) --require-hashes --requirement $(BLENDER_LOCK)
 	touch $@
 
 $(HEADS): $(HEAD_SOURCES) | .venv/installed

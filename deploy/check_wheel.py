@@ -3,7 +3,7 @@
 usage: check_wheel.py WHEEL
 
 It renders a sample sentence, starts ``kouxing run``, and loads the page with its heads and all of
-its JavaScript modules. Package versions are those of requirements.lock.
+its JavaScript modules. Its packages are those of requirements.lock.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ def main(wheel: Path) -> None:
         folder = Path(name)
         venv.create(folder / "venv", with_pip=True)
         python = folder / "venv" / "bin" / "python"
-        install = ["-m", "pip", "install", "--quiet", "--constraint", str(LOCK), str(wheel)]
-        subprocess.run([python, *install], check=True)
+        install = [python, "-m", "pip", "install", "--quiet"]
+        subprocess.run([*install, "--require-hashes", "--requirement", LOCK], check=True)
+        subprocess.run([*install, "--no-deps", wheel], check=True)
         environment = {
             key: value for key, value in os.environ.items() if not key.startswith("PYTHON")
         }
