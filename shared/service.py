@@ -181,8 +181,8 @@ class Service(MessageLoop):
     def run(self) -> None:
         """Run until a signal or the end of the supervisor."""
         self._install_signal_handlers()
-        gc.collect()
         gc.freeze()  # a full collection would stop the loop for 100 ms
+        gc.enable()  # see services.process
         trim_heap()
         self.startup()
         self.main_loop()
