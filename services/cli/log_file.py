@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 
 MAX_BYTES = 10_000_000  # of a file; the one before is kept as NAME.log.1
 _TOKEN = re.compile(rb"(token=)[^\s\"'&]+")
@@ -26,8 +26,13 @@ class LogFile:
         self._path = path
         self._warn = warn
         self._max_bytes = max_bytes
-        self._file: IO[bytes] | None = None
+        self._descriptor: int | None = None
         self._num_dropped = 0
+
+    def check(self) -> None:
+        """Create the file. Raises ``OSError`` if it cannot be written."""
+        self._open()
+        self.close()
 
     def write(self, line: bytes) -> None:
         """Append a line."""
@@ -45,17 +50,31 @@ class LogFile:
 
     def close(self) -> None:
         """Close the file; a later line opens it again."""
-        if self._file is not None:
+        if self._descriptor is not None:
             with contextlib.suppress(OSError):
-                self._file.close()
-            self._file = None
+                os.close(self._descriptor)
+            self._descriptor = None
 
     def _append(self, line: bytes) -> None:
-        if self._file is not None and self._file.tell() > self._max_bytes:
+        descriptor = self._open()
+        if os.fstat(descriptor).st_size > self._max_bytes:
             self.close()
             self._path.replace(self._path.with_name(f"{self._path.name}.1"))
-        if self._file is None:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-            self._file = os.fdopen(os.open(self._path, flags, 0o600), "ab", buffering=0)
-            os.fchmod(self._file.fileno(), 0o600)
-        self._file.write(line)
+            descriptor = self._open()
+        size = os.fstat(descriptor).st_size
+        if os.write(descriptor, line) < len(line):
+            os.ftruncate(descriptor, size)  # otherwise, the next line would follow half of this one
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _open(self) -> int:
+        """Return the descriptor of the file; create the file if somebody has deleted it."""
+        if self._descriptor is not None and os.fstat(self._descriptor).st_nlink:
+            return self._descriptor
+        self.close()
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        is_regular = self._path.is_file() and not self._path.is_symlink()
+        if os.path.lexists(self._path) and not is_regular:
+            raise OSError(errno.EINVAL, "it is not a regular file; delete it")
+        self._descriptor = os.open(self._path, flags, 0o600)
+        os.fchmod(self._descriptor, 0o600)
+        return self._descriptor

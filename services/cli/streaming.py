@@ -73,12 +73,14 @@ class _Streaming:
         self._console = console
         self._duration_s = self._clipped = self._peak = 0.0  # of what was sent
         self._num_phones = 0
+        self._is_recorded = False
 
     def run(self, *, record: bool, paced: bool, **options: Any) -> StreamSummary:
         """Stream the source and wait for the last frame and the video."""
         source = self._source
         for notice in source.notices:
             self._warn(notice)
+        self._is_recorded = record
         drawn_before_s = self._drawn_s() if record else 0.0
         self._session = self._client.open_session(
             encoding="f32le",
@@ -101,7 +103,7 @@ class _Streaming:
         finally:
             with contextlib.suppress(KouxingError):  # closed already, or control is gone
                 self._session.close()
-        video = self._wait_for_video(drawn_before_s) if record else ""
+        video = self._wait_for_video(drawn_before_s) if self._is_recorded else ""
         if not self._num_phones:
             reason = "it is silent" if self._peak < QUIET_PEAK else "is there a voice in it?"
             self._warn(f"{source.name}: no speech was found; {reason}")
@@ -169,6 +171,7 @@ class _Streaming:
         for event in self._events.available():
             if event.name == "error":
                 self._warn(event.detail)
+                self._is_recorded &= not event.detail.startswith("no-video")
 
     def _wait_for_video(self, drawn_before_s: float) -> str:
         """Wait for the driver's video; return its path, or an empty string."""

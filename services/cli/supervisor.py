@@ -23,7 +23,6 @@ from kouxing.services.kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
-from kouxing.shared.terminal import check_output
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
 STEADY_S = 30.0  # a service that has run for longer restarts without delay
@@ -66,14 +65,16 @@ class Supervisor:
         self._stopping = threading.Event()
         self._process_ended = threading.Event()
         self._failure: UserError | None = None
+        path = log_folder
         try:
             log_folder.mkdir(parents=True, exist_ok=True)
+            for path in map(self._log_path, self._names):
+                LogFile(path, self._warn).check()
         except OSError as error:
             raise UserError(
-                f"{log_folder}: cannot be written: {error.strerror}; start kouxing in a folder that"
+                f"{path}: cannot be written: {error.strerror}; start kouxing in a folder that"
                 " you can write to, or add --set driver.out=FOLDER"
             ) from None
-        check_output(*map(self._log_path, self._names), force=True)
 
     def start(self) -> None:
         """Start every service."""
@@ -132,7 +133,7 @@ class Supervisor:
                     process.kill()
                 elif process.is_ready and name in self._restarted:
                     self._restarted.remove(name)
-                    self._console.print(f"[green]{name} is running again")
+                    self._print(f"{name} is running again", "green")
             elif status == USER_ERROR:
                 raise UserError(f"{name} cannot start; see the message above")
             else:
@@ -217,10 +218,14 @@ class Supervisor:
             for line in stream:
                 log.write(line)
                 if text := _console_text(line):
-                    self._console.print(with_name(name, text), markup=False, highlight=False)
+                    self._print(with_name(name, text))
 
     def _warn(self, text: str) -> None:
-        self._console.print(f"[yellow]{text}")
+        self._print(text, "yellow")
+
+    def _print(self, text: str, style: str | None = None) -> None:
+        with contextlib.suppress(OSError):  # the console is a file on a full disk
+            self._console.print(text, style=style, markup=False, highlight=False)
 
 
 def _console_text(line: bytes) -> str:

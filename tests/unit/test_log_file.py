@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import stat
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 from kouxing.services.cli.log_file import LogFile
 
@@ -28,17 +33,44 @@ def test_a_full_log_is_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "control.log.1").read_text() == "one two three\n"
 
 
-def test_a_full_disk_is_reported_once_and_costs_only_lines(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_once_and_costs_only_whole_lines(tmp_path: Path) -> None:
     path, warnings = tmp_path / "driver.log", list[str]()
     log = LogFile(path, warnings.append)
-    path.mkdir()
-    for _ in range(3):
-        log.write(b"lost\n")
-    path.rmdir()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, before[1]))
+    try:
+        for _ in range(3):
+            log.write(b"fifteen letters\n")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     log.write(b"kept\n")
     log.close()
-    assert path.read_text() == "kept\n"
+    assert path.read_text() == "fifteen letters\nkept\n"
     assert warnings == [
-        f"{path}: cannot be written: Is a directory",
-        f"{path}: 3 lines were dropped",
+        f"{path}: cannot be written: No space left on device",
+        f"{path}: 2 lines were dropped",
     ]
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("x")])
+def test_only_a_regular_file_is_a_log(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / "driver.log")
+    warnings: list[str] = []
+    log = LogFile(tmp_path / "driver.log", warnings.append)
+    log.write(b"lost\n")
+    assert "it is not a regular file" in warnings[0]
+    with pytest.raises(OSError, match="it is not a regular file"):
+        log.check()
+
+
+def test_a_deleted_log_is_created_again_and_an_unreplaceable_one_stops(tmp_path: Path) -> None:
+    path, warnings = tmp_path / "driver.log", list[str]()
+    log = LogFile(path, warnings.append, max_bytes=10)
+    log.write(b"one two three\n")
+    path.unlink()
+    log.write(b"four five six\n")
+    (tmp_path / "driver.log.1").mkdir()
+    for _ in range(3):
+        log.write(b"seven\n")
+    assert path.read_text() == "four five six\n"
+    assert len(warnings) == 1
