@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Callable
+from itertools import islice
 
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.sockets import Socket
@@ -16,6 +17,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge
 
 RESEND_AFTER_S = 0.5
+MAX_RESENT = 200  # messages at a time; resending more would delay a busy receiver further
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
 
 
@@ -51,13 +53,14 @@ class ReliableSender:
         return acknowledged
 
     def tick(self, now_s: float) -> int:
-        """Resend all messages if acknowledgements have stopped; return how many were resent."""
+        """Resend messages if acknowledgements have stopped; return how many were resent."""
         if not self.unacknowledged or now_s - self._progress_s < RESEND_AFTER_S:
             return 0
         self._progress_s = now_s
-        for message in self.unacknowledged:
+        oldest = list(islice(self.unacknowledged, MAX_RESENT))
+        for message in oldest:
             self._socket.send(message)
-        return len(self.unacknowledged)
+        return len(oldest)
 
 
 class ReliableReceiver:

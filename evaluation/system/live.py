@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from kouxing_client import Client, FapFrame, KouxingError, Phone, Session, Speech
+from kouxing_client import Client, FapFrame, KouxingError, Phone, Session
 from numpy.typing import NDArray
 
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -25,7 +25,6 @@ class Seen:
 
     frames: list[tuple[float, FapFrame]] = field(default_factory=list)  # arrival, s
     phones: list[Phone] = field(default_factory=list)
-    speech: list[Speech] = field(default_factory=list)
     ended: bool = False
     error: str = ""  # why the session failed
     start_s: float = 0.0  # when the first sample was due
@@ -50,20 +49,8 @@ class Seen:
         )
 
     def spoken_phones(self) -> list[Phone]:
-        """Return the spoken phones of all epochs in order.
-
-        A new recognizer starts with a speech message. From there on, the phones of earlier epochs
-        are invalid.
-        """
-        spoken = [phone for phone in self.phones if phone.is_spoken]
-        starts = {speech.epoch: speech.media_time for speech in self.speech if speech.sequence == 1}
-        for epoch, start in starts.items():
-            spoken = [
-                phone
-                for phone in spoken
-                if phone.epoch >= epoch or phone.media_time + phone.duration / 2 < start
-            ]
-        return sorted(spoken, key=lambda phone: phone.media_time)
+        """Return the spoken phones in order."""
+        return [phone for phone in self.phones if phone.is_spoken]
 
 
 def speak(
@@ -103,7 +90,7 @@ def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
 class _Speaker:
     def __init__(self, session: Session, sound: NDArray[np.float32], *, paced: bool) -> None:
         self._session = session
-        self._output = session.results(FapFrame, Phone, Speech, keep_all=True)
+        self._output = session.results(FapFrame, Phone, keep_all=True)
         pcm, size = sound.astype("<f4").tobytes(), 4 * CHUNK
         self._chunks = [pcm[at : at + size] for at in range(0, len(pcm), size)]
         self._num_sent = 0
@@ -137,8 +124,6 @@ class _Speaker:
                         self.seen.frames.append((time.monotonic(), result))
                     case Phone():
                         self.seen.phones.append(result)
-                    case Speech():
-                        self.seen.speech.append(result)
         except KouxingError as error:
             self.seen.error = str(error)
         self.seen.ended = self._output.has_ended

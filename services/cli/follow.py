@@ -19,6 +19,7 @@ from kouxing.services.cli.curves import (
     json_line,
 )
 from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
+from kouxing.services.cli.streaming import missed_remark
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
@@ -28,7 +29,7 @@ from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, lo
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.terminal import CONSOLE, plural, print_message
 
-OPEN_POLL_S = 0.2
+OPEN_POLL_S = 0.05  # the services repeat what they published shortly before
 PRINTED_FAPS = (3, 4, 5, 6, 16, 17)  # jaw, lips, lip corner, protrusion
 LEGEND = "columns: time, then FAPs " + ", ".join(f"{n} {FAPS[n - 1].name}" for n in PRINTED_FAPS)
 
@@ -50,19 +51,21 @@ def follow(
     exporter = None if output is None else _open_exporter(output, form)
     with connect(control) as client:
         followed = _wait_for_session(session, client)
-        if shown is not ListenOutput.FAPS:
-            phones = _iter_until_interrupt(followed.results(Phone, keep_all=True), followed.name)
-            if shown is ListenOutput.SYLLABLES:
-                language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
-                count = _print(_syllable_lines(phones, load_inventory(language)))
-            else:
-                count = _print(_phone_lines(phones))
+        shows_faps = shown is ListenOutput.FAPS
+        results = followed.results(FapFrame if shows_faps else Phone, keep_all=True)
+        arriving = _iter_until_interrupt(results, followed.name)
+        if shown is ListenOutput.SYLLABLES:
+            language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
+            count = _print(_syllable_lines(arriving, load_inventory(language)))
+        elif shown is ListenOutput.PHONES:
+            count = _print(_phone_lines(arriving))
         else:
-            frames = _iter_until_interrupt(followed.results(FapFrame, keep_all=True), followed.name)
-            rows = map(_row, frames)
+            rows = map(_row, arriving)
             count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
-    unit = "frame" if shown is ListenOutput.FAPS else shown.value.removesuffix("s")
+    unit = "frame" if shows_faps else shown.value.removesuffix("s")
     print_message(f"session {followed.name} ended: {plural(count, unit)}")
+    if results.num_missed:
+        print_message(missed_remark(results.num_missed, "frame" if shows_faps else "phone"))
     if output is not None:
         print_message(f"wrote {output}")
 

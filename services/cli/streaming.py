@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from kouxing.shared.audio_file import AudioSource, clipping_remarks, num_clipped
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import plural
 
 PUSH_TIMEOUT_S = 30.0
 STATUS_S = 1.0  # between status requests
@@ -64,6 +65,14 @@ def stream(
         )
 
 
+def missed_remark(count: int, noun: str) -> str:
+    """Return the message about results that did not arrive."""
+    return (
+        f"at least {plural(count, noun)} did not arrive; close other programs, or use a faster"
+        " network, and try again"
+    )
+
+
 class _Streaming:
     """One source that is streamed into a session."""
 
@@ -93,7 +102,7 @@ class _Streaming:
         try:
             self._events = self._session.events()
             self._frames = self._session.frames()
-            self._results = self._session.results(Phone, keep_all=True)
+            self._phones = self._session.results(Phone, keep_all=True)
             with self._progress() as progress:
                 task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
                 self._show_time = functools.partial(progress.update, task)
@@ -107,6 +116,8 @@ class _Streaming:
         if not self._num_phones:
             reason = "it is silent" if self._peak < QUIET_PEAK else "is there a voice in it?"
             self._warn(f"{source.name}: no speech was found; {reason}")
+        if self._phones.num_missed:
+            self._warn(missed_remark(self._phones.num_missed, "phone"))
         for remark in (*source.remarks, *clipping_remarks(source.name, self._clipped)):
             self._warn(remark)
         return StreamSummary(self._session.name, self._duration_s, self._num_phones, video)
@@ -117,10 +128,10 @@ class _Streaming:
         return Progress(*columns, console=self._console, transient=True, disable=not is_shown)
 
     def _update(self, timeout_s: float) -> None:
-        """Process what has arrived, waiting up to the timeout for a frame."""
-        for frame in self._frames.available(timeout_s):
+        """Process what has arrived, waiting up to the timeout for a phone."""
+        self._num_phones += sum(phone.is_spoken for phone in self._phones.available(timeout_s))
+        for frame in self._frames.available():
             self._show_time(completed=frame.time_s)
-        self._num_phones += sum(phone.is_spoken for phone in self._results.available())
 
     def _send_all(self, *, paced: bool) -> None:
         source = self._source
@@ -151,12 +162,13 @@ class _Streaming:
     def _wait_for_end(self) -> None:
         """Wait for the last frame; with much queued audio that may take a while."""
         ask_s = time.monotonic() + STATUS_S
-        while not self._frames.has_ended:
+        while not self._phones.has_ended:
             self._update(0.2)
             self._check_errors()
             if time.monotonic() > ask_s:
                 self._client.status()  # fails if control is gone
                 ask_s = time.monotonic() + STATUS_S
+        self._update(0.0)
 
     def _check_errors(self) -> None:
         """Print the errors that the services report."""

@@ -38,10 +38,15 @@ class Faults:
                 fault.is_reported = True
                 LOG.warning(fault.text)
 
-    def end(self, instance: str, now_s: float) -> None:
-        """Record that a service has registered; report it if its loss was reported."""
+    def end(self, instance: str, now_s: float) -> float:
+        """Record that a service has registered; return how long it was lost.
+
+        Its return is reported if its loss was.
+        """
         fault = self._faults.pop(instance, None)
-        if fault is not None:
-            lasted_s = now_s - fault.begin_s
-            log = LOG.warning if fault.is_reported else LOG.info
-            log("%s is back after %.1f s", instance, lasted_s)
+        if fault is None:
+            return 0.0
+        lasted_s = now_s - fault.begin_s
+        log = LOG.warning if fault.is_reported else LOG.info
+        log("%s is back after %.1f s", instance, lasted_s)
+        return lasted_s

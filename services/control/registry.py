@@ -5,6 +5,7 @@ A worker provides endpoints and needs others. An observer takes part in every se
 
 from __future__ import annotations
 
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -23,6 +24,8 @@ from kouxing.shared.wire.session import ErrorCode, SessionFacts
 MAX_SERVICES = 2000
 MAX_SERVICES_PER_KEY = 1500
 MAX_REMEMBERED = 1000  # lost services that are recognized when they return
+MAX_LATE_S = 5.0  # a service that is back by then was late, not lost
+CALM_S = 60.0  # without a late service, until the usual limit applies again
 
 
 @dataclass(slots=True)
@@ -46,7 +49,8 @@ class Registry:
 
     def __init__(self, lost_after_s: float) -> None:
         self._services: OrderedDict[str, ServiceRecord] = OrderedDict()  # by newest heartbeat
-        self._lost_after_s = lost_after_s
+        self._usual_limit_s = self._limit_s = lost_after_s
+        self._late_at_s = -math.inf
         self._paused_s = 0.0  # total time in which control itself did not run
         self._observers: set[str] = set()
         self._by_peer: dict[Peer, str] = {}
@@ -235,14 +239,25 @@ class Registry:
         """Exclude a time in which control did not run from the age of heartbeats."""
         self._paused_s += pause_s
 
+    def note_return(self, after_s: float, now_s: float) -> None:
+        """Wait longer for heartbeats if a service that was declared lost had only been late.
+
+        Otherwise, the sessions of a busy machine would move from one late worker to the next.
+        """
+        if after_s < MAX_LATE_S:
+            self._limit_s = min(2 * self._limit_s, max(MAX_LATE_S, self._usual_limit_s))
+            self._late_at_s = now_s
+
     def age_s(self, instance: str, now_s: float) -> float:
         """Return the age of a service's newest heartbeat, without control's own pauses."""
         return now_s - self._paused_s - self._services[instance].heartbeat_s
 
     def overdue(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
+        if now_s > self._late_at_s + CALM_S:
+            self._limit_s = self._usual_limit_s
         oldest = takewhile(
-            lambda item: self.age_s(item[0], now_s) > self._lost_after_s, self._services.items()
+            lambda item: self.age_s(item[0], now_s) > self._limit_s, self._services.items()
         )
         return [instance for instance, record in oldest if record.peer != NO_PEER]
 

@@ -55,7 +55,7 @@ from kouxing.shared.wire.speech import Speech
 
 STOPPED = "stopped"  # reason for a service that shut down
 START_TIMEOUT_S = 5.0
-MOVE_TIMEOUT_S = 20.0  # until a session without a worker is closed
+MOVE_TIMEOUT_S = 20.0  # until a session that no worker takes over is closed
 MAX_PAUSE_S = 0.1  # a longer pause between ticks is control's, not the services'
 SERVICE_EVENTS = (EventName.ERROR, EventName.RECORDED)  # events that a service may publish
 
@@ -124,7 +124,9 @@ class ControlService(Service):
             self._restore_sessions()
         for connection in self._commands.ended():
             if instance := self._registry.instance_on(connection):
-                self._on_service_lost(instance, "its connection closed")
+                has_stopped = self._registry[instance].state == "draining"
+                reason = STOPPED if has_stopped else "its connection closed"
+                self._on_service_lost(instance, reason)
         for instance in self._registry.overdue(now_s):
             self._on_service_lost(instance, "no heartbeat")
         self._faults.report(now_s)
@@ -224,10 +226,10 @@ class ControlService(Service):
         replaced = self._registry.replaced_by(heartbeat, sender) if is_new else None
         self._registry.add(heartbeat, sender, time.monotonic())
         self._takeover.record_observer(heartbeat)
+        self._check_sessions(heartbeat, sender)  # before others are placed on it
         if is_new:
             was_lost = self._registry.reclaim_lost(instance, sender) and not is_other
             self._on_new_service(heartbeat, sender, replaced, was_lost=was_lost)
-        self._check_sessions(heartbeat, sender)
         # The reply is last: a service that stalled learns by then which sessions have moved.
         reply = HeartbeatReply(
             sent_ns=heartbeat.sent_ns,
@@ -237,7 +239,9 @@ class ControlService(Service):
             keys=self._requests.changed_keys(heartbeat),
         )
         self._commands.send(reply, to=sender)
-        if heartbeat.state == "draining":
+        if heartbeat.state == "draining" and heartbeat.role == "worker":
+            self._move_sessions_of(instance)  # it continues to serve them until they have moved
+        elif heartbeat.state == "draining":
             self._on_service_lost(instance, STOPPED)
 
     def _on_new_service(
@@ -247,12 +251,14 @@ class ControlService(Service):
 
         A worker that was declared lost by mistake keeps the sessions that have not moved.
         """
-        self._faults.end(heartbeat.instance, time.monotonic())
+        now_s = time.monotonic()
+        lasted_s = self._faults.end(heartbeat.instance, now_s)
         self._publish(EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}")
         if replaced is not None:
             self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
         uninformed = []
         if was_lost:
+            self._registry.note_return(lasted_s, now_s)
             uninformed = self._sessions.reinstate_worker(heartbeat.instance)
         self._restore_sessions()
         for record in self._sessions.pending():
@@ -271,6 +277,8 @@ class ControlService(Service):
                 continue
             if record is not None and heartbeat.instance in record.lost:
                 continue  # the session has not moved yet
+            if record is not None and record.moved and heartbeat.state == "draining":
+                continue  # its new worker is starting
             if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
             elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:
@@ -321,6 +329,9 @@ class ControlService(Service):
         else:
             self._faults.begin(instance, reason, time.monotonic())
         self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
+        self._move_sessions_of(instance)
+
+    def _move_sessions_of(self, instance: str) -> None:
         for record in self._sessions.mark_worker_lost(instance, time.monotonic()):
             self._move_session(record)
 
@@ -354,7 +365,9 @@ class ControlService(Service):
             if waited_s > MOVE_TIMEOUT_S:
                 lost = ", ".join(sorted(record.lost))
                 self._end_session(record, f"{lost} is lost, and no other worker is free")
-        elif record.waiting_for and waited_s > START_TIMEOUT_S:
+        elif record.waiting_for and waited_s > (
+            MOVE_TIMEOUT_S if record.announced else START_TIMEOUT_S
+        ):
             self._stop_waiting(record)
         else:
             self._announce_if_started(record)
@@ -392,7 +405,7 @@ class ControlService(Service):
             record.waiting_for.clear()
             self._announce_if_started(record)
             return
-        text = f"{', '.join(sorted(missing))} did not start the session in {START_TIMEOUT_S:g} s"
+        text = f"{', '.join(sorted(missing))} did not start the session in time"
         if record.announced:
             self._end_session(record, text)
         else:

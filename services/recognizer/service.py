@@ -34,15 +34,13 @@ from kouxing.shared.phones.events import SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import SessionInput, StartSession
+from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
-from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
+from kouxing.shared.wire.speech import Acknowledge
 
-MAX_BACKLOG = 2000  # unacknowledged messages to a synthesizer before audio must wait
-MAX_OVERDUE_S = 5.0  # then the session stops sending phones, for the sake of other sessions
 MAX_BATCH_S = 0.3  # of audio that is decoded together
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
@@ -68,7 +66,7 @@ class RecognizerService(Service):
         self._ticked_s = time.monotonic()
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio", role="client")
-        self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
+        self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones", self._on_joined)
         self._unpaced_audio = self.bus.bind_router(
             config.unpaced_audio, "recognizer.unpaced_audio", role="client"
         )
@@ -136,14 +134,15 @@ class RecognizerService(Service):
                 self._unpaced.drop(session, keep_end=False)
             socket = self._audio if start.paced else self._unpaced_audio
             session = RecognizerSession(
-                start, self._recognizer, self._lip_predictor, socket, time.monotonic()
+                start, self._recognizer, self._lip_predictor, socket, self._phones, time.monotonic()
             )
             self._sessions[start.session] = session
         if is_new or session.start.epoch != start.epoch:
             session.start = start
             socket = self._connect(start.endpoints["phone_input"])
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
-            session.without_audio_s = 0.0  # so that the new synthesizer learns of a stalled client
+            if not is_new:  # so that the new synthesizer learns of a stalled client
+                session.without_audio_s = 0.0
             self._close_unused_synthesizers()
         return True
 
@@ -182,15 +181,12 @@ class RecognizerService(Service):
             if session.acknowledge_due_s is not None and now_s >= session.acknowledge_due_s:
                 self._acknowledge(session, now_s)
             self.metrics.count("resent", session.link.tick(now_s))
-            if session.link.backlog <= MAX_BACKLOG:
-                session.overdue_since_s = None
-                continue
-            blocked.add(session.start.paced)
-            session.overdue_since_s = session.overdue_since_s or now_s
-            if now_s - session.overdue_since_s > MAX_OVERDUE_S:
-                text = "dropped phones that the synthesizer does not acknowledge"
-                self.warn("no-link", text, session.name)
-                session.link.disconnect()
+            if session.link.check_overdue(now_s):
+                text = "the synthesizer is too slow, so the face misses a part of the speech"
+                self.warn(ErrorCode.NO_LINK, text, session.name)
+                self.publish_event(EventName.ERROR, session.name, f"{ErrorCode.NO_LINK}: {text}")
+            if session.link.is_full:
+                blocked.add(session.start.paced)
         self._is_live_blocked, self._is_unpaced_blocked = True in blocked, False in blocked
         self.pause(self._audio, paused=self._is_live_blocked)
         self._limit_unpaced()
@@ -201,10 +197,7 @@ class RecognizerService(Service):
         if self._batch or self._audio.wait(0.0):
             return
         for session in self._sessions.values():
-            if session.check_stalled(tick_s):
-                media_time = max(session.stream.media_time, session.start.media_time)
-                stalled = Progress(media_time=media_time, state=AudioState.STALLED)
-                session.link.send(stalled, now_s)
+            session.check_stalled(tick_s, now_s)
 
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
@@ -259,7 +252,7 @@ class RecognizerService(Service):
             self.metrics.count("repeated")
             in_order = []
         else:
-            session.last_audio_s, session.without_audio_s = now_s, 0.0
+            session.on_new_audio(now_s)
             in_order = session.order.push(message, now_s)
         self._accept_in_order(session, in_order, sender)
         if message.acknowledge:  # at once if the client resends or must fill a gap
@@ -391,16 +384,24 @@ class RecognizerService(Service):
         session.socket.send(acknowledgement, to=session.client)
 
     def _send_results(self, session: RecognizerSession) -> None:
-        """Send new results to the synthesizer, the subscribers and control."""
+        """Send new results to the subscribers, the synthesizer and control.
+
+        Subscribers are first: another recognizer would not repeat what the synthesizer has.
+        """
         now_s = time.monotonic()
         for result in session.new_results(self._recognizer):
-            if not isinstance(result, Waveform):
-                session.link.send(message_of(result), now_s)
             published = session.published_message(result)
             if published is not None:
-                self._phones.send(published)
+                session.replay.send(published, now_s)
                 if isinstance(result, SpeechChange):
                     self.send_to_control(published)
+            if not isinstance(result, Waveform):
+                session.link.send(message_of(result), now_s)
+
+    def _on_joined(self, session: str) -> None:
+        joined = self._sessions.get(session)
+        if joined is not None:
+            joined.replay.repeat(time.monotonic())
 
     def _connect(self, endpoint: str) -> Socket:
         if endpoint not in self._synthesizers:

@@ -16,6 +16,7 @@ from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_second
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange, Waveform
+from kouxing.shared.replay import Replay
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import StartSession
@@ -29,6 +30,7 @@ MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
 ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
 STALLED_AFTER_S = 0.2  # without audio of a live client
+MOVE_S = 3.0  # in addition after a move, for the client to connect to this recognizer
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
 
 
@@ -49,9 +51,11 @@ class RecognizerSession:
         recognizer: Recognizer,
         lip_predictor: LipFrameModel | None,
         socket: Socket,
+        publisher: Socket,
         now_s: float,
     ) -> None:
         self.start = start
+        self.replay = Replay(publisher, now_s)
         self.first_epoch = start.epoch
         self.face = CurrentFace(start.face, now_s)
         self.socket = socket
@@ -81,12 +85,12 @@ class RecognizerSession:
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded
         self.last_audio_s = now_s
-        self.without_audio_s = 0.0  # time in which this process could receive audio and did not
+        # time in which this process could receive audio and did not
+        self.without_audio_s = -MOVE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
         self.sequence_out = 0
         self.num_gaps_counted = 0
-        self.overdue_since_s: float | None = None  # the synthesizer's acknowledgements
         # After a loss, the client sends the audio that it kept in the meantime.
         self._lead = _AheadLimit(now_s, may_catch_up=start.epoch > 1)
 
@@ -147,11 +151,22 @@ class RecognizerSession:
         aligned = self.resumption.align((media_time, samples), rate_hz)
         return aligned if len(aligned[1]) else None
 
-    def check_stalled(self, tick_s: float) -> bool:
-        """Count time in which no audio arrived; return whether a live client has now stalled."""
+    def check_stalled(self, tick_s: float, now_s: float) -> None:
+        """Count time in which no audio arrived; report a live client that has now stalled."""
         before_s, self.without_audio_s = self.without_audio_s, self.without_audio_s + tick_s
         is_live = self.start.paced and not self.is_finished
-        return is_live and before_s <= STALLED_AFTER_S < self.without_audio_s
+        if is_live and before_s <= STALLED_AFTER_S < self.without_audio_s:
+            self._report(AudioState.STALLED, now_s)
+
+    def on_new_audio(self, now_s: float) -> None:
+        """Note that audio has arrived: the face must not rest until it is processed."""
+        if self.start.paced and self.without_audio_s > STALLED_AFTER_S:
+            self._report(AudioState.RESUMED, now_s)
+        self.last_audio_s, self.without_audio_s = now_s, 0.0
+
+    def _report(self, state: AudioState, now_s: float) -> None:
+        media_time = max(self.stream.media_time, self.start.media_time)
+        self.link.send(Progress(media_time=media_time, state=state), now_s)
 
     def request_acknowledgement(self, now_s: float, *, at_once: bool) -> None:
         """Schedule an acknowledgement to the client."""
@@ -180,8 +195,7 @@ class RecognizerSession:
     def on_acknowledge(self, ack: Acknowledge, now_s: float) -> None:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
-            is_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED
-            if isinstance(message, SpeechMessage) and not is_stalled:
+            if isinstance(message, SpeechMessage):
                 self.replay_window.update(event_of(message), self.order.last)
 
 

@@ -11,9 +11,12 @@ from collections import deque
 from kouxing.shared.clock import to_samples
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.events import is_report
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
+MAX_BACKLOG = 2000  # unacknowledged messages before audio must wait
+MAX_OVERDUE_S = 5.0  # then new messages are dropped, for the sake of other sessions
 KEPT = to_samples(3.0)  # media time of the messages that a new synthesizer gets, samples
 
 
@@ -25,6 +28,8 @@ class SynthesizerLink:
         self._kept: deque[Message] = deque()  # acknowledged messages of the last KEPT samples
         self._speech: Speech | None = None  # the newest one before those
         self._newest_frame: NewestFrame | None = None  # that the synthesizer has published
+        self._full_since_s: float | None = None
+        self._drops = False
 
     @property
     def backlog(self) -> int:
@@ -35,23 +40,37 @@ class SynthesizerLink:
         """Send to this synthesizer from now on, first what a new one needs."""
         messages = [*self._kept, *(self._sender.unacknowledged if self._sender is not None else ())]
         self._kept.clear()
+        self._full_since_s, self._drops = None, False
         self._sender = ReliableSender(socket, session, epoch)
         if (frame := self._newest_frame) is not None:
             self._sender.send(Progress(media_time=frame.media_time, newest_frame=frame), now_s)
         if self._speech is not None:
             self._sender.send(self._speech, now_s)
         for message in messages:
-            if not _is_resumption(message):
+            if not is_report(message):
                 self._sender.send(message, now_s)
 
-    def disconnect(self) -> None:
-        """Stop sending."""
-        self._sender = None
-        self.forget()
+    @property
+    def is_full(self) -> bool:
+        """Whether audio must wait."""
+        return self.backlog > MAX_BACKLOG and not self._drops
+
+    def check_overdue(self, now_s: float) -> bool:
+        """Return whether the link now starts to drop messages, until none is unacknowledged."""
+        if self.backlog <= MAX_BACKLOG:
+            self._full_since_s = None
+            self._drops = self._drops and self.backlog > 0
+            return False
+        if self._full_since_s is None:
+            self._full_since_s = now_s
+        if self._drops or now_s - self._full_since_s <= MAX_OVERDUE_S:
+            return False
+        self._drops = True
+        return True
 
     def send(self, message: Message, now_s: float) -> None:
-        """Send a message, if there is a synthesizer."""
-        if self._sender is not None:
+        """Send a message, if there is a synthesizer that takes it."""
+        if self._sender is not None and not self._drops:
             self._sender.send(message, now_s)
 
     def acknowledge(self, ack: Acknowledge, now_s: float) -> list[Message]:
@@ -60,7 +79,7 @@ class SynthesizerLink:
             return []
         self._newest_frame = ack.newest_frame or self._newest_frame
         acknowledged = self._sender.acknowledge(ack.sequence, now_s)
-        messages = [message for message in acknowledged if not _is_resumption(message)]
+        messages = [message for message in acknowledged if not is_report(message)]
         self._kept.extend(messages)
         while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
             oldest = self._kept.popleft()
@@ -76,8 +95,3 @@ class SynthesizerLink:
     def tick(self, now_s: float) -> int:
         """Resend messages that were not acknowledged in time; return their number."""
         return self._sender.tick(now_s) if self._sender is not None else 0
-
-
-def _is_resumption(message: Message) -> bool:
-    """Return whether a message only has the frame after which a new synthesizer continues."""
-    return isinstance(message, Progress) and message.newest_frame is not None

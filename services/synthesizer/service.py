@@ -12,7 +12,6 @@ to rest.
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -40,10 +39,11 @@ from kouxing.shared.phones.events import EndOfSound, LipPositions, Phone, SoundE
 from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.reliable import ReliableReceiver
+from kouxing.shared.replay import Replay
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
-from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of
+from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of, is_report
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
@@ -55,7 +55,6 @@ from kouxing.shared.wire.speech import (
 )
 
 RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
-REPUBLISH_S = 3.0  # followers of a session that has moved here may still be connecting
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
 MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
 MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
@@ -67,8 +66,11 @@ MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little"
 class _SynthesizerSession:
     """A session: its face, and its position in the streams of messages."""
 
-    def __init__(self, start: StartSession, face: FaceAnimator, input_socket: Socket) -> None:
+    def __init__(
+        self, start: StartSession, face: FaceAnimator, input_socket: Socket, publisher: Socket
+    ) -> None:
         self.start = start
+        self.replay = Replay(publisher, time.monotonic())
         self.face = face
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledge)
         self.epoch_in = 0  # epoch of the newest message from the recognizer; 0 before the first
@@ -79,20 +81,12 @@ class _SynthesizerSession:
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
         self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
         self.finished = False
-        self._resumed_s = -math.inf  # when this session replaced one of another synthesizer
         self.shapes: list[str] = []  # shape sets to publish
-        self.recently_published: list[FapFrame | EndOfFaps] = []
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
         """Continue after the newest frame of another synthesizer."""
-        self._resumed_s = time.monotonic()
         self.sequence_out = num_frames
         self.face.resume(to_seconds(media_time), num_frames, faps)
-
-    @property
-    def just_resumed(self) -> bool:
-        """Whether followers may still be connecting to this synthesizer."""
-        return time.monotonic() < self._resumed_s + REPUBLISH_S
 
     @property
     def media_time(self) -> int:
@@ -144,7 +138,8 @@ class SynthesizerService(Service):
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
             settings = self._known_settings(start.session, start.face)
-            session = _SynthesizerSession(start, self._new_face(start, settings), self._input)
+            face = self._new_face(start, settings)
+            session = _SynthesizerSession(start, face, self._input, self._faps)
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
@@ -264,14 +259,14 @@ class SynthesizerService(Service):
         if session is None:
             return
         now_s = time.monotonic()
-        has_stalled, newest_frame = False, None
+        state = newest_frame = None
         if isinstance(message, Progress):
-            has_stalled = message.state == AudioState.STALLED
-            newest_frame = message.newest_frame
+            state, newest_frame = message.state, message.newest_frame
+        has_stalled = state == AudioState.STALLED
         session.relax_at_s = now_s if has_stalled else now_s + RECOGNIZER_TIMEOUT_S
         if message.epoch != session.epoch_in:
             self._enter_epoch(session, message, newest_frame)
-        if not has_stalled and newest_frame is None:
+        if not is_report(message):
             self._queue_event(session, message)
 
     def _enter_epoch(
@@ -342,15 +337,13 @@ class SynthesizerService(Service):
     def _end(self, session: _SynthesizerSession) -> None:
         session.finished = True
         session.sequence_out += 1
-        self._send(
-            session,
-            EndOfFaps(
-                session=session.start.session,
-                epoch=session.start.epoch,
-                sequence=session.sequence_out,
-                media_time=session.media_time,
-            ),
+        end = EndOfFaps(
+            session=session.start.session,
+            epoch=session.start.epoch,
+            sequence=session.sequence_out,
+            media_time=session.media_time,
         )
+        session.replay.send(end, time.monotonic())
         LOG.info("end of frames", extra={"session": session.start.session})
 
     def _publish(self, session: _SynthesizerSession, frames: Sequence[Frame]) -> None:
@@ -369,18 +362,9 @@ class SynthesizerService(Service):
                     for name in session.shapes
                 },
             )
-            self._send(session, session.newest)
-
-    def _send(self, session: _SynthesizerSession, message: FapFrame | EndOfFaps) -> None:
-        self._faps.send(message)
-        if session.just_resumed:
-            session.recently_published.append(message)
-        else:
-            session.recently_published.clear()
+            session.replay.send(session.newest, time.monotonic())
 
     def _on_joined(self, session: str) -> None:
-        """Publish recent frames again for a follower that joins a moved session."""
         joined = self._sessions.get(session)
-        if joined is not None and joined.just_resumed:
-            for message in joined.recently_published:
-                self._faps.send(message)
+        if joined is not None:
+            joined.replay.repeat(time.monotonic())

@@ -8,11 +8,20 @@ import numpy as np
 
 from kouxing.shared.clock import duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones import events
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AudioState, LipPositions, Phone, Progress, Speech
 
 # From the recognizer to the synthesizer
 SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress
 SPEECH_MESSAGES: tuple[type[SpeechMessage], ...] = get_args(SpeechMessage)
+
+
+def is_report(message: Message) -> bool:
+    """Return whether a message is about the client or another synthesizer, and has no event."""
+    return isinstance(message, Progress) and (
+        message.newest_frame is not None
+        or message.state in (AudioState.STALLED, AudioState.RESUMED)
+    )
 
 
 def message_of(event: events.SoundEvent) -> SpeechMessage:

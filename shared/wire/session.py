@@ -41,6 +41,7 @@ class ErrorCode(StrEnum):
     BAD_TOKEN = "bad-token"  # noqa: S105 - no password
     BUSY = "busy"
     FINISHED = "finished"
+    NO_LINK = "no-link"
     NO_SERVICE = "no-service"
     NO_VIDEO = "no-video"
     NOT_ALLOWED = "not-allowed"

@@ -110,6 +110,12 @@ def test_takes_once_what_arrives_over_two_connections_in_any_order() -> None:
     assert scene.received == [sound(number) for number in (1, 3, 2, 4)]
 
 
+def test_drops_what_a_publisher_repeats_for_others() -> None:
+    scene = Scene().complete()
+    scene.publish(*map(sound, (1, 2, 1, 2, 3)))
+    assert scene.received == [sound(1), sound(2), sound(3)]
+
+
 def test_a_new_epoch_of_one_publisher_drops_nothing_of_another() -> None:
     scene = Scene().complete()
     scene.publish(frame(1, epoch=2), sound(1, epoch=1))

@@ -15,6 +15,7 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import (
     MAX_LEAD_S,
     MAX_MEDIA_TIME,
+    MOVE_S,
     STALLED_AFTER_S,
     AudioRejected,
     RecognizerSession,
@@ -24,6 +25,7 @@ from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.speech import Progress
 from tests.e2e.following import samples_of_file
 from tests.live_streams import START
 from tests.system import VOWELS_FILE
@@ -35,7 +37,7 @@ LIPS = load_lip_predictor()
 
 
 def make_session(**changes: Any) -> RecognizerSession:
-    return RecognizerSession(replace(START, **changes), RECOGNIZER, LIPS, SOCKET, 0.0)
+    return RecognizerSession(replace(START, **changes), RECOGNIZER, LIPS, SOCKET, SOCKET, 0.0)
 
 
 def chunk(
@@ -111,12 +113,23 @@ def test_limits_how_far_a_paced_client_is_ahead_of_the_clock() -> None:
     assert [client.send(1.0, gap_s=9.9) for _ in range(3)] == [True, True, False]
 
 
-def test_a_live_client_stalls_once_until_audio_arrives() -> None:
+def reports_of(session: RecognizerSession, *, silent_s: float) -> list[str]:
+    """Return what a session reports to its synthesizer about a silent client that returns."""
+    reports: list[Progress] = []
+    cast(Any, session.link).send = lambda message, _: reports.append(message)
+    for _ in range(round(100 * silent_s)):
+        session.check_stalled(0.01, 0.0)
+    session.on_new_audio(0.0)
+    return [report.state for report in reports]
+
+
+def test_reports_a_live_client_that_stalls_and_resumes() -> None:
     session = make_session()
     for _ in range(2):
-        session.without_audio_s = 0.0
-        assert sum(session.check_stalled(0.01) for _ in range(100)) == 1
-    assert not make_session(paced=False).check_stalled(2 * STALLED_AFTER_S)
+        assert reports_of(session, silent_s=1.0) == ["stalled", "resumed"]
+    assert reports_of(session, silent_s=STALLED_AFTER_S / 2) == []
+    assert reports_of(make_session(paced=False), silent_s=1.0) == []
+    assert reports_of(make_session(epoch=2), silent_s=MOVE_S) == [], "the client is connecting"
 
 
 def test_a_mouth_profile_that_does_not_fit_is_not_used() -> None:

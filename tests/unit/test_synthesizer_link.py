@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import cast
 
-from kouxing.services.recognizer.synthesizer_link import KEPT, SynthesizerLink
+from kouxing.services.recognizer.synthesizer_link import (
+    KEPT,
+    MAX_BACKLOG,
+    MAX_OVERDUE_S,
+    SynthesizerLink,
+)
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.sockets import Socket
@@ -65,3 +70,21 @@ def test_forgets_messages_before_an_interruption() -> None:
     link.send_all(Speech(media_time=16_000, active=False))
     expected = Speech(session="s", epoch=2, sequence=1, media_time=16_000, active=False)
     assert link.connect_to(2) == [expected]
+
+
+def test_drops_messages_only_while_the_synthesizer_is_too_slow() -> None:
+    link = Link()
+    link.send_all(*[progress(0.0)] * (MAX_BACKLOG + 1))
+    assert link.is_full, "audio waits"
+    assert [link.check_overdue(time_s) for time_s in (1.0, 2.0, 1.1 + MAX_OVERDUE_S)] == [
+        False,
+        False,
+        True,
+    ]
+    assert not link.is_full, "other sessions no longer wait"
+    link.send_all(progress(1.0))
+    assert len(link.acknowledge_up_to(MAX_BACKLOG + 1)) == MAX_BACKLOG + 1
+    assert not link.check_overdue(20.0)
+    link.send_all(progress(2.0))
+    assert link.sent[-1].media_time == to_samples(2.0)
+    assert link.backlog == 1

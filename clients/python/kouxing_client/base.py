@@ -294,6 +294,11 @@ class BaseResults:
         """Whether the session's last face has arrived, or the session is closed."""
         return self._inbox.is_over
 
+    @property
+    def num_missed(self) -> int:
+        """Number of frames and phones that were published but did not arrive; at least this."""
+        return self._inbox.num_missed
+
     def _has_news(self) -> bool:
         return self._inbox.is_over or bool(self._inbox.messages)
 

@@ -107,7 +107,7 @@ class Follower:
         self._confirmed: set[str] = set()  # publishers
         self._first_epoch = 0
         self._epochs: dict[str, int] = {}  # of the newest message, by publisher
-        self._newest: dict[str, _Number] = {}  # numbers of the newest message, by publisher
+        self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
         self._newest_before: dict[str, _Number] = {}  # when it subscribed again
         self._seen: set[tuple[str, _Number]] = set()  # since then
         self._last_frame = _NONE  # media time and sequence
@@ -242,14 +242,17 @@ class Follower:
 
     def _is_repeated(self, message: Any, publisher: str) -> bool:
         """Return whether the message arrived before, on the other connection or in an epoch."""
-        number = (message.epoch, message.sequence)
-        if number <= self._newest_before.get(publisher, _NONE) or (publisher, number) in self._seen:
+        kind, number = message.kind, (message.epoch, message.sequence)
+        has_two = self._old_connection is not None
+        known = self._newest_before if has_two else self._newest
+        is_numbered = message.sequence > 0
+        if is_numbered and (number <= known.get(kind, _NONE) or (kind, number) in self._seen):
             return True
-        if self._old_connection is not None:
-            self._seen.add((publisher, number))
+        if has_two:
+            self._seen.add((kind, number))
         self._epochs[publisher] = message.epoch
-        self._newest[publisher] = max(number, self._newest.get(publisher, number))
-        if message.kind == "fap-frame":
+        self._newest[kind] = max(number, self._newest.get(kind, number))
+        if kind == "fap-frame":
             place = (message.media_time, message.sequence)
             if place <= self._last_frame:
                 return True
@@ -261,5 +264,4 @@ class Follower:
         self.epoch = epoch
         if is_new:
             self.has_ended = False
-            self._last_sequence = None
             self._on_new_epoch()

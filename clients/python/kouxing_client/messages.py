@@ -103,7 +103,7 @@ class Phone(Result, frozen=True, kw_only=True):
     kind: ClassVar[str] = "phone"
 
     index: int
-    """number of the phone within its epoch"""
+    """number of the phone within the session"""
     symbol: str
     """a phone of the session's language"""
     duration: int

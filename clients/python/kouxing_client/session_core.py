@@ -14,11 +14,14 @@ from kouxing_client.messages import (
     FapFrame,
     Fields,
     Message,
+    Phone,
     Result,
     Shapes,
+    Speech,
     decode,
     encode,
 )
+from kouxing_client.phone_track import PhoneTrack
 
 if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
@@ -44,6 +47,7 @@ class Inbox:
         self.messages: deque[Any] = deque(maxlen=capacity)
         self.is_over = False  # no more messages arrive
         self.failure: KouxingError | None = None  # why it ended too early
+        self.num_missed = 0  # frames and phones that did not arrive
         self.signal = signal
 
     def add(self, message: Any) -> None:
@@ -87,10 +91,15 @@ class Subscription:
         self._on_joined: Callable[[KouxingError | None], None] | None = on_joined
         self._on_result = on_result or inbox.add
         self._classes = classes
+        self._phones = PhoneTrack()
+        needed: set[type[Any]] = {
+            EndOfFaps,
+            *(FapFrame if cls is Shapes else cls for cls in classes),
+        }
         self.follower = Follower(
             session.sockets,
             session.name,
-            {EndOfFaps, *(FapFrame if cls is Shapes else cls for cls in classes)},
+            needed | {Speech} if Phone in classes else needed,
             self._on_message,
             live=session.is_live,
             on_complete=lambda: self._join(None),
@@ -114,14 +123,24 @@ class Subscription:
 
     def _on_message(self, message: Any) -> None:
         if isinstance(message, EndOfFaps):
+            self.follower.drain()  # results of the other publisher may have arrived
             self.inbox.end(None)
-        elif type(message) in self._classes:
+        elif isinstance(message, Phone):
+            self._pass_on(self._phones.update(message))
+        elif isinstance(message, Speech) and message.sequence == 1:  # of another recognizer
+            self._pass_on(self._phones.restart())
+        self.inbox.num_missed = self.follower.num_missed + self._phones.num_missed
+        if type(message) in self._classes and not isinstance(message, Phone):
             self._on_result(message)
         if Shapes in self._classes and isinstance(message, FapFrame):
             weights = message.shapes.get(self._shape_set)
             if weights is not None:
                 place = {name: getattr(message, name) for name in Message.__struct_fields__}
                 self._on_result(Shapes(**place, set=self._shape_set, weights=weights))
+
+    def _pass_on(self, phones: list[Phone]) -> None:
+        for phone in phones:
+            self._on_result(phone)
 
 
 class SessionCore:

@@ -1,0 +1,71 @@
+"""Makes one sequence of the phones of successive recognizers; no I/O of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from msgspec.structs import replace
+
+from kouxing_client.messages import SILENCE, Phone
+
+
+class PhoneTrack:
+    """Passes on each phone of a session once, whichever recognizers publish it.
+
+    A recognizer that takes a session over numbers its phones again, and may repeat phones. The
+    track continues the numbers and drops the repeated phones. ``num_missed`` counts final phones
+    that were published but did not arrive, by gaps in their numbers.
+    """
+
+    def __init__(self) -> None:
+        self.num_missed = 0
+        self._epoch = 0  # of the newest phone
+        self._base = 0  # added to the recognizer's indices
+        self._next = 0  # after the greatest index
+        self._open: dict[int, Phone] = {}  # that are not final, by index
+        self._next_final: int | None = None  # the recognizer's index of its next final phone
+        self._end = 0  # media time at which the last final phone ends
+
+    def restart(self) -> list[Phone]:
+        """Continue with another recognizer; return the open phones as withdrawn."""
+        withdrawn = [_withdraw(phone) for phone in self._open.values()]
+        self._open.clear()
+        self._base, self._next_final = self._next, None
+        return withdrawn
+
+    def update(self, phone: Phone) -> list[Phone]:
+        """Add or revise a phone; return the phones that change for the program."""
+        changed: list[Phone] = []
+        if phone.epoch > self._epoch and phone.index < (self._next_final or 0):
+            self.num_missed += 1  # at least: another recognizer's first messages
+            changed = self.restart()
+        self._epoch = phone.epoch
+        if phone.final:
+            first = phone.index if self._next_final is None else self._next_final
+            changed += self._skip(range(self._base + first, self._base + phone.index))
+            self._next_final = phone.index + 1
+        phone = replace(phone, index=self._base + phone.index)
+        was_open = self._open.pop(phone.index, None) is not None
+        is_new = phone.media_time + phone.duration // 2 >= self._end
+        if not is_new and phone.final and was_open:
+            phone, is_new = _withdraw(phone), True
+        if not is_new:
+            return changed
+        self._next = max(self._next, phone.index + 1)
+        if not phone.final:
+            self._open[phone.index] = phone
+        else:
+            self._end = max(self._end, phone.media_time + phone.duration)
+        return [*changed, phone]
+
+    def _skip(self, indices: Iterable[int]) -> Iterator[Phone]:
+        """Withdraw phones that an interruption dropped; count those that never arrived."""
+        for index in indices:
+            if index in self._open:
+                yield _withdraw(self._open.pop(index))
+            else:
+                self.num_missed += 1
+
+
+def _withdraw(phone: Phone) -> Phone:
+    return replace(phone, symbol=SILENCE, duration=0, final=True)

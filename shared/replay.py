@@ -1,0 +1,38 @@
+"""Publishes a session's results, and repeats the first ones for subscribers that join late.
+
+When a session opens or moves, its subscribers need time to connect to the new worker. Results that
+are published in the meantime are repeated for each of them. Subscribers ignore repeated messages.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.message import Message
+
+REPLAY_S = 10.0  # after a session has started at a worker; a busy machine connects slowly
+MAX_REPLAYED = 2000  # messages
+
+
+class Replay:
+    """The publisher of one session at one worker, which starts to serve it at ``now_s``."""
+
+    def __init__(self, publisher: Socket, now_s: float) -> None:
+        self._publisher = publisher
+        self._end_s = now_s + REPLAY_S
+        self._messages: deque[Message] = deque(maxlen=MAX_REPLAYED)
+
+    def send(self, message: Message, now_s: float) -> None:
+        """Publish a message."""
+        self._publisher.send(message)
+        if now_s < self._end_s:
+            self._messages.append(message)
+        else:
+            self._messages.clear()
+
+    def repeat(self, now_s: float) -> None:
+        """Publish the messages again for a subscriber that has joined."""
+        if now_s < self._end_s:
+            for message in self._messages:
+                self._publisher.send(message)
