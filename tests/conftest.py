@@ -32,7 +32,7 @@ def _own_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # an idle system costs more than a start
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     """All services on this host, with metrics."""
     settings = {variable(name, "metrics_port"): str(free_port()) for name in KINDS}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import Any
 
@@ -74,4 +73,5 @@ def switch() -> None:
 
 
 if __name__ == "__main__":
-    {"size_and_close": size_and_close, "switch": switch}[sys.argv[1]]()
+    size_and_close()
+    switch()

@@ -17,6 +17,7 @@ def test_prints_and_writes_the_same_figures(
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_IMAGES", 3)
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_SESSIONS", (1,))
+    monkeypatch.setattr("kouxing.evaluation.system.page.SIZE_PX", (320, 240))
     monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 1.0)
     figures = tmp_path / "latency.json"

@@ -1,4 +1,4 @@
-"""The documents' links lead somewhere, and the commands that they name exist."""
+"""The documents' links lead somewhere, and the commands and tests that they name exist."""
 
 from __future__ import annotations
 
@@ -36,3 +36,10 @@ def test_every_named_command_exists() -> None:
     named = set(re.findall(r"(?:`|^    [^#\n]*?)kouxing ([a-z-]+)", text, re.MULTILINE))
     assert len(named) > 10
     assert named <= {*get_command(app).list_commands(None)}  # type: ignore[attr-defined]
+
+
+def test_every_named_test_exists() -> None:
+    text = "\n".join(path.read_text("utf-8") for path in DOCUMENTS)
+    names = set(re.findall(r"`(?:tests/)?(\w+/test_\w+\.py)`", text))
+    assert len(names) > 10
+    assert not {name for name in names if not (ROOT / "tests" / name).is_file()}

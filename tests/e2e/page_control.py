@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
+from kouxing.shared.face.faps import MASK_BYTES
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
@@ -16,19 +16,14 @@ from kouxing.shared.wire.speech import Phone
 from tests.fake_control import EPOCH, FakeControl
 
 FRAME = 320  # samples; 20 ms
-CLICK_EVERY = 25 * FRAME  # samples; 0.5 s
 LOOK_AHEAD_MS = 60
 
 
 class PageControl(FakeControl):
-    """Control with a synthesizer that publishes the face ``shown`` in one session.
-
-    If ``flash`` is set, the face changes to it and back twice a second, and the sound clicks.
-    """
+    """Control with a synthesizer that publishes the face ``shown`` in one session."""
 
     def __init__(self) -> None:
         self.shown: NDArray[np.float32] | None = None  # None: nothing is published
-        self.flash: NDArray[np.float32] | None = None
         self.look_ahead_ms = LOOK_AHEAD_MS  # between a frame and its sound
         self._symbol = "a"
         self._session = ""
@@ -74,9 +69,6 @@ class PageControl(FakeControl):
         self._media_time += FRAME
         frame_time = self._media_time - self.look_ahead_ms * 16
         if frame_time >= 0:
-            if self.flash is not None:
-                shown = (self.flash if frame_time % CLICK_EVERY < CLICK_EVERY / 2 else shown).copy()
-                shown[FAP_NUMBER["head_yaw"] - 1] = frame_time % 16000  # all pictures differ
             values = shown.astype("<f4").tobytes()
             self.faps.send(
                 FapFrame(**stamp, media_time=frame_time, values=values, mask=bytes(MASK_BYTES))
@@ -95,10 +87,7 @@ class PageControl(FakeControl):
             )
 
     def _sound(self) -> NDArray[np.int16]:
-        """Return the next samples of a tone, or of a click in the middle of a flash."""
+        """Return the next samples of a tone."""
         times = self._media_time + np.arange(FRAME)
-        if self.flash is not None:
-            sound = np.where((times + FRAME // 2) % CLICK_EVERY == 0, 20000.0, 0.0)
-        else:
-            sound = 3000 * np.sin(2 * np.pi * 200 / 16000 * times)
+        sound: NDArray[np.float64] = 3000 * np.sin(2 * np.pi * 200 / 16000 * times)
         return sound.astype(np.int16)

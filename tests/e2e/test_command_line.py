@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
@@ -58,16 +57,6 @@ def command(
     return Command(system, monkeypatch, capsys)
 
 
-def test_speaks_a_truncated_file_of_another_format(command: Command, tmp_path: Path) -> None:
-    whole, truncated = tmp_path / "whole.wav", tmp_path / "truncated.wav"
-    samples = np.repeat(samples_of_file(SENTENCE), 3)
-    soundfile.write(whole, np.repeat(samples[:, None], 6, axis=1), 48000, subtype="PCM_24")
-    data = whole.read_bytes()
-    truncated.write_bytes(data[: len(data) * 3 // 4 + 1])
-    status, _, log = command("speak", truncated, "--fast")
-    assert (status, "no speech" in log) == (0, False), log
-
-
 @pytest.mark.parametrize(("scale", "word"), [(0.0, "it is silent"), (30.0, "clipped")])
 def test_warns_of_silence_and_clipping(
     command: Command, tmp_path: Path, scale: float, word: str
@@ -84,13 +73,6 @@ def test_speaks_raw_audio_from_standard_input_and_writes_the_video(system: Syste
     assert result.returncode == 0, result.stderr
     assert "phones in 2.3 s" in result.stderr
     assert "wrote" in result.stderr
-
-
-def test_phones_are_written_in_the_format_of_the_suffix(command: Command, tmp_path: Path) -> None:
-    table = tmp_path / "phones.csv"
-    assert command("phones", SENTENCE, "-o", table)[0] == 0
-    with table.open(encoding="utf-8") as file:
-        assert {"phone", "onset_s", "duration_s"} <= set(next(csv.DictReader(file)))
 
 
 def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[str]:

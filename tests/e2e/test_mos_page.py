@@ -184,10 +184,9 @@ class Page:
         self._address = f"http://127.0.0.1:{served.port}/"
         browser.command("Emulation.setUserAgentOverride", userAgent="test", acceptLanguage="en-GB")
 
-    def open(self, secrets: str = "") -> None:
-        self._browser.command("Page.navigate", url="about:blank")
-        self._browser.command("Page.navigate", url=self._address + secrets)
-        self._browser.wait_for(IS_WELCOME if not secrets else "document.readyState === 'complete'")
+    def open(self) -> None:
+        self._browser.command("Page.navigate", url=self._address)
+        self._browser.wait_for(IS_WELCOME)
 
     def press(self, name: str) -> None:
         button = f"document.getElementById('{name}')"
@@ -204,8 +203,6 @@ class Page:
         assert browser.evaluate("document.documentElement.lang") == "zh"
         browser.evaluate("for (let n = 0; n < 2; n++) document.getElementById('begin').click()")
         browser.wait_for("document.getElementById('task').checkVisibility()")
-        token = browser.evaluate("new URLSearchParams(location.hash.slice(1)).get('judge')")
-        self._check_width()
         places = places_of_judge(0, load_study(self._served.folder))
         for place, (_, condition) in places.items():
             self._wait_for_place(place)
@@ -214,8 +211,6 @@ class Page:
                 self.press("play")
                 browser.command("Page.reload")
                 self._wait_for_place(place)
-            if place == 3:
-                self._continue_elsewhere(token)
             self.press("play")
             self.press(f"sync-{scores[condition]}")
             self.press(f"realism-{scores[condition] - 1}")
@@ -229,22 +224,3 @@ class Page:
         assert self._browser.evaluate(hint) == (place < 0)
         progress = self._browser.evaluate("document.getElementById('progress').value")
         assert progress == max(place, 0)
-
-    def _continue_elsewhere(self, token: str) -> None:
-        """Continue in another browser that has only the address, and stop the video once."""
-        browser = self._browser
-        self.open()
-        browser.evaluate(f"location.hash = 'judge={token}'")
-        self._wait_for_place(3)
-        # as a phone does when another app is opened
-        stop = f"() => {VIDEO}.pause()"
-        browser.evaluate(f"void {VIDEO}.addEventListener('playing', {stop}, {{once: true}})")
-        self.press("play")
-        browser.wait_for(f"{VIDEO}.paused")
-        assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")
-
-    def _check_width(self) -> None:
-        """Check that no phone scrolls sideways."""
-        for width_px in (320, 390):
-            self._browser.resize(width_px, 844, mobile=True)
-            assert self._browser.evaluate("document.documentElement.scrollWidth") <= width_px

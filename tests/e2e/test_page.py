@@ -11,7 +11,6 @@ import io
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,9 +23,8 @@ from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from tests import sync
 from tests.browser import SIZE_PX, Browser
-from tests.e2e.page_control import CLICK_EVERY, FRAME, LOOK_AHEAD_MS, PageControl
+from tests.e2e.page_control import LOOK_AHEAD_MS, PageControl
 from tests.system import ROOT, Gateway, wait_until
 
 pytestmark = pytest.mark.timeout(400)
@@ -55,7 +53,6 @@ def face(values: list[int]) -> NDArray[np.float32]:
 
 
 A_FACE, B_FACE = face(A_VALUES), face(B_VALUES)
-NUM_CLICKS = 8
 
 
 def write_tone(path: Path) -> None:
@@ -92,7 +89,6 @@ def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Itera
     folder = tmp_path_factory.mktemp("browser")
     write_tone(folder / "tone.wav")
     browser = Browser(folder, folder / "tone.wav")
-    sync.install(browser)
     yield browser
     browser.close()
 
@@ -213,25 +209,6 @@ def test_controls_do_not_cover_the_mouth_on_a_phone(
     assert np.percentile(rows, 90) < caption_top
 
 
-def test_settings_do_not_cover_the_face_on_a_phone(page: Browser, gateway: Gateway) -> None:
-    page.resize(390, 844, mobile=True)
-    page.open(gateway.page)
-    show_controls(page, 0)
-    whole = page.steady_image()
-    page.click("open-settings")
-    beside = page.steady_image()
-    top = page.evaluate("document.getElementById('settings').getBoundingClientRect().top")
-    page.evaluate("document.getElementById('settings').hidePopover()")
-    show_controls(page, 1)
-    page.resize(*SIZE_PX)
-    free = beside[: int(top)]
-    assert len(free) > 400
-    # Skin and lips are above the panel: the head is smaller than without the panel, but complete.
-    skin, all_skin = ((colorfulness(image) > 60).sum(axis=1) > 20 for image in (free, whole))
-    assert 0.4 < skin.sum() / all_skin.sum() < 0.95
-    assert skin.nonzero()[0][0] > 20
-
-
 @pytest.mark.parametrize(("width", "is_phone"), [(1280, False), (390, True)])
 def test_every_control_can_be_clicked(
     page: Browser, gateway: Gateway, width: int, is_phone: bool
@@ -284,28 +261,6 @@ def test_senders_are_started_delayed_to_match_the_sound_and_stopped(audible: Bro
     page.click("send button")
     page.wait_for("document.getElementById('send-problem').innerText.includes('another machine')")
     page.evaluate("document.getElementById('settings').hidePopover()")
-
-
-def test_clicks_are_heard_when_the_mouth_is_seen_to_open(
-    control: PageControl, audible: Browser, session: Session
-) -> None:
-    page = audible
-    page.resize(160, 120)  # drawn quickly
-    control.flash = A_FACE
-    control.talk(session.name, B_FACE, "b")
-    sync.begin(page)
-    offsets: list[float] = []
-
-    def has_enough() -> bool:
-        time.sleep(1)  # reading is work for the page
-        offsets[:] = sync.offsets_ms(page, CLICK_EVERY / 16, -FRAME / 32)
-        return len(offsets) >= NUM_CLICKS
-
-    wait_until(has_enough, 240)
-    control.flash = None
-    page.resize(*SIZE_PX)
-    # 45 ms are detectable according to ITU-R BT.1359
-    assert abs(np.median(offsets)) < 45, offsets
 
 
 def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
@@ -537,13 +492,6 @@ def test_a_dropped_file_is_streamed(
     wait_until(lambda: control.has_ended(name))
     assert is_loud(control.samples(name))
     page.wait_for(f"{STATE}.session === 'seen'")
-
-
-def test_a_file_without_sound_is_refused(page: Browser, tmp_path: Path) -> None:
-    (tmp_path / "not.wav").write_text("no sound")
-    choose_file(page, tmp_path / "not.wav")
-    page.wait_for(f"{NOTICE}.includes('not.wav: cannot read audio: this is text, not sound')")
-    assert not page.evaluate("window.kouxing.state.microphone")
 
 
 @pytest.mark.parametrize("view", ["", "?view=bare&background=transparent"])

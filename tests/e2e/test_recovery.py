@@ -14,14 +14,15 @@ from rich.console import Console
 from kouxing.services.cli.supervisor import Supervisor
 from kouxing.shared.errors import UserError
 from tests.e2e.following import Stream, samples_of_file, stream
-from tests.system import DEMO, System, wait_until
+from tests.system import CHEAP, DEMO, System, wait_until
 
 SERVICES = ("control", "recognizer", "synthesizer", "driver")
 
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    with System(SERVICES, tmp_path_factory.mktemp("supervised"), restarts=True) as running:
+    folder = tmp_path_factory.mktemp("supervised")
+    with System(SERVICES, folder, CHEAP, restarts=True) as running:
         yield running
 
 

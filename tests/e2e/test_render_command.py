@@ -88,13 +88,6 @@ def test_renders_a_transparent_picture_of_any_head(face: Path, tmp_path: Path) -
     assert np.abs(pictures[0] - pictures[2]).mean() > 5
 
 
-def test_reports_the_line_of_a_bad_fap_file(tmp_path: Path) -> None:
-    (tmp_path / "bad.fap").write_text("2.1 x 25 1\n0 1\n0 7\n", encoding="utf-8")
-    with pytest.raises(UserError, match=r"bad\.fap, line 2: expected a mask of 68"):
-        render(tmp_path / "bad.fap", tmp_path / "out.csv")
-    assert not (tmp_path / "out.csv").exists()
-
-
 @pytest.mark.parametrize(
     ("output", "options", "message"),
     [

@@ -7,13 +7,10 @@ import csv
 import re
 from pathlib import Path
 
-import pytest
 from kouxing_client import AsyncClient, Phone
 
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System, kouxing, start_python
-
-pytestmark = pytest.mark.e2e
 
 
 async def speak_while_listening(system: System, path: Path) -> tuple[list[Phone], list[str]]:
@@ -38,9 +35,8 @@ def num_phones(report: str) -> int:
     return int(match[1])
 
 
-@pytest.mark.parametrize("name", ["hello-female.wav", "fast-female.wav"])
-def test_all_outputs_have_the_same_phones(name: str, system: System, tmp_path: Path) -> None:
-    path, table = DEMO / name, tmp_path / "phones.csv"
+def test_all_outputs_have_the_same_phones(system: System, tmp_path: Path) -> None:
+    path, table = DEMO / "fast-female.wav", tmp_path / "phones.csv"
     spoken, printed = asyncio.run(speak_while_listening(system, path))
     assert printed == [phone.symbol for phone in spoken]
     assert all(phone.duration > 0 for phone in spoken)

@@ -203,14 +203,16 @@ def gateway_process(control: str = NO_CONTROL, **settings: str) -> subprocess.Po
     return start_python("-m", "kouxing.services.gateway", control=control, **names)
 
 
-def test_plain_http_for_a_proxy_creates_and_prints_a_token(system: System) -> None:
-    process = gateway_process(
-        system.control,
-        gateway_host="0.0.0.0",  # noqa: S104
-        gateway_plain_http="true",
-        advertise="127.0.0.1",
-    )
-    try:
+def test_plain_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> None:
+    settings = {
+        "gateway_host": "0.0.0.0",  # noqa: S104
+        "gateway_plain_http": "true",
+        "advertise": "127.0.0.1",
+    }
+    with contextlib.ExitStack() as stack:
+        system = stack.enter_context(System(["control"], tmp_path))
+        process = stack.enter_context(gateway_process(system.control, **settings))
+        stack.callback(process.terminate)
         assert process.stderr is not None
         matches = (
             re.search(r"page=http://127.0.0.1:(\d+)/#token=([\w-]{22})", line)
@@ -221,9 +223,6 @@ def test_plain_http_for_a_proxy_creates_and_prints_a_token(system: System) -> No
             with contextlib.closing(HTTPConnection("127.0.0.1", int(port), timeout=60)) as http:
                 http.request("GET", f"/viewer{query}", headers=UPGRADE)
                 assert http.getresponse().status == status
-    finally:
-        process.terminate()
-        process.communicate(timeout=LIMIT_S)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,9 @@
-"""The Python, JavaScript, C# and Blender code finds the same shapes; Godot's code is not run."""
+"""The Python, JavaScript and C# code finds the same shapes; other code has the same table."""
 
 from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 from kouxing.shared.errors import UserError
@@ -36,26 +35,6 @@ console.log(JSON.stringify(meshes.map((names) => [
   chosen(names),
   ...["arkit", "oculus", "vrm"].map((set) => Object.fromEntries(findShapes(set, names))),
 ])));
-"""
-BLENDER = """
-import json, sys, types
-from unittest.mock import MagicMock
-class Thing: pass
-bpy = MagicMock()
-bpy.types = types.SimpleNamespace(Operator=Thing, Panel=Thing)
-helper = types.SimpleNamespace(ImportHelper=type("Helper", (), {}))
-sys.modules |= {"bpy": bpy, "bpy_extras": types.SimpleNamespace(), "bpy_extras.io_utils": helper}
-import kouxing_face as face
-def chosen(names):
-    bpy.data.shape_keys = [MagicMock(key_blocks=Blocks(names))]
-    problems = {name: face.problem(name) for name in face.SETS}
-    return next((name for name, text in problems.items() if not text), problems["arkit"])
-class Blocks(list):
-    def __init__(self, names):
-        super().__init__([None, *(types.SimpleNamespace(name=name) for name in names)])
-def row(names):
-    return [chosen(names), *(face.find_shapes(name, names) for name in face.SETS)]
-print(json.dumps([row(names) for names in json.load(sys.stdin)]))
 """
 C_SHARP = """
 using System;
@@ -107,12 +86,6 @@ def test_javascript_finds_the_same_shapes() -> None:
     command: list[str | Path] = [NODE, "--input-type=module", "-e", JAVASCRIPT]
     meshes = json.dumps([mesh.split() for mesh in MESHES])
     assert output(command, meshes, ROOT / "clients" / "javascript") == expected()
-
-
-def test_blender_finds_the_same_shapes() -> None:
-    meshes = json.dumps([mesh.split() for mesh in MESHES])
-    command: list[str | Path] = [sys.executable, "-c", BLENDER]
-    assert output(command, meshes, ROOT / "examples" / "blender") == expected()
 
 
 def test_unity_finds_the_same_shapes(tmp_path: Path) -> None:

@@ -34,12 +34,11 @@ def display() -> Iterator[str]:
         server.wait()
 
 
-@pytest.mark.parametrize("check", ["size_and_close", "switch"])
-def test_on_a_display(display: str, check: str) -> None:
+def test_on_a_display(display: str) -> None:
     environment = {**os.environ, **ONE_THREAD, "DISPLAY": display}
     environment.pop("WAYLAND_DISPLAY", None)
     result = subprocess.run(
-        [sys.executable, "-m", "tests.window_checks", check],
+        [sys.executable, "-m", "tests.window_checks"],
         env=environment,
         cwd=ROOT,
         capture_output=True,

@@ -1,10 +1,8 @@
 import csv
 import io
 import json
-from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,20 +37,6 @@ def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
     for one, two in pairwise(vowels):
         assert one.onset_s + one.duration_s == pytest.approx(two.onset_s)
     assert vowels[0].onset_s == pytest.approx(0.0075)
-
-
-def test_progress_advances_with_each_second_of_the_recording() -> None:
-    samples, rate_hz = read_audio(VOWELS_FILE)
-    model, seconds = load_model(), []
-
-    def with_progress(items: Sequence[Any]) -> Iterator[Any]:
-        assert len(items) == -(-len(samples) // rate_hz)
-        for item in items:
-            seconds.append(item // rate_hz)
-            yield item
-
-    align_syllables(model, samples, rate_hz, [("a",), ("o",)], with_progress)
-    assert seconds == list(range(-(-len(samples) // rate_hz)))
 
 
 PHONES = [
@@ -92,11 +76,6 @@ def test_rejects_a_text_that_does_not_fit(
     assert "ignored: 'Mike'" in errors
     assert "does not fit" in errors
     assert output.is_file()
-
-
-def test_rejects_a_missing_text_file() -> None:
-    with pytest.raises(UserError, match=r"nowhere\.txt: no such file"):
-        align(DEMO / "hello-female.wav", "nowhere.txt")
 
 
 @pytest.mark.parametrize(

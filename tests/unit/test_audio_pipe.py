@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from kouxing.shared.audio_file import AudioSource, open_audio, raw_audio, read_audio
+from kouxing.shared.audio_file import AudioSource, open_audio, read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import RawFormat
 from kouxing.shared.sound_formats import is_sound
@@ -200,13 +200,6 @@ def test_rejects_a_pipe_that_is_not_sound(
 ) -> None:
     with pytest.raises(UserError, match=f"standard input: .*{message}"):
         _open(monkeypatch, data, **options)
-
-
-def test_reads_raw_audio_in_odd_pieces() -> None:
-    values = np.arange(-1000, 1000, dtype="<i2")
-    source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), RawFormat(16000, 2), "x")
-    read = np.concatenate(list(source.blocks))
-    np.testing.assert_allclose(read.ravel() * 32768, values)
 
 
 @pytest.mark.parametrize("num_bytes", [0, 300, 3000, 9000])

@@ -12,12 +12,8 @@ from typer.testing import CliRunner
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.four_schemes import (
     delay_by_one_phone,
-    load_recognizers,
-    print_missing,
     without_corrections,
 )
-from kouxing.evaluation.lips.report import describe
-from kouxing.evaluation.lips.scheme_scores import Order
 from kouxing.shared.audio_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
@@ -111,22 +107,3 @@ def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
         score["jerk"] > 0.0 and score["like_real_lips"] is None for score in figures["scores"]
     )
     assert [order["reference"] for order in figures["orders"]] == ["scheme 1"]
-
-
-def test_the_order_names_the_cost_of_each_step() -> None:
-    order = Order(
-        lips="ferguson", recognizer="gmm", reference="scheme 1", num_sentences=1,
-        correlations=[1.0, 0.87, 0.84, 0.67], holds=True, num_holding=1,
-    )  # fmt: skip
-    assert describe(order).endswith(
-        "holds, in 1 of 1 sentence; "
-        "recognition errors cost 0.13, live output 0.03, waiting for the next phone 0.17"
-    )
-
-
-def test_explains_missing_schemes(capsys: pytest.CaptureFixture[str]) -> None:
-    print_missing(["learnt", "ferguson"], load_recognizers(["neural", "gmm"]))
-    assert capsys.readouterr().err == (
-        "no schemes 2 to 4 with learnt lips and gmm: learnt lips need a neural recognizer, such as"
-        " --acoustic blocks\n"
-    )

@@ -20,7 +20,6 @@ def read_visemes() -> dict[str, NDArray[np.float32]]:
 
 
 VISEMES = read_visemes()
-INNER_PARTS = ("teeth_upper", "teeth_lower", "tongue")
 PAIRS = (("2.2", "2.3"), ("2.6", "2.8"), ("2.7", "2.9"))
 
 
@@ -42,37 +41,6 @@ def gaps_mm(head: Head, faps: NDArray[np.float32]) -> NDArray[np.float64]:
     return places[::2, 1] - places[1::2, 1]
 
 
-def depth_mm(points: NDArray[np.float32], surface: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return how far points (N, 3) are in front of triangles (F, 3, 3).
-
-    The result is -1000 for points that no triangle covers.
-    """
-    a, b, c = surface.astype(np.float64).transpose(1, 0, 2)
-    ab, ac = (b - a)[:, :2], (c - a)[:, :2]
-    area = ab[:, 0] * ac[:, 1] - ac[:, 0] * ab[:, 1]
-    faces_front = area > 1e-10
-    a, b, c, ab, ac = (rows[faces_front] for rows in (a, b, c, ab, ac))
-    ap = points[:, None, :2] - a[:, :2]  # (N, F, 2)
-    v = (ap[..., 0] * ac[:, 1] - ac[:, 0] * ap[..., 1]) / area[faces_front]
-    w = (ab[:, 0] * ap[..., 1] - ap[..., 0] * ab[:, 1]) / area[faces_front]
-    covers = (v >= 0) & (w >= 0) & (v + w <= 1)
-    z = a[:, 2] + v * (b - a)[:, 2] + w * (c - a)[:, 2]
-    front = np.where(covers, z, -np.inf).max(axis=1)
-    return np.where(np.isfinite(front), 1000 * (points[:, 2] - front), -1000.0)
-
-
-def lips(head: Head) -> NDArray[np.uint32]:
-    """Return the triangles (F, 3) of the outer skin around the mouth."""
-    triangles = head.triangles[head.part("skin").triangles]
-    middle = head.vertices[triangles].mean(axis=1)
-    corners = head.vertices[[head.feature_points[f"8.{n}"] for n in range(1, 5)]]
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    near = (np.abs(middle[:, 0]) < 1.1 * high[0]) & (middle[:, 2] > low[2] - 0.01)
-    near &= (middle[:, 1] > low[1] - 0.012) & (middle[:, 1] < high[1] + 0.008)
-    nearby: NDArray[np.uint32] = triangles[near]
-    return nearby
-
-
 def test_lips_do_not_cross_and_close_in_b_p_m(head: Head) -> None:
     assert gaps_mm(head, VISEMES["b"]).max() <= 0.1
     for name, faps in VISEMES.items():
@@ -92,16 +60,3 @@ def test_lower_lip_meets_the_upper_teeth_in_f(head: Head, faps: NDArray[np.float
     upper_lip, lower_lip, edge = place_mm(head, faps, "2.2", "2.3", "9.10")[:, 1]
     assert -0.5 < lower_lip - edge < 2.0  # it covers the cutting edge,
     assert upper_lip - lower_lip > 1.0  # and the teeth show above it
-
-
-def test_nothing_penetrates_the_skin(head: Head) -> None:
-    """Teeth and tongue stay behind lips and chin."""
-    head = heads.load(head.name, "coarse")  # the coarse skin is closer to the teeth
-    around = lips(head)
-    spoken = [*VISEMES.values(), *high_level.VISEMES, *high_level.EXPRESSIONS]
-    for number, faps in enumerate(spoken):
-        vertices = head.deform(faps)
-        parts = [vertices[head.part(part).vertices][::4] for part in INNER_PARTS]
-        inside = np.concatenate(parts)
-        inside = inside[inside[:, 2] > np.quantile(inside[:, 2], 0.6)]  # front vertices
-        assert depth_mm(inside, vertices[around]).max() < 0.2, number

@@ -56,28 +56,17 @@ def test_writes_a_model_and_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyP
     write_clip(folder, name_for("choice"), "berta", "MIT")
     write_clip(folder, name_for("held"), "clara", "CC0")
     write_clip(folder, "closed", "dora", "academic use only")
-    train_lips(folder, output, seed=1)
+    with pytest.raises(UserError, match="also give --whisper"):
+        train_lips(folder, output, speech=[folder])
+    small = Shape(num_states=0, look_aheads=(), width=32, heads=2, layers=4, inner=48)
+    monkeypatch.setattr(recipe, "load_encoder", lambda _: WholeEncoder(small, (0, 1, 2, 3)).eval())
+    train_lips(folder, output, seed=1, speech=[folder], whisper=tmp_path)
     assert load_lip_predictor(output).delays_s == DELAYS_S
     card = output.with_suffix(".md").read_text()
     assert "| CC0 | 1 | 1 | 0.0 |" in card
     assert "| MIT | 1 | 1 | 0.0 |" in card
     assert "academic" not in card
     assert "gated recurrent unit" in card
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_labels_speech_without_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    folder, output = tmp_path / "clips", tmp_path / "lips.npz"
-    folder.mkdir()
-    write_clip(folder, name_for("train"), "anna", "CC0")
-    with pytest.raises(UserError, match="also give --whisper"):
-        train_lips(folder, output, speech=[folder])
-    small = Shape(num_states=0, look_aheads=(), width=32, heads=2, layers=4, inner=48)
-    monkeypatch.setattr(recipe, "load_encoder", lambda _: WholeEncoder(small, (0, 1, 2, 3)).eval())
-    train_lips(folder, output, speech=[folder], whisper=tmp_path)
-    assert load_lip_predictor(output).delays_s == DELAYS_S
-    card = output.with_suffix(".md").read_text()
     assert "labeled 0.0 hours of speech" in card
 
 

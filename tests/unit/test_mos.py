@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from kouxing.evaluation.mos import server
 from kouxing.evaluation.mos.commands import app
 from kouxing.evaluation.mos.report import (
     make_report,
@@ -29,7 +28,6 @@ from kouxing.evaluation.mos.study import (
     new_study,
     williams_design,
 )
-from kouxing.services.gateway.config import GatewayConfig
 from kouxing.shared.errors import UserError
 
 CONDITIONS = ("real", "live", "late", "still")
@@ -148,17 +146,3 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     text = StringIO()
     print_report(study, make_report(study, read_answers(folder)), Console(file=text, width=80))
     assert "real (hidden reference)" in text.getvalue()
-
-
-def test_serve_takes_the_gateways_keys(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ports = []
-
-    async def serve(_study: object, _store: Store, config: GatewayConfig, _ready: object) -> None:
-        ports.append(config.port)
-
-    monkeypatch.setattr(server, "serve", serve)
-    run = CliRunner().invoke
-    assert "8 sentences in 4 conditions" in run(app, ["new", str(folder)]).stderr
-    for option in (["--set", "port=8124"], ["--port", "8125"]):
-        assert run(app, ["serve", str(folder), *option]).exit_code == 0
-    assert ports == [8124, 8125]

@@ -45,8 +45,3 @@ def test_evaluates_a_small_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "half level" in output.getvalue()
     with pytest.raises(UserError, match="no usable recordings in the split 'test'"):
         evaluate_robustness(load_model(), tmp_path, "test", OutputRuleConfig())
-
-
-def test_rejects_a_folder_without_recordings(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="contains no wav"):
-        robustness.read_recordings(tmp_path)

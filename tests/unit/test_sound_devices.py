@@ -36,21 +36,6 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("name", "target"),
-    [
-        ("", "--device=@DEFAULT_MONITOR@"),
-        ("hdmi", "--device=hdmi.monitor"),
-        ("firefox", "--monitor-stream=7"),
-    ],
-)
-def test_records_a_monitor_by_name(server: Path, name: str, target: str) -> None:
-    source = monitor(name)
-    assert not (server / "arguments").exists()  # nothing runs before the first block is read
-    np.testing.assert_array_equal(np.concatenate([*source.blocks]), np.full((1000, 1), 0.5))
-    assert target in (server / "arguments").read_text().split()
-
-
 def test_rejects_an_unknown_name_and_lists_the_devices(server: Path) -> None:
     listed = [(device.kind, device.name) for device in sound_devices() if device.kind != "mic"]
     assert listed == [("monitor", "HDMI"), ("program", "Firefox")]

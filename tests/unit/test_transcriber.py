@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 import pytest
-import sherpa_onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
@@ -60,33 +57,6 @@ def test_transcribes_with_the_smallest_file(paraformer: Path) -> None:
     (paraformer / "model.onnx").write_bytes(bytes(100_000))  # cannot be loaded
     transcriber = SherpaTranscriber(paraformer)
     assert [transcriber.transcribe(sound) for sound in (SOUND, SOUND[:8000])] == ["你好", "你好"]
-
-
-@pytest.mark.parametrize(
-    ("kind", "name", "models"),
-    [
-        ("from_transducer", "zipformer", ("encoder", "decoder", "joiner")),
-        ("from_paraformer", "a-paraformer", ("model",)),
-        ("from_sense_voice", "sherpa-onnx-sense-voice-zh", ("model",)),
-    ],
-)
-def test_loads_every_kind_of_model(
-    tmp_path: Path, kind: str, name: str, models: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / name
-    folder.mkdir()
-    files = {str(folder / f"{model}.onnx") for model in models}
-    for path in (folder / "tokens.txt", *map(Path, files)):
-        path.touch()
-    load = inspect.signature(getattr(sherpa_onnx.OfflineRecognizer, kind))
-    given: dict[str, Any] = {}
-
-    def bind(**names: Any) -> None:
-        given.update(load.bind(**names).arguments)
-
-    monkeypatch.setattr(sherpa_onnx.OfflineRecognizer, kind, bind)
-    SherpaTranscriber(folder)
-    assert files <= {str(value) for value in given.values()}
 
 
 def test_rejects_a_folder_without_a_model(tmp_path: Path, paraformer: Path) -> None:
