@@ -33,10 +33,7 @@ class LiveStream:
     """A stream with a separate recognizer; ``options`` are those of ``create_stream``."""
 
     def __init__(
-        self,
-        model: AcousticModel,
-        rule: OutputRuleConfig = MODEL_RULES["neural"],
-        **options: Any,
+        self, model: AcousticModel, rule: OutputRuleConfig = MODEL_RULES["neural"], **options: Any
     ) -> None:
         self._recognizer = Recognizer(model, rule)
         self.stream = self._recognizer.create_stream(**options)

@@ -80,9 +80,7 @@ def num_repeated(sent: Stream) -> int:
     return sum(after == before for before, after in itertools.pairwise(times))
 
 
-def test_the_face_waits_for_a_slow_recognizer_and_rests_for_a_silent_client(
-    system: System,
-) -> None:
+def test_the_face_waits_for_a_slow_recognizer_and_rests_for_a_silent_client(system: System) -> None:
     with Client(system.control) as client, client.open_session(encoding="f32le") as session:
         sent = Stream(session)
         sent.send(SENTENCE[:16000], paced=True)

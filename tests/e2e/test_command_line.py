@@ -21,14 +21,7 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.following import Stream, samples_of_file
 from tests.receivers import read_osc
-from tests.system import (
-    LIMIT_S,
-    ROOT,
-    VOWELS_FILE,
-    System,
-    kouxing,
-    start_python,
-)
+from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
 
 SENTENCE = VOWELS_FILE
 

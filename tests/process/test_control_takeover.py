@@ -98,9 +98,7 @@ def test_only_the_recognizer_of_a_session_may_report_it(
     assert answer.code == "unknown-session"
 
 
-def test_moves_a_session_without_synthesizer_at_the_deadline(
-    stage: Stage,
-) -> None:
+def test_moves_a_session_without_synthesizer_at_the_deadline(stage: Stage) -> None:
     recognizer, synthesizer = stage.services
     recognizer.send(report({**PLACED, "faps": "tcp://127.0.0.1:3"}))
     stage.control._takeover.end_s = time.monotonic() + 0.5

@@ -135,9 +135,7 @@ async def test_closes_connections_without_a_request(
 
 
 @async_test
-async def test_ends_slow_answers_except_on_unlimited_paths(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_ends_slow_answers_except_on_unlimited_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2, ANSWER_TIMEOUT_S=0.5) as served:
         long = await served.connect(LONG)
         slow = await served.connect(SLOW)

@@ -79,9 +79,7 @@ def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
 
 
-def test_drops_a_message_when_no_file_can_be_opened(
-    slow: Slow,
-) -> None:
+def test_drops_a_message_when_no_file_can_be_opened(slow: Slow) -> None:
     handle_progress = slow._on_progress
 
     def open_nothing(progress: Progress, sender: Peer) -> None:

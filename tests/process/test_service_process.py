@@ -11,14 +11,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.shared.config import variable
-from tests.system import (
-    LIMIT_S,
-    ROOT,
-    can_connect,
-    own_addresses,
-    start_python,
-    wait_until,
-)
+from tests.system import LIMIT_S, ROOT, can_connect, own_addresses, start_python, wait_until
 
 
 def ended(*arguments: str, **environment: str) -> tuple[int, str]:
@@ -49,10 +42,7 @@ def test_ctrl_c_in_imports_prints_nothing(tmp_path: Path, module: str, slow_impo
     assert ended(module, PYTHONPATH=path) == (-signal.SIGINT, "")
 
 
-@pytest.mark.parametrize(
-    ("service", "key"),
-    [("recognizer", "audio"), ("gateway", "port")],
-)
+@pytest.mark.parametrize(("service", "key"), [("recognizer", "audio"), ("gateway", "port")])
 def test_reports_a_port_in_use(service: str, key: str) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -27,11 +27,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.control import (
-    SessionInput,
-    SessionStarted,
-    StartSession,
-)
+from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
 from tests.control_stage import LOCAL, PROVIDED, beat

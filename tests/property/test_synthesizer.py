@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
-    CLOSURE_FAPS,
-    VISEME_INDEX,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FAPS, VISEME_INDEX
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange

@@ -7,17 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
-    blend,
-)
-from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
-    log_closure,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
+from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import log_closure
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
-    VISEME_INDEX,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from tests.lips import INVENTORY, phone

@@ -125,9 +125,7 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
         np.testing.assert_array_equal(np.concatenate([*parts, stream.score(None)]), whole)
 
 
-def test_long_speech_restarts_the_table_with_an_empty_past(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_long_speech_restarts_the_table_with_an_empty_past(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = scores_of(blocks(), FRAMES)
     monkeypatch.setattr(blocks_module, "MAX_POSITIONS", 40)
     short = scores_of(blocks(), FRAMES)

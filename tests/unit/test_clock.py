@@ -4,10 +4,7 @@ import math
 
 import pytest
 
-from kouxing.shared.clock import (
-    ClockOffset,
-    StallDetector,
-)
+from kouxing.shared.clock import ClockOffset, StallDetector
 
 
 def test_the_exchange_with_the_shortest_round_trip_gives_the_offset() -> None:

@@ -129,11 +129,7 @@ def test_an_error_in_a_file_is_located(tmp_path: Path, text: str, message: str) 
     [
         ({"KOUXING_HEAD": "1"}, {}, r"\$KOUXING_HEAD: .* the nearest is KOUXING_DRIVER_HEAD;"),
         ({"KOUXING_CONTROLL": "1"}, {}, "the nearest is KOUXING_CONTROL;"),
-        (
-            {},
-            {"recognizer.acustic": "gmm"},
-            "--set: .*; the nearest is .*acoustic;",
-        ),
+        ({}, {"recognizer.acustic": "gmm"}, "--set: .*; the nearest is .*acoustic;"),
     ],
 )
 def test_an_unknown_key_is_an_error_with_the_nearest_name(

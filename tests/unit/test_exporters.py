@@ -86,11 +86,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("no/a.csv", {}, "cannot be written"),
         ("no/a.mp4", {}, "cannot write"),
         ("a.jsonl", {"form": CurveForm.LIVELINK}, "for livelink, write .csv"),
-        (
-            "a.mp4",
-            {"form": CurveForm.ARKIT},
-            "--as does not apply .* .fap, .csv",
-        ),
+        ("a.mp4", {"form": CurveForm.ARKIT}, "--as does not apply .* .fap, .csv"),
         ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
         ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),
         ("a.png", {"rate_hz": 30.0}, "--rate does not apply"),

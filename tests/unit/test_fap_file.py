@@ -97,11 +97,7 @@ def test_errors_of_missing_paths(tmp_path: Path) -> None:
         (mask(1, 3, 48, digits=69), "12 0 80 -900", {1: 0, 3: 80, 48: -900}),  # Greta
         (mask(3, 5, 6, 7).replace(" ", ""), "0 inf nan -inf 1e60", {3: 0, 5: 0, 6: 0, 7: 0}),
         # The outer lips follow the inner ones if they are not set.
-        (
-            mask(4, 5, 57, 52),
-            "0 -10 -20 -30 -40",
-            {51: -10, 52: -30, 57: -40, 10: -40},
-        ),
+        (mask(4, 5, 57, 52), "0 -10 -20 -30 -40", {51: -10, 52: -30, 57: -40, 10: -40}),
     ],
 )
 def test_reads_variants(tmp_path: Path, bits: str, values: str, faps: dict[int, float]) -> None:

@@ -1,10 +1,6 @@
 import numpy as np
 
-from kouxing.services.recognizer.front_end.features import (
-    NUM_STATIC,
-    LiveMean,
-    with_differences,
-)
+from kouxing.services.recognizer.front_end.features import NUM_STATIC, LiveMean, with_differences
 
 
 def test_differences_of_a_line_and_a_parabola() -> None:

@@ -12,11 +12,7 @@ from kouxing.services.synthesizer.lips.ferguson.key_frames import key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.ferguson.recipe import (
-    fit_openings,
-    relative_openings,
-    travel_of,
-)
+from kouxing.training.ferguson.recipe import fit_openings, relative_openings, travel_of
 from tests.lips import clip_of, utterance
 
 INVENTORY = load_inventory()

@@ -6,11 +6,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from kouxing.services.recognizer.acoustic.gmm import (
-    GaussianMixtures,
-    GmmModel,
-    mixture_scores,
-)
+from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel, mixture_scores
 from kouxing.services.recognizer.acoustic.load import NEURAL_PATH, load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, NUM_STATIC

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.measures import (
-    Detections,
-    closures,
-    is_closed_at,
-)
+from kouxing.evaluation.lips.measures import Detections, closures, is_closed_at
 
 TIME_S = np.arange(0.0, 4.0, 0.02)
 

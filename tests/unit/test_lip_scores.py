@@ -8,11 +8,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from kouxing.evaluation.lips.schemes import (
-    DELAYS_S,
-    RecognizedClip,
-    Scheme,
-)
+from kouxing.evaluation.lips.schemes import DELAYS_S, RecognizedClip, Scheme
 from kouxing.evaluation.lips.scores import ClipScore, LipScore, pool, score_clip
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend

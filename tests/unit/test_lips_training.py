@@ -10,15 +10,10 @@ import pytest
 import soundfile
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, part_of
-from kouxing.services.recognizer.lip_predictor import (
-    load_lip_predictor,
-)
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError
 from kouxing.training.lips import recipe
-from kouxing.training.lips.recipe import (
-    DELAYS_S,
-    train_lips,
-)
+from kouxing.training.lips.recipe import DELAYS_S, train_lips
 from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import WholeEncoder
 from tests.e2e.following import samples_of_file

@@ -45,13 +45,7 @@ def test_honors_gaps_in_timestamps(tmp_path: Path, name: str, codec: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ("name", "codec"),
-    [
-        ("a.mkv", "aac"),
-        ("a.mp4", "aac"),
-        ("a.ts", "aac"),
-        ("a.mov", "pcm_s16le"),
-    ],
+    ("name", "codec"), [("a.mkv", "aac"), ("a.mp4", "aac"), ("a.ts", "aac"), ("a.mov", "pcm_s16le")]
 )
 def test_honors_the_start_of_a_late_track(tmp_path: Path, name: str, codec: str) -> None:
     write_media(tmp_path / name, codec, TONE, RATE_HZ, start_s=2.0, video_s=5.0)

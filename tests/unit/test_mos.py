@@ -14,20 +14,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from kouxing.evaluation.mos.commands import app
-from kouxing.evaluation.mos.report import (
-    make_report,
-    mean_of,
-    opinion_of,
-    print_report,
-)
+from kouxing.evaluation.mos.report import make_report, mean_of, opinion_of, print_report
 from kouxing.evaluation.mos.store import FILE_NAME as ANSWERS
 from kouxing.evaluation.mos.store import Answer, Store, read_answers
-from kouxing.evaluation.mos.study import (
-    FILE_NAME,
-    load_study,
-    new_study,
-    williams_design,
-)
+from kouxing.evaluation.mos.study import FILE_NAME, load_study, new_study, williams_design
 from kouxing.shared.errors import UserError
 
 CONDITIONS = ("real", "live", "late", "still")

@@ -3,10 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.front_end.pcm import (
-    level_db,
-    samples_of,
-)
+from kouxing.services.recognizer.front_end.pcm import level_db, samples_of
 
 
 def test_scales_int16_to_one() -> None:

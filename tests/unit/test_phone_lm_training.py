@@ -21,14 +21,7 @@ from kouxing.training.phone_lm.recipe import (
     stream_of,
     train_phone_lm,
 )
-from tests.languages import (
-    MANDARIN,
-    NUM_PHONES,
-    SIL,
-    START,
-    Table,
-    step,
-)
+from tests.languages import MANDARIN, NUM_PHONES, SIL, START, Table, step
 
 INDEX = MANDARIN.index
 # the corpus's sentence of split train

@@ -34,8 +34,7 @@ def num_admitted(load: WorkerLoad, now_s: float) -> int:
 
 
 @pytest.mark.parametrize(
-    ("num_sessions", "measured", "admitted"),
-    [(2, 0.19, 6), (8, 0.76, 0), (1, 0.01, 79)],
+    ("num_sessions", "measured", "admitted"), [(2, 0.19, 6), (8, 0.76, 0), (1, 0.01, 79)]
 )
 def test_admits_as_many_sessions_as_the_measured_load_leaves_room_for(
     num_sessions: int, measured: float, admitted: int

@@ -6,9 +6,7 @@ import pytest
 from rich.console import Console
 
 from kouxing.corpora.scoring import matched_pairs
-from kouxing.evaluation.recognizer.error_rates import (
-    evaluate_recognizer,
-)
+from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
 from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig

@@ -64,8 +64,7 @@ def test_backgrounds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
-    [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
+    ("name", "said"), [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")]
 )
 def test_error_of_an_unknown_head(name: str, said: str) -> None:
     with pytest.raises(UserError, match=said):

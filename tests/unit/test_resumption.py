@@ -120,10 +120,7 @@ def first_chunks(outputs: Sequence[Sequence[StreamOutput]], from_s: float) -> li
 
 def test_withdraws_a_phone_that_turns_out_to_be_known() -> None:
     resumption = Resumption(1.0, "sil")
-    first, revised = (
-        phone(0, 0.98, 0.1, final=False),
-        phone(0, 0.8, 0.1, final=False),
-    )
+    first, revised = (phone(0, 0.98, 0.1, final=False), phone(0, 0.8, 0.1, final=False))
     assert resumption.new_results([first])[1:] == [first]
     assert resumption.new_results([revised]) == [revised]  # it may change again
     (last,) = resumption.new_results([phone(0, 0.8, 0.1)])

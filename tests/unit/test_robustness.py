@@ -8,9 +8,7 @@ import pytest
 from rich.console import Console
 
 from kouxing.evaluation.recognizer import robustness
-from kouxing.evaluation.recognizer.disturbances import (
-    SPEECH_CONDITIONS,
-)
+from kouxing.evaluation.recognizer.disturbances import SPEECH_CONDITIONS
 from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig

@@ -4,10 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
-    check_visemes,
-    visemes_of,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import check_visemes, visemes_of
 from kouxing.shared.errors import UserError
 from tests.lips import INVENTORY
 

@@ -2,10 +2,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.front_end.features import NUM_BANDS
-from kouxing.services.recognizer.front_end.vtln import (
-    REFERENCE_HZ,
-    VocalTractNormalizer,
-)
+from kouxing.services.recognizer.front_end.vtln import REFERENCE_HZ, VocalTractNormalizer
 
 
 def bands_with_a_peak(num_frames: int, peak: int) -> np.ndarray:
@@ -15,10 +12,7 @@ def bands_with_a_peak(num_frames: int, peak: int) -> np.ndarray:
 
 
 def voice(pitch_hz: float, num_frames: int, strength: float = 0.95) -> tuple[np.ndarray, ...]:
-    return (
-        np.full(num_frames, pitch_hz, np.float32),
-        np.full(num_frames, strength, np.float32),
-    )
+    return (np.full(num_frames, pitch_hz, np.float32), np.full(num_frames, strength, np.float32))
 
 
 def center_hz(band: float) -> float:
