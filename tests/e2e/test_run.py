@@ -108,7 +108,7 @@ def test_reports_a_mistake_before_anything_starts(
     assert word in result.stderr
 
 
-def interrupt(arguments: list[str], folder: Path, is_due: Callable[[], bool]) -> tuple[int, str]:
+def interrupt(arguments: list[str], folder: Path, is_due: Callable[[], object]) -> tuple[int, str]:
     """Press Ctrl-C when it is due; return the command's status and what it printed."""
     environment = {**ONE_THREAD, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(folder)}
     with subprocess.Popen(
@@ -130,7 +130,8 @@ def interrupt(arguments: list[str], folder: Path, is_due: Callable[[], bool]) ->
 
 def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
     arguments = ["run", "--no-browser", "--port", "0", "--play", str(SENTENCE)]
-    status, log = interrupt(arguments, tmp_path, (tmp_path / "out/logs/control.log").exists)
+    control = tmp_path / "out/logs/control.log"
+    status, log = interrupt(arguments, tmp_path, lambda: control.exists() and control.read_text())
     assert (status, "stopping" in log) == (0, True)
 
 
