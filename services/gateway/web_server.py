@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Collection
 from typing import Any, cast
 
-from aiohttp import web
+from aiohttp import web, web_fileresponse
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
@@ -24,6 +24,7 @@ from kouxing.shared.logs import LOG, RateLimit
 MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # until a request arrives, and until the next one
 BODY_TIMEOUT_S = 70.0  # for the body on unlimited paths; an upload is answered before that
+MAX_HEAD_BYTES = 64 * 1024  # of a request: its first line and its headers
 ANSWER_TIMEOUT_S = 120.0  # to send a file; a head has 5 MB
 BACKLOG = 128
 KEEPALIVE_S = 20  # without data, until a client that has vanished is looked for
@@ -32,6 +33,8 @@ LOG_PERIOD_S = 60.0  # between two log lines about errors at the same place
 _CHECK_S = 1.0
 _SHUTDOWN_S = 0.5  # until handlers are cancelled
 _RETRY_S = 1.0  # when the system has no free descriptor
+# asyncio logs an error if a connection ends while the system sends a file to it.
+web_fileresponse.NOSENDFILE = True  # type: ignore[misc]
 _HEADERS = {  # of every answer
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
@@ -98,12 +101,34 @@ class _Connection(web.RequestHandler):
         self.set_timeout(IDLE_TIMEOUT_S)
         self.request: web.BaseRequest | None = None  # while its handler runs
         self.is_lost = asyncio.Event()
+        self._head_bytes = 0
         self._log_limit = log_limit
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """Release the connection's place."""
         super().connection_lost(exc)
         self.is_lost.set()
+
+    def data_received(self, data: bytes) -> None:
+        """Handle data; close if a request's head is too long, or if requests do not wait."""
+        super().data_received(data)
+        is_head = self._waiter is not None and not self._waiter.done()
+        self._head_bytes = self._head_bytes + len(data) if is_head else 0
+        is_too_long = self._head_bytes > MAX_HEAD_BYTES or len(self._messages) > 1
+        if is_too_long and self.transport is not None:
+            self.transport.abort()
+
+    async def finish_response(
+        self, request: web.BaseRequest, resp: web.StreamResponse, start_time: float | None
+    ) -> tuple[web.StreamResponse, bool]:
+        """Send an answer. Read no further request until the client has received it."""
+        if self.transport is not None:
+            self.transport.pause_reading()
+        try:
+            return await super().finish_response(request, resp, start_time)
+        finally:
+            if self.transport is not None:  # still connected
+                self.transport.resume_reading()
 
     def set_timeout(self, timeout_s: float) -> None:
         """Close the connection after a time; infinite: its client keeps its place."""
@@ -123,8 +148,8 @@ class _Connection(web.RequestHandler):
         message: str | None = None,
     ) -> web.StreamResponse:
         """Answer a request whose handler raised an exception."""
-        if _is_disconnect(exc):
-            raise ConnectionResetError
+        if isinstance(exc, ConnectionError):
+            raise exc
         if isinstance(exc, HttpProcessingError | web.RequestPayloadError):
             status, text = 400, "this is not a valid HTTP request"
             self._warn("dropped a request that is not HTTP")
@@ -145,18 +170,12 @@ class _Connection(web.RequestHandler):
     def log_exception(self, *args: object, **_options: object) -> None:
         """Log the current exception, once a minute for each place in the code."""
         error = sys.exception()
-        if not _is_disconnect(error) and self._log_limit.allows(_place(error)):
+        if not isinstance(error, ConnectionError) and self._log_limit.allows(_place(error)):
             LOG.error(*args, exc_info=True)
 
     def _warn(self, text: str, error: BaseException | None = None) -> None:
         if self._log_limit.allows(_place(error) or text):
             LOG.warning("%s", text)
-
-
-def _is_disconnect(error: BaseException | None) -> bool:
-    # asyncio raises AttributeError if a client disconnects while it receives a file over TLS
-    context = error and error.__context__
-    return isinstance(error, ConnectionError) or isinstance(context, ConnectionError)
 
 
 def _place(error: BaseException | None) -> str:

@@ -124,6 +124,19 @@ async def check_open(reader: asyncio.StreamReader) -> None:
         await asyncio.wait_for(reader.read(), 0.2)
 
 
+@async_test
+async def test_closes_connections_with_long_heads_or_many_requests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    request = b"GET / HTTP/1.1\r\nHost: a\r\n"
+    headers = b"".join(b"X%d: %s\r\n" % (number, b"x" * 8000) for number in range(100))
+    async with serve(monkeypatch) as served:
+        for part in (request + headers, SLOW + 50 * (request + b"\r\n")):
+            with contextlib.suppress(ConnectionResetError):
+                await read_to_end(await served.connect(part))
+        assert await served.answers()
+
+
 @pytest.mark.parametrize("part", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
 @async_test
 async def test_closes_connections_without_a_request(
