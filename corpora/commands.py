@@ -60,14 +60,14 @@ def adapt(
 
 def _read(source: Path) -> FilmedSpeech:
     from kouxing.corpora.lip_clips import read_clip
-    from kouxing.services.mouth_profiles.landmark_file import SUFFIX, parse_landmark_file
+    from kouxing.services.mouth_profiles.landmark_file import MAX_BYTES, SUFFIX, parse_landmark_file
+    from kouxing.shared.user_file import read_file
 
     if source.suffix != SUFFIX:
         return read_clip(source).filmed_speech()
+    content = read_file(source, MAX_BYTES)
     try:
-        return parse_landmark_file(source.read_bytes())
-    except OSError as error:
-        raise UserError(f"cannot read {source}: {error.strerror}") from None
+        return parse_landmark_file(content)
     except UserError as error:
         raise UserError(f"{source}: {error}") from error
 

@@ -13,7 +13,8 @@ folder names further clips and speakers to hold out.
 from __future__ import annotations
 
 import csv
-import json
+import io
+import itertools
 import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -33,10 +34,13 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.user_file import check_content, parse_json, read_text
 
 Array = NDArray[np.float64]
 
 SAMPLE_RATE_HZ = 16_000
+_MAX_BYTES = 64 << 20  # of a table
+_MAX_ROWS = 1_000_000
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
 # Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
@@ -127,7 +131,7 @@ def read_clips(
     if there are no clips, or one of them cannot be read.
     """
     held = folder / "held.txt"
-    held_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
+    held_out = set(read_text(held, _MAX_BYTES).split()) if held.exists() else set()
     clips = [
         clip
         for path in sorted(folder.glob("*.json"))
@@ -150,16 +154,18 @@ def _read_clip(
     path: Path, language: str | None, *, any_license: bool, held_out: Collection[str] = ()
 ) -> LipClip | None:
     """Read a clip; None if it is in another language."""
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
+    with check_content(path, "a clip"):
+        about = parse_json(read_text(path, _MAX_BYTES))
         clip_language = str(about.get("language", "zh"))[:2]
         if language not in (None, clip_language):
             return None
         license_name, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
-        with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        if not rows or None in rows[0]:
-            raise ValueError("its table has no rows, or rows longer than its header")
+        table = io.StringIO(read_text(path.with_suffix(".csv"), _MAX_BYTES), newline="")
+        rows = list(itertools.islice(csv.DictReader(table), _MAX_ROWS + 1))
+        if not rows or None in rows[0] or len(rows) > _MAX_ROWS:
+            raise ValueError(
+                f"its table has no rows, more than {_MAX_ROWS}, or rows longer than its header"
+            )
         values = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
         if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
             raise ValueError("its times do not ascend")
@@ -180,12 +186,6 @@ def _read_clip(
             faps=faps,
             samples=read_audio(path.with_suffix(".flac")),
         )
-    except KeyError as error:
-        raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
-    except OSError as error:
-        raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
-    except (ValueError, AttributeError, csv.Error) as error:
-        raise UserError(f"cannot read the clip {path.stem}: {error}") from error
 
 
 def _tracked_faps(tracks: dict[str, Array]) -> Array:

@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 from kouxing.corpora.face_mesh import FaceMesh
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
 from kouxing.services.cli.inputs import read_mono_16k
+from kouxing.services.driver import picture
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import level_track
-from kouxing.shared.audio_file import check_video
+from kouxing.shared.audio_file import MAX_FILE_BYTES, check_video
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
-from kouxing.shared.media_file import start_of
+from kouxing.shared.media_file import OPTIONS, start_of
 from kouxing.shared.terminal import plural
+from kouxing.shared.user_file import check_content, open_file
 
 MAX_DURATION_S = 1200.0
 MAX_SIDE_PX = 960  # larger images are reduced
@@ -38,11 +40,13 @@ def read_video(
     be read, has no images or no audio, or is too long.
     """
     check_video(path)
-    try:
-        with path.open("rb") as file, av.open(file, mode="r", metadata_errors="replace") as video:
-            _decode(path, video, on_image)
-    except (av.error.FFmpegError, OSError) as error:
-        raise UserError(f"cannot read the video {path}: {error.strerror}") from None
+    with (
+        open_file(path, MAX_FILE_BYTES) as file,
+        check_content(path, "a video"),
+        av.open(file, mode="r", options=OPTIONS, metadata_errors="replace") as video,
+    ):
+        video.streams.video[0].codec_context.options = {"max_pixels": str(picture.MAX_PIXELS)}
+        _decode(path, video, on_image)
     return read_mono_16k(path, track)
 
 

@@ -22,6 +22,7 @@ are cut into pieces that overlap by 0.48 s, and so are their texts.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -32,6 +33,7 @@ from kouxing.shared.audio_file import read_duration_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 from kouxing.shared.terminal import plural
+from kouxing.shared.user_file import check_content, read_text
 
 # Licenses that allow distributing a model trained on the data.
 _FREE_LICENSE = re.compile(
@@ -42,6 +44,7 @@ _CLOSED_LICENSE = re.compile(
     r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
 )
 _MIN_PHONE_S = 0.03
+_MAX_LIST_BYTES = 256 << 20  # a million recordings
 _AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")
 
@@ -113,7 +116,7 @@ def read_corpus(
     are read. ``audio`` is the base folder of a manifest's paths, by default the manifest's folder.
     Raises UserError if the layout is unknown, or a list is missing or not UTF-8 text.
     """
-    if folder.suffix == ".tsv" and folder.is_file():
+    if folder.suffix == ".tsv" and not folder.is_dir():
         rows = _manifest_rows(folder, audio)
     elif (folder / "manifest.tsv").is_file():
         rows = _manifest_rows(folder / "manifest.tsv", audio)
@@ -126,14 +129,8 @@ def read_corpus(
             f"{folder} is not a corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
             "text, or with AISHELL's wav and transcript folders"
         )
-    try:
+    with check_content(folder, "a corpus"):
         chosen = [(place, row) for place, row in rows if split in (None, _split_of(row))]
-    except UnicodeDecodeError as error:
-        raise UserError(
-            f"{folder}: the list of recordings is not UTF-8 text ({error}); convert it"
-        ) from error
-    except OSError as error:
-        raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
     utterances = [_utterance(place, row, errors, inventory) for place, row in chosen]
     return [utterance for utterance in utterances if utterance]
 
@@ -154,13 +151,12 @@ def _utterance(
     place: str, row: dict[str, str], errors: RowErrors, inventory: PhoneInventory
 ) -> Utterance | None:
     path = Path(row["path"])
-    if not path.is_file():
-        errors.add(place, f"no audio file {path}")
-        return None
     try:
+        if not path.is_file():
+            raise ValueError(f"no audio file {path}")
         syllables = inventory.pronounce(row.get("pinyin") or row["text"])
         seconds = float(row.get("seconds") or duration_s(path))
-    except (UserError, ValueError) as error:
+    except (UserError, ValueError, OSError) as error:  # OSError: not a possible name
         errors.add(place, str(error))
         return None
     phones = tuple(inventory.index[phone] for syllable in syllables for phone in syllable)
@@ -191,18 +187,18 @@ def duration_s(path: Path) -> float:
 
 
 def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:
-    with path.open(encoding="utf-8-sig", newline="") as lines:
-        reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
-        columns = set(reader.fieldnames or ())
-        missing = sorted({"utt_id", "path"} - columns)
-        if not columns & {"pinyin", "text"}:
-            missing.append("pinyin or text")
-        if missing:
-            raise UserError(f"{path} lacks the columns {', '.join(missing)}; add them")
-        for number, row in enumerate(reader, start=2):
-            place = f"{path.name} row {number} ({row['utt_id']})"
-            cells = {"text": "", **{key: value or "" for key, value in row.items() if key}}
-            yield place, {**cells, "path": str((audio or path.parent) / cells["path"])}
+    lines = io.StringIO(read_text(path, _MAX_LIST_BYTES), newline="")
+    reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
+    columns = set(reader.fieldnames or ())
+    missing = sorted({"utt_id", "path"} - columns)
+    if not columns & {"pinyin", "text"}:
+        missing.append("pinyin or text")
+    if missing:
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}; add them")
+    for number, row in enumerate(reader, start=2):
+        place = f"{path.name} row {number} ({row['utt_id']})"
+        cells = {"text": "", **{key: value or "" for key, value in row.items() if key}}
+        yield place, {**cells, "path": str((audio or path.parent) / cells["path"])}
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
@@ -249,7 +245,7 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def _pairs(path: Path) -> Iterator[tuple[str, str]]:
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in io.StringIO(read_text(path, _MAX_LIST_BYTES), None):
         key, _, value = line.strip().partition(" ")
         if key:
             yield key, value.strip()

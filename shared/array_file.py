@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import stat
 import zipfile
-import zlib
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -12,35 +11,35 @@ from typing import Any
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from kouxing.shared.user_file import check_content, open_file
+
 MAX_ARRAYS = 1000
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others need much memory
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_ENTRY = b"PK\1\2"  # of the table at the end of an archive
 
 
-def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, max_bytes: int, expected: str) -> dict[str, NDArray[Any]]:
     """Read all arrays of an npz file, never a pickle.
 
-    Raises ``OSError`` if the file cannot be read. Raises ``ValueError`` if it is not an npz file of
-    plain arrays, or has more than ``max_bytes``.
+    Raises ``UserError`` if the file cannot be read, is not an npz file of plain arrays, or has more
+    than ``max_bytes``. The error says that it is not what is ``expected``.
     """
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError("it is not a file")
-    if status.st_size > max_bytes:
-        raise ValueError(f"it is larger than {max_bytes // 2**20} MiB")
-    try:
-        with zipfile.ZipFile(path) as archive:
+    with open_file(path, max_bytes) as file, check_content(path, expected):
+        # ZipFile reads the whole table, so its entries are counted first
+        if (
+            sum(piece.count(_ENTRY) for piece in iter(partial(file.read, 1 << 16), b""))
+            > MAX_ARRAYS
+        ):
+            raise ValueError(f"it has more than {MAX_ARRAYS} arrays")
+        with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
             if sum(entry.file_size for entry in entries) > max_bytes:
-                raise ValueError(f"it is larger than {max_bytes // 2**20} MiB unpacked")
-            if len(entries) > MAX_ARRAYS:
-                raise ValueError(f"it has {len(entries)} arrays")
+                raise ValueError(f"it is larger than {max_bytes >> 20} MiB unpacked")
             return {
                 entry.filename.removesuffix(".npy"): _read_array(archive, entry)
                 for entry in entries
             }
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise ValueError(str(error)) from error
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
@@ -52,7 +51,7 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any
         if version not in _HEADERS:
             raise ValueError(f"{entry.filename} is an array of unknown version {version}")
         shape, _, kind = _HEADERS[version](stream)
-        if stream.tell() + prod(shape) * kind.itemsize > entry.file_size:
+        if stream.tell() + prod(shape) * max(1, kind.itemsize) > entry.file_size:
             raise ValueError(f"{entry.filename} is cut off")
     with archive.open(entry) as stream:
         array: NDArray[Any] = npy.read_array(stream, allow_pickle=False)

@@ -31,6 +31,7 @@ from kouxing.shared.sound_formats import (
     non_audio_kind,
     stated_bytes,
 )
+from kouxing.shared.user_file import open_file
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # of a session; files above are resampled to it
@@ -39,6 +40,8 @@ CLIPPED_LEVEL = 0.999
 CLIPPED_SHARE = 0.01  # of the samples; the user is warned about more
 _MIN_MISSING_S = 0.05  # of a file that is reported as cut off
 _MAX_SPOOLED_BYTES = 64 << 20  # of a pipe that must be read to its end first; more goes to a file
+MAX_FILE_BYTES = 8 << 30
+MAX_DURATION_S = 3 * 3600.0  # of a recording that is held in memory
 _PIPE = Path("-")
 
 
@@ -79,23 +82,17 @@ def open_audio(
     The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
     is read as raw samples; ``raw`` is their format. ``is_raw``: the content is raw samples.
 
-    Raises ``UserError`` if the file is missing, empty, not audio, or below 8 kHz, or if ``raw`` is
-    given and another format fits. While reading, raises it if samples are not finite.
+    Raises ``UserError`` if the file is missing, empty, too large, not audio, or below 8 kHz, or if
+    ``raw`` is given and another format fits. While reading, raises it if samples are not finite.
     """
-    try:
-        if path.is_dir():
-            raise UserError(f"{path}: this is a folder; give an audio file")
-        file: BinaryIO = sys.stdin.buffer if path == _PIPE else path.open("rb")
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
+    file = sys.stdin.buffer if path == _PIPE else open_file(path, MAX_FILE_BYTES, pipe=True)
+    is_pipe = path == _PIPE or path.is_fifo()
     name = "standard input" if path == _PIPE else path.name
 
     def open_source() -> AudioSource:
         if is_raw:
             return raw_audio(_Pipe(file), raw or RawFormat(), name)
-        if path == _PIPE or not path.is_file():
+        if is_pipe:
             return _open_pipe(file, name, block_s, track, raw)
         if raw is not None:
             raise UserError(f"{path}: --rate and --channels apply to raw samples; add --raw")
@@ -122,11 +119,12 @@ def _close_after(blocks: Iterator[Samples], file: BinaryIO) -> Iterator[Samples]
 def _open_file(
     file: BinaryIO, path: str, name: str, block_s: float, track: int | None
 ) -> AudioSource:
-    begin = file.read(NUM_BEGIN_BYTES)
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     if num_bytes == 0:
         raise UserError(f"{path}: the file is empty")
+    begin = file.read(NUM_BEGIN_BYTES)
+    file.seek(0)
     sound = MediaSound(file, path, begin, track, is_pipe=False)
     return _source(sound, path, name, block_s, begin, lambda: num_bytes)
 
@@ -202,9 +200,27 @@ class _Pipe:
 
 
 def read_audio(path: Path) -> tuple[Samples, int]:
-    """Return all samples, (n, channels), and their rate in Hz; raises as ``open_audio``."""
+    """Return all samples, (n, channels), and their rate in Hz.
+
+    Raises ``UserError`` as ``open_audio``, and if it is longer than ``MAX_DURATION_S``.
+    """
     source = open_audio(path, block_s=1.0)
-    return np.concatenate(list(source.blocks)), source.sample_rate_hz
+    return np.concatenate(list(limited_blocks(source))), source.sample_rate_hz
+
+
+def limited_blocks(
+    source: AudioSource, max_duration_s: float = MAX_DURATION_S
+) -> Iterator[Samples]:
+    """Yield the blocks of a recording; ``UserError`` if it is too long."""
+    num_samples = 0
+    for block in source.blocks:
+        num_samples += len(block)
+        if num_samples > max_duration_s * source.sample_rate_hz:
+            raise UserError(
+                f"{source.name}: the sound is longer than {max_duration_s / 3600:g} h; use a"
+                " shorter file"
+            )
+        yield block
 
 
 def read_duration_s(path: Path) -> float:
@@ -212,26 +228,20 @@ def read_duration_s(path: Path) -> float:
 
     Raises ``UserError`` as ``open_audio``.
     """
-    try:
-        with path.open("rb") as file:
-            source = _open_file(file, str(path), path.name, block_s=1.0, track=None)
-            num_samples = 0
-            if source.duration_s is None:
-                num_samples = sum(len(block) for block in source.blocks)
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
+    with open_file(path, MAX_FILE_BYTES) as file:
+        source = _open_file(file, str(path), path.name, block_s=1.0, track=None)
+        num_samples = 0
+        if source.duration_s is None:
+            num_samples = sum(len(block) for block in source.blocks)
     return source.duration_s or num_samples / source.sample_rate_hz
 
 
 def check_video(path: Path) -> None:
     """Raise ``UserError`` if a file is not a video with audio."""
-    try:
-        with path.open("rb") as file:
-            begin = file.read(NUM_BEGIN_BYTES)
-            file.seek(0)
-            is_video = has_video(file, str(path), begin)
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the file: {error.strerror}") from None
+    with open_file(path, MAX_FILE_BYTES) as file:
+        begin = file.read(NUM_BEGIN_BYTES)
+        file.seek(0)
+        is_video = has_video(file, str(path), begin)
     if not is_video:
         raise UserError(f"{path}: the video must have images and audio; record it with sound")
 

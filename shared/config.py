@@ -40,8 +40,11 @@ from kouxing.shared.endpoints import (
     with_host,
 )
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import check_content, read_text
 
 PREFIX = "KOUXING_"
+_MAX_FILE_BYTES = 64 << 10
+_MAX_DOTS = 1000  # in a line; tomllib needs memory for the square of a key's parts
 COMMON = "common"  # table of the keys that every service has
 
 
@@ -276,10 +279,11 @@ class Settings:
         return _find(values, self._names, "--set")
 
     def _read_file(self, file: Path) -> Layer:
-        try:
-            content = tomllib.loads(file.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise UserError(f"--config {file}: {error}") from None
+        text = read_text(file, _MAX_FILE_BYTES)
+        if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
+            raise UserError(f"{file}: a line has more than {_MAX_DOTS} dots; split it")
+        with check_content(file, "a TOML file of kouxing"):
+            content = tomllib.loads(text)
         values: dict[str, Any] = {}
         for table, entries in content.items():
             if table not in self._tables or not isinstance(entries, dict):

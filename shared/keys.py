@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import parse_json, read_text
 
 if TYPE_CHECKING:
     from kouxing_client.keys import Key
@@ -37,6 +38,7 @@ CLIENT_ROLES = ("client", "operator")  # of the user of control's machine
 MAX_KEYS = 1000  # with MAX_ROLES, what fits in one message from control
 MAX_ROLES = 16  # of a key
 _MAX_ALLOWED_BYTES = 768 * 1024
+_MAX_FILE_BYTES = 1 << 20
 _ALLOWED = "allowed"
 _SUBSCRIBER = "subscriber:"
 _PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
@@ -275,7 +277,7 @@ def read_key(path: Path) -> Key:
     from kouxing_client.keys import Key  # noqa: PLC0415 (slow to import)
 
     try:
-        key = Key(**json.loads(_read(path)))
+        key = Key(**parse_json(_read(path)))
         if all(_PUBLIC.fullmatch(part) for part in (key.public, key.secret, key.control)):
             return key
     except (ValueError, TypeError):
@@ -366,9 +368,9 @@ def _check_private(path: Path, mode: int) -> None:
 def _read(path: Path) -> str:
     try:
         _check_private(path, 0o600)
-        return path.read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise UserError(f"cannot read {path}: {error}") from None
+    return read_text(path, _MAX_FILE_BYTES)
 
 
 def _write(path: Path, text: str) -> None:

@@ -17,9 +17,10 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.sound_formats import MIN_UNKNOWN_BYTES, is_sound, why_unreadable
 
 _MAX_STREAMS = 64
-_OPTIONS = {"protocol_whitelist": "none"}  # no network, and no files that a playlist names
+_MAX_RATE_HZ = 1_000_000
+OPTIONS = {"protocol_whitelist": "none"}  # no network, and no files that a playlist names
 # A pipe's first frame is decoded as soon as its bytes are there.
-_PIPE_OPTIONS = _OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
+_PIPE_OPTIONS = OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
 _JITTER_S = 0.05  # timestamps that differ less from the number of samples are inexact
 _MAX_OVERLAP_S = 1.0  # timestamps that go back further start again
 _MAX_GAP_S = 3600.0  # a larger one is an error in the timestamps
@@ -72,7 +73,7 @@ class MediaSound:
             self._container: Any = av.open(
                 self._file,
                 mode="r",
-                options=_PIPE_OPTIONS if is_pipe else _OPTIONS,
+                options=_PIPE_OPTIONS if is_pipe else OPTIONS,
                 buffer_size=4096 if is_pipe else 65536,
                 metadata_errors="replace",
             )
@@ -182,6 +183,10 @@ class MediaSound:
         with self._container:
             while frame is not None:
                 rate_hz = frame.sample_rate
+                if not 0 < rate_hz <= _MAX_RATE_HZ:
+                    raise UserError(
+                        f"{self._name}: the sample rate is {rate_hz} Hz; export the sound again"
+                    )
                 samples = guard.mix(*self._mix(frame))
                 ahead_s = 0.0
                 if self._has_times and frame.time is not None:
@@ -281,7 +286,7 @@ def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
     Raises ``UserError`` if FFmpeg cannot read it.
     """
     try:
-        with av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace") as container:
+        with av.open(file, mode="r", options=OPTIONS, metadata_errors="replace") as container:
             cover = av.stream.Disposition.attached_pic
             has_pictures = any(not one.disposition & cover for one in container.streams.video)
             return bool(has_pictures and container.streams.audio)

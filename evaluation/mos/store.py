@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -13,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "answers.jsonl"
 MAX_JUDGES = 10_000
+_MAX_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,19 +91,16 @@ class Store:
 
 def read_answers(folder: Path) -> list[Answer]:
     """Read all answers; raises UserError if the file cannot be read."""
-    return [Answer(**line) for line in _read_lines(folder / FILE_NAME) if "token" not in line]
+    path = folder / FILE_NAME
+    with check_content(path, "a file of answers"):
+        return [Answer(**line) for line in _read_lines(path) if "token" not in line]
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:
     lines = []
-    try:
-        for text in path.read_text(encoding="utf-8").splitlines():
-            try:
-                lines.append(json.loads(text))
-            except ValueError:
-                continue  # empty, or cut by a crash before it was acknowledged
-    except FileNotFoundError:
-        return []
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read: {error}") from None
+    if path.exists():
+        for text in read_text(path, _MAX_BYTES).splitlines():
+            # lines may be empty, or cut by a crash before they were acknowledged
+            with contextlib.suppress(ValueError):
+                lines.append(parse_json(text))
     return lines

@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 
 from kouxing.shared.audio_file import check_video
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "study.json"
 SUFFIXES = {".mp4", ".webm", ".mov"}
 LANGUAGES = ("zh", "en")  # of the page
+_MAX_BYTES = 16 << 20
 SCALES = ("sync", "realism")
 
 
@@ -72,12 +74,10 @@ def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str
 def load_study(folder: Path) -> Study:
     """Read the study of a folder; raises UserError if it is missing, invalid or incomplete."""
     file = folder / FILE_NAME
-    try:
-        return _parse(folder, json.loads(file.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise UserError(f"{file} is missing; create it with: kouxing mos new {folder}") from None
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{file} is not a valid study: {error!r}") from None
+    if not file.exists():
+        raise UserError(f"{file} is missing; create it with: kouxing mos new {folder}")
+    with check_content(file, "a valid study"):
+        return _parse(folder, parse_json(read_text(file, _MAX_BYTES)))
 
 
 def _parse(folder: Path, content: Any) -> Study:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import codecs
 import csv
-import json
+import io
+import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,11 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.user_file import parse_json, read_file
 
 TABLE_SUFFIXES = (".csv", ".jsonl")
-MAX_MB = 128  # about two hours
+MAX_BYTES = 128 << 20  # about two hours
+MAX_FRAMES = 1_000_000
 _MAX_FAP = 1e6
 _MAX_WEIGHT = 10.0  # of a shape; percentages are larger
 _TIME_CODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+(?:\.\d+)?)")  # ";" if frames are dropped
@@ -70,45 +73,43 @@ def read_table(path: Path) -> FapAnimation:
                 f"{path}, frame {number}: values of shapes must be from 0 to 1; divide percentages"
                 " by 100"
             )
+        if number > MAX_FRAMES:
+            raise UserError(f"{path}: the table has more than {MAX_FRAMES} frames; split it")
     if not times:
         raise UserError(f"{path}: the table has no frames with a face")
     times_s = _times_s(path, times, is_time_code=time_name == "timecode")
     return _resample(path, times_s, np.array(values) @ basis)
 
 
-def _read_lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> Iterator[str]:
+    content = read_file(path, MAX_BYTES)
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        if path.stat().st_size > MAX_MB * 1_000_000:
-            raise UserError(f"{path} is larger than {MAX_MB} MB; split it")
-        content = path.read_bytes()
-        is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
         raise UserError(f"{path}: this is not a text file; give a table of curves in UTF-8")
-    return [line for line in text.splitlines() if line.strip(" ,;\t")]
+    return (line for line in io.StringIO(text, None) if line.strip(" ,;\t\n"))
 
 
-def _csv_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
+def _csv_rows(path: Path, lines: Iterator[str]) -> Iterator[list[str]]:
     """Yield the cells of each line, separated by commas, semicolons or tabs."""
     header = next((line for line in lines if not line.startswith("sep=")), "")  # from Excel
     delimiter = max(",;\t", key=header.count)
     try:
-        for row in csv.reader(lines[lines.index(header) :] if header else [], delimiter=delimiter):
+        for row in csv.reader(itertools.chain([header], lines), delimiter=delimiter):
             yield row if delimiter == "," else [cell.replace(",", ".") for cell in row]
     except csv.Error as error:
         raise UserError(f"{path}: this is not a table: {error}; export it again") from None
 
 
-def _json_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
+def _json_rows(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
     """Yield the names of the first frame, then the values of each frame."""
     names: list[str] = []
     for number, line in enumerate(lines, start=1):
         try:
-            frame = json.loads(line)
+            frame = parse_json(line)
             values = next(frame[key] for key in ("faps", *SHAPE_SETS) if key in frame)
             if isinstance(values, list):
                 values = dict(zip(FAP_NUMBER, values, strict=True))
@@ -119,7 +120,7 @@ def _json_rows(path: Path, lines: Sequence[str]) -> Iterator[list[str]]:
             if len(fields) != len(names):
                 raise ValueError
             yield [fields[name] for name in names]
-        except (ValueError, TypeError, LookupError, StopIteration, RecursionError):
+        except (ValueError, TypeError, LookupError, StopIteration):
             raise UserError(
                 f"{path}, line {number}: expected an object with time_s, and the values of a"
                 f" face in {', '.join(('faps', *SHAPE_SETS))}; all lines need the same values"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
+from kouxing.shared.audio_file import clipping_remarks, limited_blocks, num_clipped, open_audio
 from kouxing.shared.terminal import print_message
 
 
@@ -16,7 +16,7 @@ def read_mono_16k(path: Path, track: int | None = None) -> NDArray[np.float32]:
     """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
 
     Prints a message if the file is truncated or clipped, or has other tracks. Raises ``UserError``
-    as ``kouxing.shared.audio_file.open_audio``.
+    as ``kouxing.shared.audio_file.read_audio``.
     """
     source = open_audio(path, block_s=1.0, track=track)
     for notice in source.notices:
@@ -24,7 +24,7 @@ def read_mono_16k(path: Path, track: int | None = None) -> NDArray[np.float32]:
     resampler = Resampler(source.sample_rate_hz, source.num_channels)
     parts = []
     num_samples = clipped = 0
-    for block in source.blocks:
+    for block in limited_blocks(source):
         parts.append(resampler.accept_waveform(block))
         num_samples += block.size
         clipped += num_clipped(block)

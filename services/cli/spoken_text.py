@@ -10,8 +10,11 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.terminal import print_message
+from kouxing.shared.user_file import read_file
 
-_MAX_BYTES = 16 * 1024 * 1024
+_MAX_BYTES = 8 << 20
+_MAX_CHARACTERS = 150_000
+_MAX_DIGITS = 10_000  # reading a number takes long
 _MAX_NAMED = 20  # words in a message
 _TEXT_SUFFIXES = {
     *(".txt", ".text", ".md", ".markdown", ".html", ".htm", ".xml", ".ssml", ".json", ".textgrid"),
@@ -28,7 +31,14 @@ def read_text(text: str, inventory: PhoneInventory) -> Transcript:
     Prints a message about words that cannot be read, and about a format with more than the text.
     Raises ``UserError`` if the file or the text cannot be read, or the text has no syllables.
     """
-    transcript = inventory.read(text_of(text))
+    spoken = text_of(text)
+    for kind, limit, number in (
+        ("characters", _MAX_CHARACTERS, len(spoken)),
+        ("digits", _MAX_DIGITS, sum(map(str.isdigit, spoken))),
+    ):
+        if number > limit:
+            raise UserError(f"the spoken text has more than {limit} {kind}; split it")
+    transcript = inventory.read(spoken)
     words = [repr(word) for word in dict.fromkeys(transcript.dropped)]
     named = ", ".join(words[:_MAX_NAMED])
     if len(words) > _MAX_NAMED:
@@ -63,8 +73,9 @@ def text_of(text: str) -> str:
     if path is None:
         spoken, encoding = extract_text(text), ""
     else:
+        content = read_file(path, _MAX_BYTES)
         try:
-            spoken, encoding = _read_file(path)
+            spoken, encoding = _extract_from(content, path.suffix.lower())
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
     forms = [form for form in (spoken.form, encoding) if form]
@@ -75,26 +86,17 @@ def text_of(text: str) -> str:
 
 
 def _path_of(text: str) -> Path | None:
-    """Return the file that a text names; ``UserError`` if it does not exist."""
+    """Return the file that a text names, None if it names none."""
     try:
         path = Path(text)
-        if path.is_file():
+        if path.suffix.lower() in _TEXT_SUFFIXES or (path.exists() and not path.is_dir()):
             return path
-        if path.suffix.lower() in _TEXT_SUFFIXES:
-            raise UserError(f"{path}: no such file")
     except (OSError, ValueError):  # too long for a file name
         pass
     return None
 
 
-def _read_file(path: Path) -> tuple[SpokenText, str]:
-    suffix = path.suffix.lower()
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise UserError(f"a text file must not be larger than {_MAX_BYTES >> 20} MiB")
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"cannot be read: {error.strerror}") from None
+def _extract_from(content: bytes, suffix: str) -> tuple[SpokenText, str]:
     if suffix in _TABLE_SUFFIXES:
         raise UserError(f"this is a table ({suffix}); save the spoken text as a plain text file")
     decoded = decode_text(content)

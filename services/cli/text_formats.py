@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import codecs
 import contextlib
-import json
+import html
 import re
 from collections.abc import Callable
-from html.parser import HTMLParser
 from typing import NamedTuple
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import parse_json
 
 _BINARY = {  # by their first bytes
     b"%PDF": "a PDF document",
@@ -60,6 +60,12 @@ _LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
 _BRACES = re.compile(r"\{[^{}]*\}")
 _INLINE_TIME = re.compile(r"<\d{1,3}:[\d:.]+>")
 _TAG = re.compile(r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--")
+_MARKUP = re.compile(  # one pass, without going back
+    r"<!\[CDATA\[(?P<plain>[^\]]*(?:\](?!\]>)[^\]]*)*)\]\]>"
+    r"|<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
+    r"|(?P<data><?[^<]+|<)"
+)
+_ALIAS = re.compile(r"""\balias\s*=\s*(["'])(.*?)\1""", re.DOTALL)
 _STRING = re.compile(r'"((?:[^"]|"")*)"')
 _CHINESE = re.compile("[〇\u3400-\u9fff]")
 
@@ -122,7 +128,7 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
         if (is_markdown and form == "Markdown") or pattern.search(text):
             try:
                 spoken = extract(text)
-            except (ValueError, RecursionError):
+            except ValueError:
                 raise UserError(f"this is not valid {form}; give the spoken text alone") from None
             break
     else:
@@ -222,7 +228,7 @@ def _read_text_grid(text: str) -> str:
 
 
 def _read_json(text: str) -> str:
-    return _json_text(json.loads(text))
+    return _json_text(parse_json(text))
 
 
 def _json_text(value: object) -> str:
@@ -241,54 +247,45 @@ def _json_text(value: object) -> str:
 def _read_markdown(text: str) -> str:
     text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)  # metadata
     text = re.sub(r"^(```|~~~).*?^\1[^\n]*$", "", text, flags=re.DOTALL | re.MULTILINE)
-    text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)  # pictures
-    text = re.sub(r"\[([^\]]*)\](?:\([^)]*\)|\[[^\]]*\])", r"\1", text)  # links
-    text = re.sub(r"^\s*\|?[\s:|-]*-[\s:|-]*$", "", text, flags=re.MULTILINE)  # rules
-    text = re.sub(r"^\s*(?:#{1,6}|>+|[-*+]|\d+[.)])\s+", "", text, flags=re.MULTILINE)
+    text = re.sub(r"!\[[^][]*\]\([^()]*\)", "", text)  # pictures
+    text = re.sub(r"\[([^][]*)\](?:\([^()]*\)|\[[^][]*\])", r"\1", text)  # links
+    lines = (line for line in text.split("\n") if "-" not in line or line.strip(" \t:|-"))
+    text = "\n".join(lines)  # without rules
+    text = re.sub(r"^[ \t]*(?:#{1,6}|>+|[-*+]|\d+[.)])[ \t]+", "", text, flags=re.MULTILINE)
     return _read_markup(re.sub(r"[*`|]|~~", "", text))
 
 
 def _read_markup(text: str) -> str:
-    """Extract the text from SSML, TTML, HTML and subtitles with tags."""
-    parser = _MarkupParser()
-    parser.feed(_INLINE_TIME.sub("", text))
-    parser.close()
-    return "".join(parser.spoken)
+    """Extract the text from SSML, TTML, HTML and subtitles with tags.
+
+    ``html.parser`` is not used: its time grows with the square of a damaged text. Entities that a
+    document defines are not resolved, so they cannot grow.
+    """
+    first, *others = _INLINE_TIME.sub("", text).split("<!--")
+    text = first + "".join(comment.partition("-->")[2] for comment in others)
+    spoken: list[str] = []
+    unspoken: list[str] = []  # open elements whose text is not spoken
+    for match in _MARKUP.finditer(text):
+        if match["tag"]:
+            _handle_tag(match, spoken, unspoken)
+        elif not unspoken:
+            spoken.append(match["plain"] or html.unescape(match["data"] or ""))
+    return "".join(spoken)
 
 
-class _MarkupParser(HTMLParser):
-    """Collects the spoken text. It resolves no entities of a document, so they cannot grow."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.spoken: list[str] = []
-        self._unspoken: list[str] = []  # open elements whose text is not spoken
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        name = tag.rpartition(":")[2]
-        if name in _LINE_ELEMENTS:
-            self.spoken.append("\n")
-        alias = dict(attrs).get("alias") if name == "sub" else None
-        if alias and not self._unspoken:
-            self.spoken.append(alias)
-        if name in _UNSPOKEN_ELEMENTS or alias:
-            self._unspoken.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag.rpartition(":")[2] in _LINE_ELEMENTS:
-            self.spoken.append("\n")
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag in self._unspoken:
-            del self._unspoken[self._unspoken.index(tag) :]
-
-    def handle_data(self, data: str) -> None:
-        if not self._unspoken:
-            self.spoken.append(data)
-
-    def unknown_decl(self, data: str) -> None:
-        if data.startswith("CDATA["):
-            self.handle_data(data.removeprefix("CDATA["))
+def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> None:
+    name = tag["tag"].lower().rpartition(":")[2]
+    if tag["end"]:
+        if name in unspoken:
+            del unspoken[unspoken.index(name) :]
+        return
+    if name in _LINE_ELEMENTS:
+        spoken.append("\n")
+    alias = _ALIAS.search(tag["rest"]) if name == "sub" else None
+    if alias and not unspoken:
+        spoken.append(html.unescape(alias[2]))
+    if (name in _UNSPOKEN_ELEMENTS or alias) and not tag["rest"].endswith("/"):
+        unspoken.append(name)
 
 
 def _reject_xml(text: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
+from kouxing.shared.audio_file import clipping_remarks, limited_blocks, num_clipped, open_audio
 from kouxing.shared.errors import UserError
 
 REJECTED = 2  # exit status after an error of the user
@@ -27,11 +27,9 @@ def decode(path: Path) -> None:
     num_samples = clipped = 0
     with wave.open(sys.stdout.buffer, "wb") as output:
         output.setparams((1, 2, source.sample_rate_hz, 0, "NONE", ""))
-        for block in source.blocks:
+        for block in limited_blocks(source, MAX_DURATION_S):
             num_samples += len(block)
             clipped += num_clipped(block)
-            if num_samples > MAX_DURATION_S * source.sample_rate_hz:
-                raise UserError(f"{path}: the sound is longer than an hour; use a shorter file")
             mono = np.rint(block.mean(axis=1) * 32768).clip(-32768, 32767)
             output.writeframes(mono.astype("<i2").tobytes())
     share = clipped / max(1, num_samples * source.num_channels)

@@ -24,6 +24,7 @@ from kouxing.services.mouth_profiles.lip_tracks import level_track, lip_tracks
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import parse_json
 
 SUFFIX = ".landmarks"
 MAX_BYTES = 64 * 1024 * 1024
@@ -68,7 +69,7 @@ def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], ND
     body = 4 + int.from_bytes(content[:4], "little")
     if not 4 < body <= min(4 + _MAX_HEADER_BYTES, len(content)):
         raise ValueError("it is not a landmark file")
-    header = json.loads(content[4:body])
+    header = parse_json(content[4:body])
     keys = ("times", "points", "sample_rate_hz")
     if not isinstance(header, dict) or any(type(header.get(key)) is not int for key in keys):
         raise ValueError(f"its header needs whole numbers for {', '.join(keys)}")

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.user_file import read_file
 
 Floats = NDArray[np.float32]
 
@@ -94,11 +95,7 @@ def parse_mouth_profile(
 
 def read_mouth_profile(path: Path) -> bytes:
     """Read a file that starts like a mouth profile; ``UserError`` if it does not."""
-    try:
-        with path.open("rb") as file:
-            content = file.read(MAX_MOUTH_PROFILE_BYTES + 1)
-    except OSError as error:
-        raise UserError(f"cannot read the mouth profile {path}: {error.strerror}") from None
-    if content[: len(_MAGIC)] != _MAGIC or len(content) > MAX_MOUTH_PROFILE_BYTES:
+    content = read_file(path, MAX_MOUTH_PROFILE_BYTES)
+    if content[: len(_MAGIC)] != _MAGIC:
         raise UserError(f"{path} is not a mouth profile; make one with 'kouxing adapt'")
     return content

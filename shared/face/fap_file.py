@@ -16,7 +16,10 @@ expression_intensity1 expression_select2 expression_intensity2 init_face express
 
 from __future__ import annotations
 
+import io
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,9 +28,11 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.user_file import read_file
 
 _VERSION = "2.1"
-MAX_BYTES = 256 * 1024 * 1024  # several hours
+MAX_BYTES = 256 << 20  # several hours
+MAX_FRAMES = 1_000_000
 _GRETA_MASK_DIGITS = NUM_FAPS + 1
 # Maximum of each number of FAP 1 and FAP 2. The flags at the end have no meaning for a head with
 # given shapes, and programs write any value there.
@@ -65,12 +70,7 @@ def read_fap(path: Path) -> FapAnimation:
     Raises ``UserError`` if the file cannot be read or is not a valid ``.fap`` file; the text names
     the line.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path} is larger than {MAX_BYTES // 2**20} MiB; split it")
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}; give a .fap file") from error
+    text = read_file(path, MAX_BYTES).decode("utf-8-sig", "replace")
     try:
         return _parse(text)
     except _BadFileError as error:
@@ -102,27 +102,27 @@ def write_fap(path: Path, animation: FapAnimation) -> None:
 
 
 def _parse(text: str) -> FapAnimation:
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ] or [(1, "")]
-    name, frame_rate_hz, num_frames = _parse_header(lines[0][0], lines[0][1].split())
-    complete = (len(lines) - 1) // 2
-    if complete < num_frames:
-        raise _BadFileError(lines[-1][0], f"the file ends after {complete} of {num_frames} frames")
-    if len(lines) > 1 + 2 * num_frames:
-        raise _BadFileError(
-            lines[1 + 2 * num_frames][0], f"more frames than the header announces: {num_frames}"
-        )
+    lines = _lines(text)
+    number, line = next(lines, (1, ""))
+    name, frame_rate_hz, num_frames = _parse_header(number, line.split())
+    if num_frames > MAX_FRAMES:
+        raise _BadFileError(number, f"more than {MAX_FRAMES} frames; split the file")
+    num_lines = 0
+    for number, _ in lines:
+        num_lines += 1
+        if num_lines > 2 * num_frames:
+            raise _BadFileError(number, f"more frames than the header announces: {num_frames}")
+    if num_lines < 2 * num_frames:
+        raise _BadFileError(number, f"the file ends after {num_lines // 2} of {num_frames} frames")
+    lines = itertools.islice(_lines(text), 1, None)
     faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
     visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
     expressions = np.zeros((num_frames, len(_EXPRESSION_LIMITS)), dtype=np.int64)
     used = np.zeros(NUM_FAPS, dtype=bool)
     first_number: int | None = None
     for frame in range(num_frames):
-        mask = _parse_mask(*lines[1 + 2 * frame])
-        line_number, line = lines[2 + 2 * frame]
+        mask = _parse_mask(*next(lines))
+        line_number, line = next(lines)
         words = line.split()
         visemes[frame], expressions[frame], values = _parse_values(line_number, words, mask)
         faps[frame, 2:][mask[2:]] = values
@@ -141,6 +141,13 @@ def _parse(text: str) -> FapAnimation:
             faps[:, inner - 1] = faps[:, outer - 1]
     used_visemes, used_expressions = visemes if used[0] else None, expressions if used[1] else None
     return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
+
+
+def _lines(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are neither empty nor comments, with their numbers."""
+    for number, line in enumerate(io.StringIO(text, None), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line
 
 
 def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:

@@ -68,7 +68,7 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
         ("me", "a face was found in only 0 images"),
         ("silent", "must have images and audio"),
         ("text", "this is text, not sound"),
-        ("nobody", "No such file"),
+        ("nobody", "no such file"),
     ):
         with pytest.raises(UserError, match=message):
             run(track_app, tmp_path / f"{name}.mp4", "-o", tmp_path / "out")

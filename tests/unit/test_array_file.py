@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from kouxing.shared.array_file import read_arrays
+from kouxing.shared.errors import UserError
 
 MIB = 1024 * 1024
 
@@ -30,7 +31,7 @@ def npy(array: np.ndarray, **header: object) -> bytes:
 def test_arrays_round_trip(tmp_path: Path) -> None:
     arrays = {"a": np.arange(6).reshape(2, 3), "b": np.array("text"), "c": np.zeros((0, 4))}
     np.savez_compressed(tmp_path / "a.npz", allow_pickle=False, **arrays)
-    again = read_arrays(tmp_path / "a.npz", MIB)
+    again = read_arrays(tmp_path / "a.npz", MIB, "a model")
     assert again.keys() == arrays.keys()
     for name, array in arrays.items():
         np.testing.assert_array_equal(again[name], array)
@@ -53,7 +54,7 @@ def test_rejects_a_damaged_or_huge_array_before_unpacking_it(
     with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
         archive.writestr("format.npy", content)
     tracemalloc.start()
-    with pytest.raises(ValueError, match=r".+"):
-        read_arrays(tmp_path / "a.npz", 2 * MIB)
+    with pytest.raises(UserError, match="not a model"):
+        read_arrays(tmp_path / "a.npz", 2 * MIB, "a model")
     assert tracemalloc.get_traced_memory()[1] < MIB
     tracemalloc.stop()

@@ -73,11 +73,14 @@ def test_rejects_invalid_profiles(content: bytes, message: str) -> None:
 
 def test_reads_only_small_files_that_start_like_a_profile(tmp_path: Path) -> None:
     path = tmp_path / "me.mouth"
-    with pytest.raises(UserError, match="No such file"):
+    with pytest.raises(UserError, match="no such file"):
         read_mouth_profile(path)
-    for content in (b"RIFF", CONTENT + bytes(65536)):
+    for content, message in (
+        (b"RIFF", "is not a mouth profile"),
+        (CONTENT + bytes(65536), "larger than 64 KiB"),
+    ):
         path.write_bytes(content)
-        with pytest.raises(UserError, match="is not a mouth profile"):
+        with pytest.raises(UserError, match=message):
             read_mouth_profile(path)
     path.write_bytes(CONTENT)
     assert read_mouth_profile(path) == CONTENT

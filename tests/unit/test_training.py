@@ -89,7 +89,7 @@ def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
     assert "line 3 (u3): no text" in errors.messages[1]
     assert read_corpus(held_out, RowErrors(), MANDARIN, split="train") == []
     (held_out / "text").unlink()
-    with pytest.raises(UserError, match=r"cannot read .*text: "):
+    with pytest.raises(UserError, match="text: no such file"):
         read_corpus(held_out, RowErrors(), MANDARIN)
     (held_out / "segments").write_text("u1-1 u1 0 1\n")
     with pytest.raises(UserError, match="segments"):
@@ -116,7 +116,7 @@ def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="lacks the columns pinyin or text"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))
-    with pytest.raises(UserError, match="not UTF-8"):
+    with pytest.raises(UserError, match="not text in UTF-8"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from kouxing_client.errors import KouxingError
 
 _FILE = "client.key"
+_MAX_BYTES = 1000
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ def find_key() -> Key:
     return read_key(folder / "kouxing" / _FILE)
 
 
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # a FIFO would wait for its writer
+
+
 def read_key(path: str | Path) -> Key:
     """Read a key file.
 
@@ -49,14 +54,15 @@ def read_key(path: str | Path) -> Key:
         If it cannot be read, or is not a key file.
     """
     try:
-        fields = json.loads(Path(path).read_text(encoding="ascii"))
+        with open(path, "rb", opener=_open_at_once) as file:
+            fields = json.loads(file.read(_MAX_BYTES))
         key = Key(*(fields[name] for name in ("public", "secret", "control")))
     except OSError as error:
         raise KouxingError(
             f"{path}: {error.strerror}. 'kouxing run' writes this file on its own machine. For "
             "another machine, run 'kouxing keys add NAME --role client' there and copy the file"
         ) from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise KouxingError(f"{path} is not a key file") from None
     if not all(isinstance(part, str) and len(part) == 40 for part in vars(key).values()):
         raise KouxingError(f"{path} is not a key file")

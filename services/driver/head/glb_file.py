@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import struct
 import urllib.parse
 from collections.abc import Iterable
@@ -20,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import parse_json, read_file
 
-MAX_BYTES = 512 * 1024 * 1024
+MAX_BYTES = 512 << 20  # of all files, unpacked
 MAX_COUNT = 2_000_000  # elements of an accessor
 MAX_NODES = 20_000
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -38,10 +37,6 @@ Float64 = NDArray[np.float64]
 
 class BadGlbError(Exception):
     """Says what is wrong with the file."""
-
-
-def _reject_constant(word: str) -> float:
-    raise ValueError(f"{word} is not valid JSON")
 
 
 def _chunks(data: bytes) -> dict[bytes, bytes]:
@@ -80,9 +75,9 @@ class Glb:
             chunks = _chunks(data)
             text, self._binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
         try:
-            self.json: dict[str, Any] = json.loads(text, parse_constant=_reject_constant)
+            self.json: dict[str, Any] = parse_json(text)
             needed = set(self.json.get("extensionsRequired", ()))
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, AttributeError) as error:
             raise BadGlbError("its glTF description is damaged") from error
         unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOKS)}
         if unknown:
@@ -97,12 +92,9 @@ class Glb:
             raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB")
 
     def _read(self, path: Path) -> bytes:
-        try:
-            self._allow(path.stat().st_size)
-            return path.read_bytes()
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise UserError(f"cannot read {path}: {reason}") from error
+        content = read_file(path, MAX_BYTES)
+        self._allow(len(content))
+        return content
 
     def _uri(self, uri: str) -> bytes:
         """Return the data of a URI: base64, or a file in the folder of this file or below."""

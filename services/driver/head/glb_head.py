@@ -35,6 +35,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
+from kouxing.shared.user_file import check_content
 
 EYE_DISTANCE_M = 0.055  # heads are scaled to this
 FAPU_SHARES = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
@@ -61,15 +62,14 @@ def read_glb(path: Path) -> Head:
 
     Raises ``UserError`` if the file is not such a GLB; the text says what is missing.
     """
-    try:
-        glb = Glb(path)
-        with np.errstate(invalid="ignore", over="ignore"):  # the results are checked
-            pieces = read_pieces(glb)
-            return _head(path.stem, glb, pieces, _recognize(pieces))
-    except BadGlbError as error:
-        raise UserError(f"{path}: {error}") from error
-    except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as error:
-        raise UserError(f"{path} is damaged or is not a GLB file ({error!r})") from error
+    with check_content(path, "a GLB file"):
+        try:
+            glb = Glb(path)
+            with np.errstate(invalid="ignore", over="ignore"):  # the results are checked
+                pieces = read_pieces(glb)
+                return _head(path.stem, glb, pieces, _recognize(pieces))
+        except BadGlbError as error:
+            raise UserError(f"{path}: {error}") from error
 
 
 def _recognize(pieces: list[Primitive]) -> Names:

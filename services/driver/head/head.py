@@ -37,6 +37,7 @@ from kouxing.services.driver.head.shading import Shading
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.user_file import check_content
 
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"
@@ -101,14 +102,9 @@ class Head:
                 f"unknown head {str(path)!r}; give the path of a .glb, .gltf, .vrm or .npz, or one"
                 f" of {', '.join(HEAD_NAMES)}"
             )
-        try:
-            return assemble(file.stem, read_arrays(file, MAX_BYTES), detail)
-        except (
-            OSError, ValueError, TypeError, AttributeError, KeyError, IndexError, MemoryError,
-        ) as error:  # fmt: skip
-            raise UserError(
-                f"{file} is damaged or is not a head ({error}); make one with kouxing head import"
-            ) from error
+        expected = "a head; make one with kouxing head import"
+        with check_content(file, expected):
+            return assemble(file.stem, read_arrays(file, MAX_BYTES, expected), detail)
 
     def part(self, name: str) -> HeadPart:
         """Return a part by name."""

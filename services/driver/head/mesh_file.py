@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
 from kouxing.services.driver.head.pieces import Primitive
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import check_content, read_file
 
-MAX_MESH_BYTES = 256 * 1024 * 1024  # size of a file
+MAX_MESH_BYTES = 64 << 20
 MESH_SUFFIXES = (".obj", ".glb", ".ply")
+_PICTURES = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
 _NO_DIFFUSE = [102, 102, 102]  # trimesh's default
 _SKIN_COLOR = (0.58, 0.40, 0.32)  # linear, for meshes without color
 
@@ -29,32 +33,68 @@ def read_mesh(path: Path) -> list[Primitive]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise UserError(f"{path}: give a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
-    if not path.is_file():
-        raise UserError(f"{path}: no such file")
-    if path.stat().st_size > MAX_MESH_BYTES:
-        raise UserError(f"{path} is larger than {MAX_MESH_BYTES // 2**20} MiB; decimate the mesh")
-    try:
+    with check_content(path, "a mesh"):
         if suffix == ".glb":
-            pieces = read_pieces(Glb(path))
+            try:
+                pieces = read_pieces(Glb(path))
+            except BadGlbError as error:
+                raise UserError(f"{path}: {error}") from error
         else:
-            with warnings.catch_warnings(action="ignore"):  # trimesh warns about its own guesses
-                options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
-                scene = trimesh.load_scene(path, process=False, **options)
-            meshes: list[Any] = list(scene.dump())
+            meshes = _load(path, suffix)
             pieces = [_from_trimesh(mesh) for mesh in meshes if len(getattr(mesh, "faces", ()))]
-    except BadGlbError as error:
-        raise UserError(f"{path}: {error}") from error
-    except Exception as error:  # trimesh's loaders raise arbitrary exceptions
-        raise UserError(f"{path} is damaged or is not a mesh ({error})") from error
     if not pieces:
         raise UserError(f"{path} has no faces; export the mesh with its triangles")
     return pieces
 
 
+def _load(path: Path, suffix: str) -> list[Any]:
+    """Read the meshes of an OBJ or PLY file, with the materials and pictures that it names."""
+    content = io.BytesIO(read_file(path, MAX_MESH_BYTES))
+    files = _NamedFiles(str(path))
+    options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
+    with warnings.catch_warnings(action="ignore"):  # trimesh warns about its own guesses
+        scene = trimesh.load_scene(
+            content, file_type=suffix[1:], resolver=files, process=False, **options
+        )
+    if files.error is not None:
+        raise files.error
+    return list(scene.dump())
+
+
+class _NamedFiles(trimesh.resolvers.FilePathResolver):
+    """Reads the files that a mesh names. trimesh ignores errors, so the last one is kept."""
+
+    error: UserError | None = None
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a file in the mesh's folder or below."""
+        path = Path(self.parent, name.strip())
+        try:
+            if not path.resolve().is_relative_to(Path(self.parent).resolve()):
+                raise UserError(f"{self.file_path}: it refers to {name!r} outside its folder")
+            content = read_file(path, MAX_MESH_BYTES)
+            if path.suffix.lower() != ".mtl":
+                _check_picture(path, content)
+        except UserError as error:
+            self.error = error if path.exists() else self.error
+            raise
+        return content
+
+
+def _check_picture(path: Path, content: bytes) -> None:
+    with check_content(path, "a picture"):
+        image = Image.open(io.BytesIO(content), formats=_PICTURES)
+        if image.width * image.height > picture.MAX_PIXELS:
+            raise ValueError(f"it has more than {picture.MAX_PIXELS / 1e6:.0f} million pixels")
+
+
 def _from_trimesh(mesh: Any) -> Primitive:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    triangles = np.asarray(mesh.faces, dtype=np.int64)
     if not np.isfinite(vertices).all():
         raise ValueError("a coordinate is not finite")
+    if triangles.shape[1] != 3 or triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError("a triangle refers to a missing vertex")
     visual, texture = mesh.visual, b""
     uv, colors = np.zeros((len(vertices), 2)), np.full((len(vertices), 3), _SKIN_COLOR)
     if getattr(visual, "uv", None) is not None and len(visual.uv) == len(vertices):
@@ -74,7 +114,7 @@ def _from_trimesh(mesh: Any) -> Primitive:
     return Primitive(
         name=str(mesh.metadata.get("name", "part")),
         vertices=vertices,
-        triangles=np.asarray(mesh.faces, dtype=np.int64),
+        triangles=triangles,
         uv=uv,
         colors=colors,
         texture=texture,
@@ -93,7 +133,8 @@ def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> tuple[Float64, dic
         return np.concatenate([p.vertices for p in pieces]), {p.name: p.vertices for p in pieces}
     rows: list[list[float]] = []
     starts: dict[str, int] = {}
-    for line in mesh.read_text(encoding="utf-8", errors="replace").splitlines():
+    text = read_file(mesh, MAX_MESH_BYTES).decode("utf-8", "replace")
+    for line in io.StringIO(text, None):
         words = line.split()
         if words[:1] == ["v"]:
             try:

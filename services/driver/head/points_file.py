@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import read_file
 
-MAX_BYTES = 16 * 1024 * 1024
+MAX_BYTES = 4 * 1024 * 1024
 # ISO/IEC 14496-2, annex C: number of points per group
 _GROUP_SIZES = {2: 14, 3: 14, 4: 6, 5: 4, 6: 4, 7: 1, 8: 10, 9: 15, 10: 10, 11: 6}
 _LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
@@ -42,12 +43,7 @@ def read_points(path: Path) -> Points:
     Raises ``UserError`` if the file cannot be read or is invalid; the text names the line if
     possible.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path}: too large for a file of feature points")
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    text = read_file(path, MAX_BYTES).decode("utf-8-sig", "replace")
     points = _from_xml(path, text) if text.lstrip().startswith("<") else _from_lines(path, text)
     if not points.places:
         raise UserError(f"{path} has no feature points; write lines such as '2.1 0.0 -0.07 0.07'")

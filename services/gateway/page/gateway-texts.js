@@ -33,8 +33,7 @@ const CHINESE = {
   "{rate} Hz is too low for speech; use {least} Hz or more": "采样率 {rate} Hz 太低，请用 {least} Hz 以上",
   "NaN or infinite samples near {place} s; export the file again, for example as 16-bit PCM":
     "{place} 秒附近有无效采样，请重新导出，例如 16 位 PCM",
-  "cannot read the file: {reason}": "无法读取文件",
-  "the sound is longer than an hour; use a shorter file": "声音长于一小时，请用较短的文件",
+  "the sound is longer than {hours} h; use a shorter file": "声音长于 {hours} 小时，请用较短的文件",
   "another file is being read; try again in a few seconds": "正在读取另一个文件，请几秒后重试",
   "the file is larger than {size} MiB; use a smaller one": "文件大于 {size} MiB，请用较小的文件",
   "this is a big-endian WAV file; export it as wav or flac": "这是大端序的 WAV 文件，请导出为 wav 或 flac",

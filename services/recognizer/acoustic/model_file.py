@@ -57,16 +57,11 @@ class Archive:
 
 def read_archive(path: Path) -> Archive:
     """Read a model file; ``UserError`` if it is missing or is not one."""
-    try:
-        return Archive(read_arrays(path, MAX_BYTES))
-    except OSError as error:
+    if not path.exists():
         raise UserError(
             f"there is no acoustic model at {path}; use blocks, neural, gmm, or a model file"
-        ) from error
-    except ValueError as error:
-        raise UserError(
-            f"{path} is not an acoustic model ({error}); reinstall or train one"
-        ) from error
+        )
+    return Archive(read_arrays(path, MAX_BYTES, "an acoustic model; reinstall or train one"))
 
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

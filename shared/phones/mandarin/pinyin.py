@@ -64,6 +64,7 @@ _SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
 
 _CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
 _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
+_MAX_WORD_LETTERS = 500
 _MAX_LETTERS = 10  # of a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
 _SPACE_BESIDE_CHARACTER = re.compile(f"(?<![{_LATIN}]) | (?![{_LATIN}])")
@@ -220,6 +221,8 @@ def _split_word(word: str) -> list[str]:
 
     Within a word, a syllable that starts with a, o or e follows an apostrophe (GB/T 16159).
     """
+    if len(word) > _MAX_WORD_LETTERS:
+        return []
     if _is_syllable(word):
         return [word]
     for end in range(min(len(word) - 1, _MAX_LETTERS), 0, -1):

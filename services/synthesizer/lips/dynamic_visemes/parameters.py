@@ -6,7 +6,6 @@ for closures C and T; per FAP the silence models; one exponent c.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,8 +17,11 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEMES
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
+from kouxing.shared.user_file import check_content, parse_json, read_text
 
 FORMAT = "kouxing viseme parameters 2"
+_BUILT_IN = Path(__file__).with_name("parameters.json")
+_MAX_BYTES = 1 << 20
 
 PER_VISEME = ("alpha", "theta_minus", "theta_plus", "offset_s", "target", "closes")
 PER_SILENCE = (
@@ -95,8 +97,8 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
 
     Raises ``UserError`` if the file cannot be read, or its contents are invalid.
     """
-    try:
-        data = _read(path)
+    data = _read(path)
+    with check_content(path or _BUILT_IN, "a file of 'kouxing train visemes'"):
         if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
             raise ValueError(f"the format is not '{FORMAT}'")
         _clips_of(data)
@@ -112,13 +114,6 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
             closure_ratio=float(data["closure_ratio"]),
             closure_reach_s=float(data["closure_reach_s"]),
         )
-    except UserError as error:
-        raise UserError(f"{path or 'parameters.json'}: {error}") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"cannot read viseme parameters from {path or 'parameters.json'}: {error}; "
-            "give a file written by 'kouxing train visemes'"
-        ) from error
 
 
 def clips_seen(path: Path | None = None) -> frozenset[str]:
@@ -131,9 +126,10 @@ def _clips_of(data: dict[str, Any]) -> frozenset[str]:
 
 
 def _read(path: Path | None) -> dict[str, Any]:
-    if path is None:
-        path = Path(__file__).with_name("parameters.json")
-    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    path = path or _BUILT_IN
+    text = read_text(path, _MAX_BYTES)
+    with check_content(path, "JSON"):
+        data: dict[str, Any] = parse_json(text)
     return data
 
 
