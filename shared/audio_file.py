@@ -31,7 +31,7 @@ from kouxing.shared.sound_formats import (
     non_audio_kind,
     stated_bytes,
 )
-from kouxing.shared.user_file import open_file
+from kouxing.shared.user_file import check_content, open_file
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # of a session; files above are resampled to it
@@ -98,7 +98,8 @@ def open_audio(
             raise UserError(f"{path}: --rate and --channels apply to raw samples; add --raw")
         return _open_file(file, str(path), name, block_s, track)
 
-    return _with_file(file, open_source)
+    with check_content(path, "audio"):
+        return _with_file(file, open_source)
 
 
 def _with_file(file: BinaryIO, open_source: Callable[[], AudioSource]) -> AudioSource:
@@ -228,7 +229,7 @@ def read_duration_s(path: Path) -> float:
 
     Raises ``UserError`` as ``open_audio``.
     """
-    with open_file(path, MAX_FILE_BYTES) as file:
+    with open_file(path, MAX_FILE_BYTES) as file, check_content(path, "audio"):
         source = _open_file(file, str(path), path.name, block_s=1.0, track=None)
         num_samples = 0
         if source.duration_s is None:
@@ -238,7 +239,7 @@ def read_duration_s(path: Path) -> float:
 
 def check_video(path: Path) -> None:
     """Raise ``UserError`` if a file is not a video with audio."""
-    with open_file(path, MAX_FILE_BYTES) as file:
+    with open_file(path, MAX_FILE_BYTES) as file, check_content(path, "audio"):
         begin = file.read(NUM_BEGIN_BYTES)
         file.seek(0)
         is_video = has_video(file, str(path), begin)

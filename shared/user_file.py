@@ -82,7 +82,7 @@ def check_content(path: Path, expected: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        reason = str(error) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         if isinstance(error, KeyError):
             reason = f"it lacks {reason}"
         raise UserError(f"{path}: the file is damaged or is not {expected} ({reason})") from error

@@ -45,6 +45,8 @@ def test_arrays_round_trip(tmp_path: Path) -> None:
         (npy(np.zeros(4, "<f4")), zipfile.ZIP_LZMA),
         (b"\x93NUMPY\x09\x09", zipfile.ZIP_DEFLATED),
         (b"no array", zipfile.ZIP_DEFLATED),
+        (npy(np.zeros(4)).replace(b"}", b" "), zipfile.ZIP_DEFLATED),
+        (npy(np.zeros(0, "S1"), shape=(2**40,), descr="|S0"), zipfile.ZIP_DEFLATED),
         (npy(np.zeros(4 * MIB)), zipfile.ZIP_DEFLATED),
     ],
 )

@@ -190,6 +190,10 @@ def exchange(rows: str, *names: str) -> str:
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+)
 LARGE = "".join(f"v {n} {n % 2} 0\n" for n in range(65_538)) + "".join(
     f"f {n} {n + 1} {n + 2}\n" for n in range(1, 65_538, 3)
 )
@@ -201,6 +205,9 @@ LARGE = "".join(f"v {n} {n % 2} 0\n" for n in range(65_538)) + "".join(
         ("no_faces.obj", TRIANGLE, "has no faces"),
         ("garbage.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", "damaged or is not a mesh"),
         ("large.obj", LARGE, "65538 vertices; reduce it to at most 65535"),
+        ("missing.ply", PLY + "3 0 1 3\n", "refers to a missing vertex"),
+        ("negative.ply", PLY + "3 -1 0 1\n", "refers to a missing vertex"),
+        ("words.obj", "f 1 " * 1_500_001, "more than 3000000 words"),
         ("nameless.obj", TRIANGLE + "f 1 2 3\n", "points are missing"),
         ("flat.OBJ", TRIANGLE + "f 1 2 3\nv 7 8\n", "not a (mesh|valid vertex)"),
         ("face.fbx", "", "one of the formats .obj, .glb, .ply"),

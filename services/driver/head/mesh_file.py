@@ -18,7 +18,8 @@ from kouxing.services.driver.head.pieces import Primitive
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import check_content, read_file
 
-MAX_MESH_BYTES = 64 << 20
+MAX_MESH_BYTES = 32 << 20
+MAX_WORDS = 3_000_000
 MESH_SUFFIXES = (".obj", ".glb", ".ply")
 _PICTURES = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
 _NO_DIFFUSE = [102, 102, 102]  # trimesh's default
@@ -49,12 +50,14 @@ def read_mesh(path: Path) -> list[Primitive]:
 
 def _load(path: Path, suffix: str) -> list[Any]:
     """Read the meshes of an OBJ or PLY file, with the materials and pictures that it names."""
-    content = io.BytesIO(read_file(path, MAX_MESH_BYTES))
+    content = read_file(path, MAX_MESH_BYTES)
+    if content.count(b" ") + content.count(b"\n") > MAX_WORDS:  # trimesh would need minutes
+        raise UserError(f"{path} has more than {MAX_WORDS} words; decimate the mesh")
     files = _NamedFiles(str(path))
     options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
     with warnings.catch_warnings(action="ignore"):  # trimesh warns about its own guesses
         scene = trimesh.load_scene(
-            content, file_type=suffix[1:], resolver=files, process=False, **options
+            io.BytesIO(content), file_type=suffix[1:], resolver=files, process=False, **options
         )
     if files.error is not None:
         raise files.error
