@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from functools import partial
 from math import prod
@@ -54,5 +55,6 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any
         if stream.tell() + prod(shape) * max(1, kind.itemsize) > entry.file_size:
             raise ValueError(f"{entry.filename} is cut off")
     with archive.open(entry) as stream:
-        array: NDArray[Any] = npy.read_array(stream, allow_pickle=False)
+        content = io.BytesIO(stream.read(entry.file_size))  # at once, so that other threads run
+        array: NDArray[Any] = npy.read_array(content, allow_pickle=False)
         return array

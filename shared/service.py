@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
@@ -27,7 +27,6 @@ from kouxing.shared.keys import Grant, Peer, load_key, rejection_hint, save_gran
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.metrics import LoadMeter, memory_mb, trim_heap
-from kouxing.shared.prometheus import MetricsServer
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import (
@@ -42,6 +41,9 @@ from kouxing.shared.wire.control import (
 )
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession, SessionFacts
+
+if TYPE_CHECKING:
+    from kouxing.shared.prometheus import MetricsServer
 
 TICK_S = 0.01
 HEARTBEAT_S = 0.25
@@ -192,6 +194,8 @@ class Service(MessageLoop):
         """Register with control."""
         self.on_startup()
         if self.config.metrics_port:
+            from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
+
             self._tick_due_s = time.monotonic()
             self._metrics_server = MetricsServer(
                 self.config.metrics_host,

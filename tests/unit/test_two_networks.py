@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_model, with_early_network
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
@@ -21,7 +21,8 @@ pytestmark = [pytest.mark.usefixtures("one_thread")]
 
 @cache
 def two_networks() -> TwoNetworks:
-    return cast(TwoNetworks, with_early_network(blocks()))
+    early, late = cast(NeuralModel, load_model()), blocks()
+    return TwoNetworks(topology=late.topology, early=early, late=late)
 
 
 def test_the_newest_frames_have_causal_scores() -> None:

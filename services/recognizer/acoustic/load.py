@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
@@ -63,16 +64,15 @@ def load_model(path: Path = NEURAL_PATH, *, look_ahead_ms: float | None = None) 
 def load_live_model(
     name: str = DEFAULT_MODEL, *, look_ahead_ms: float | None = None
 ) -> AcousticModel:
-    """Read a model by its name or path, as the recognizer runs it; raises as ``load_model``."""
-    model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
-    return with_early_network(model, look_ahead_ms=look_ahead_ms)
+    """Read a model by its name or path, as the recognizer runs it; raises as ``load_model``.
 
-
-def with_early_network(
-    model: AcousticModel, *, look_ahead_ms: float | None = None
-) -> AcousticModel:
-    """Combine a block model with the shipped causal network; return other models unchanged."""
-    if not isinstance(model, blocks.BlockModel):
-        return model
-    early = load_model(look_ahead_ms=look_ahead_ms)
-    return TwoNetworks(topology=model.topology, early=cast(neural.NeuralModel, early), late=model)
+    A block model runs together with the shipped causal network.
+    """
+    with ThreadPoolExecutor(max_workers=1) as executor:  # both at the same time
+        early = executor.submit(load_model, look_ahead_ms=look_ahead_ms)
+        model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
+        if not isinstance(model, blocks.BlockModel):
+            return model
+        return TwoNetworks(
+            topology=model.topology, early=cast(neural.NeuralModel, early.result()), late=model
+        )
