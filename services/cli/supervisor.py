@@ -25,7 +25,7 @@ from kouxing.shared.errors import UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
-STEADY_S = 30.0  # a service that has run for longer restarts without delay
+STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
 USER_ERROR = 2  # exit status of a service with a wrong configuration
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")

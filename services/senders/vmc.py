@@ -18,8 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import ClassVar
 
-from scipy.spatial.transform import Rotation
-
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
 from kouxing.services.senders.face_frame import Angles, FaceFrame
 from kouxing.services.senders.osc import bundles, message
@@ -60,6 +58,8 @@ class VmcConnection(DatagramConnection):
 
 def _quaternion(angles: Angles) -> tuple[float, float, float, float]:
     """Return x, y, z, w of yaw * pitch * roll in Unity's axes."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - slow, and the gateway imports us
+
     pitch, yaw, roll = angles
     x, y, z, w = Rotation.from_euler("YXZ", [-yaw, pitch, -roll]).as_quat().tolist()
     return x, y, z, w
