@@ -27,6 +27,7 @@ from kouxing.shared.logs import LOG, configure
 
 MAX_QUEUED_FRAMES = 180_000  # of one video: an hour at 50 frames per second, 75 MB
 MAX_TURN = 500  # commands before the next image
+ALIVE_S = 1.0  # between two reports that the process runs
 
 
 class Recorder:
@@ -124,7 +125,7 @@ class Recorder:
 def run(connection: Connection, config: DriverConfig) -> None:
     """Process main: call the methods of a ``Recorder`` that arrive, until None or the end arrives.
 
-    Videos that are unfinished then end early.
+    Videos that are unfinished then end early. Reports ``("alive",)`` about once a second.
     """
     os.setsid()  # Ctrl-C in the terminal reaches only the driver, which stops this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
@@ -145,7 +146,8 @@ def run(connection: Connection, config: DriverConfig) -> None:
     try:
         while True:
             for _ in range(MAX_TURN):
-                if not connection.poll(0.0 if is_drawing else None):
+                if not connection.poll(0.0 if is_drawing else ALIVE_S):
+                    report("alive")
                     break
                 command = connection.recv()
                 if command is None:
@@ -156,4 +158,5 @@ def run(connection: Connection, config: DriverConfig) -> None:
     except (EOFError, OSError):
         LOG.warning("the driver ended, so its videos end early")
     finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         recorder.close_early()

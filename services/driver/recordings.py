@@ -19,8 +19,12 @@ from kouxing.services.driver.video.writer import remove_unfinished
 MAX_KEY_SHARE = 0.75  # of the videos, for one key
 MAX_QUEUED = 100_000  # commands that the process has not read
 IDLE_S = 10.0  # without a video, until the process ends and its memory is free
+HANG_S = 600.0  # without a report; completing a long video may take minutes
+MAX_TICK_S = 0.1  # a longer pause was the driver's
 CLOSE_LIMIT_S = 3.0
 KILL_LIMIT_S = 1.0
+HANGS = "the process that draws videos hangs; record again"
+ENDED = "the process that draws videos has ended; see the driver's log, and record again"
 
 _SPAWN = multiprocessing.get_context("spawn")
 
@@ -72,6 +76,7 @@ class Recordings:
         self._unfinished: dict[int, tuple[str, str]] = {}  # session and key by number
         self._recorder: _RecorderProcess | None = None
         self._busy_s = 0.0  # when a video was last unfinished
+        self._ticked_s = self._silent_s = 0.0  # the last tick; time since the last report
 
     @property
     def unfinished(self) -> list[str]:
@@ -105,7 +110,8 @@ class Recordings:
             return
         number = self._open[session] = next(self._numbers)
         self._unfinished[number] = session, key
-        self._recorder = self._recorder or _RecorderProcess(self._config)
+        if self._recorder is None:
+            self._recorder, self._silent_s = _RecorderProcess(self._config), 0.0
         self._send(session, "begin", key, path)
 
     def add_frame(self, session: str, time_s: float, values: bytes) -> None:
@@ -125,8 +131,12 @@ class Recordings:
         """Handle what the process reports, and end it when it has been idle for a while."""
         if self._recorder is None:
             return
+        self._silent_s += min(now_s - self._ticked_s, MAX_TICK_S)
+        self._ticked_s = now_s
         self._receive(timeout_s=0.0)
-        if self._unfinished:
+        if self._silent_s > HANG_S:
+            self._fail_all(HANGS)
+        elif self._unfinished:
             self._busy_s = now_s
         elif now_s > self._busy_s + IDLE_S:
             self._kill()
@@ -136,8 +146,7 @@ class Recordings:
         if self._recorder is not None:
             self._recorder.commands.put(None)
             while self._unfinished and self._receive(CLOSE_LIMIT_S):
-                pass
-            self._kill()
+                pass  # if it takes longer, the process ends by itself
 
     def _send(self, session: str, command: str, *arguments: object) -> None:
         number = self._open.get(session)
@@ -145,7 +154,7 @@ class Recordings:
             return
         self._recorder.commands.put((command, number, *arguments))
         if self._recorder.commands.qsize() > MAX_QUEUED:
-            self._fail_all("the process that draws videos hangs")
+            self._fail_all(HANGS)
 
     def _receive(self, timeout_s: float) -> bool:
         """Handle the reports that arrive until the timeout; return whether there was one."""
@@ -155,10 +164,13 @@ class Recordings:
                 self._on_report(*self._recorder.connection.recv())
                 has_received, timeout_s = True, 0.0
         except (EOFError, OSError):
-            self._fail_all("the process that draws videos has ended; see the driver's log")
+            self._fail_all(ENDED)
         return has_received
 
-    def _on_report(self, kind: str, number: int, detail: Any = None) -> None:
+    def _on_report(self, kind: str, number: int = -1, detail: Any = None) -> None:
+        self._silent_s = 0.0
+        if kind == "alive":
+            return
         session, _ = self._unfinished[number]
         if kind == "image":
             self._on_image()

@@ -7,6 +7,7 @@ Emits: session-started, recorded, error (control).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode
 
 LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
+MAX_DRAIN_S = 3.0  # for the remaining images when the driver stops; then the videos end early
 RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
 
 
@@ -57,6 +59,7 @@ class DriverService(Service):
         self._config = config
         self._sessions: dict[str, _FollowedSession] = {}
         self._was_stalled = False
+        self._drain_until_s = math.inf
         self.poses = Poses(config.session, config.idle_motion_seed)
         self.view = View(config, self.poses.switch)
         self.recordings = Recordings(
@@ -126,8 +129,10 @@ class DriverService(Service):
         """Finish the open videos."""
         for session in list(self._sessions.values()):
             self._leave(session)
-        self.recordings.tick(time.monotonic())
-        return not self.recordings.unfinished
+        now_s = time.monotonic()
+        self.recordings.tick(now_s)
+        self._drain_until_s = min(self._drain_until_s, now_s + MAX_DRAIN_S)
+        return not self.recordings.unfinished or now_s > self._drain_until_s
 
     def on_shutdown(self) -> None:
         """Save the unfinished part of the remaining videos."""
