@@ -62,6 +62,11 @@ class Utterance:
     phones: tuple[int, ...] = ()  # indices into the inventory's phones
     syllables: tuple[int, ...] = ()  # number of phones in each syllable
 
+    @property
+    def minutes(self) -> float:
+        """Duration of the recording."""
+        return self.seconds / 60
+
 
 def syllables_of(utterance: Utterance, inventory: PhoneInventory) -> list[Syllable]:
     """Return the syllables of a recording's text, each with its phones."""

@@ -11,7 +11,7 @@ import typer
 
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.terminal import Force, check_output, print_message
+from kouxing.shared.terminal import CONSOLE, Force, check_output, print_message
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
@@ -45,10 +45,13 @@ Untranscribed = Annotated[
         help="Folder of recordings in any language, for the teacher to label; repeatable."
     ),
 ]
+Sounds = Annotated[
+    list[Path], typer.Option(help="Folder of music, noise and laughter; repeatable.")
+]
 
 
 @contextmanager
-def _neural_training(output: Path, *, force: bool) -> Iterator[None]:
+def _neural_training(output: Path | None = None, *, force: bool = False) -> Iterator[None]:
     """Check the output, and explain how to install a missing package."""
     check_output(output, force=force)
     try:
@@ -193,6 +196,57 @@ def blocks(
         num_steps=steps,
         shipping=not any_license,
     )
+
+
+@app.command()
+def ear(
+    corpus: Corpora,
+    output: Model,
+    whisper: Whisper,
+    sounds: Sounds,
+    untranscribed: Untranscribed = None,
+    clips: Annotated[
+        Path | None, typer.Option(help="Folder of clips with tracked lips, for their speech.")
+    ] = None,
+    seed: Seed = 0,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Number of batches of 140 s of audio.")
+    ] = 20_000,
+    any_license: AnyLicense = False,
+    force: Force = False,
+) -> None:
+    """Train the small ear, a network for lips and voice, and write its model card.
+
+    Repeat the command to resume an interrupted run.
+    """
+    with _neural_training(output, force=force):
+        from kouxing.training.ear.recipe import Sources, train_ear
+
+    sources = Sources(
+        corpora=corpus,
+        untranscribed=untranscribed or [],
+        clips=clips,
+        sounds=sounds,
+        shipping=not any_license,
+    )
+    train_ear(sources, output, whisper=whisper, seed=seed, num_steps=steps)
+
+
+@app.command()
+def ear_report(
+    model: Annotated[Path, typer.Argument(help="Model file, or checkpoint of the training (.pt).")],
+    corpus: Corpora,
+    whisper: Whisper,
+    sounds: Sounds,
+    clips: Clips,
+) -> None:
+    """Compare the small ear with Silero and the causal network on held-out audio."""
+    with _neural_training():
+        from kouxing.training.ear.recipe import Sources
+        from kouxing.training.ear.report import report_ear
+
+    sources = Sources(corpora=corpus, clips=clips, sounds=sounds)
+    report_ear(model, sources, whisper=whisper, console=CONSOLE)
 
 
 @app.command()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.training.search_weights import SearchWeights
 from kouxing.training.training_set import Example
 
@@ -17,7 +17,7 @@ def write_card(
     *,
     title: str,
     details: str,
-    recordings: Sequence[Example] | Sequence[LipClip],
+    recordings: Sequence[Example] | Sequence[LipClip] | Sequence[Utterance],
     errors: RowErrors | None = None,
     chosen: SearchWeights | None = None,
     notes: str = "",
@@ -27,7 +27,7 @@ def write_card(
     ``details`` describe the training as part of a sentence. ``chosen`` are the search weights, if
     they were chosen on development data.
     """
-    by_license: dict[str, list[Example | LipClip]] = defaultdict(list)
+    by_license: dict[str, list[Example | LipClip | Utterance]] = defaultdict(list)
     for recording in recordings:
         by_license[recording.license or "none given"].append(recording)
     rows = [

@@ -88,17 +88,11 @@ def load_examples(
     log_mels: list[NDArray[np.float16] | None] = []
     sounds: list[NDArray[np.int16]] = []
     for corpus in corpora:
-        rows = read_corpus(corpus, errors, inventory, split=split)
-        for row in rows:
-            if shipping and not may_ship(row.license):
-                license_name = row.license or "none"
-                problem = f"its license ({license_name}) does not allow distributing a model"
-                errors.add(row.utterance_id, problem)
-        rows = [row for row in rows if not shipping or may_ship(row.license)]
+        rows = read_utterances(corpus, errors, inventory, split=split, shipping=shipping)
         utterances += rows
         log_mels += log_mel_of(rows, errors)
         sounds += samples_of(rows) if with_samples else [_NO_SAMPLES] * len(rows)
-    weights = _weights(utterances)
+    weights = weights_of(utterances)
     examples = []
     for utterance, weight, log_mel, sound in zip(
         utterances, weights, log_mels, sounds, strict=True
@@ -126,7 +120,21 @@ def load_examples(
     return examples
 
 
-def _weights(utterances: Sequence[Utterance]) -> list[float]:
+def read_utterances(
+    corpus: Path, errors: RowErrors, inventory: PhoneInventory, *, split: str, shipping: bool
+) -> list[Utterance]:
+    """Read the list of a corpus; the arguments are those of :func:`load_examples`."""
+    rows = read_corpus(corpus, errors, inventory, split=split)
+    for row in rows:
+        if shipping and not may_ship(row.license):
+            license_name = row.license or "none"
+            problem = f"its license ({license_name}) does not allow distributing a model"
+            errors.add(row.utterance_id, problem)
+    return [row for row in rows if not shipping or may_ship(row.license)]
+
+
+def weights_of(utterances: Sequence[Utterance]) -> list[float]:
+    """Return the weight of each recording, as above."""
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60

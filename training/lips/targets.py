@@ -33,7 +33,7 @@ _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
 
 
-def _opening(clip: LipClip) -> Array:
+def opening_of(clip: LipClip) -> Array:
     """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
     upper, lower = (MOUTH_FAPS.index(fap) for fap in (4, 5))
     return -clip.faps[:, upper] - clip.faps[:, lower]
@@ -43,7 +43,7 @@ def closed_below(clips: Sequence[LipClip]) -> dict[str, float]:
     """Measure the opening, FAP units, below which the lips of each speaker touch."""
     by_speaker: dict[str, list[Array]] = defaultdict(list)
     for clip in clips:
-        by_speaker[clip.speaker].append(_opening(clip))
+        by_speaker[clip.speaker].append(opening_of(clip))
     limits = {}
     for speaker, heights in by_speaker.items():
         known = np.concatenate(heights)
@@ -68,7 +68,7 @@ def targets_at(
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
     faps = [interpolate_track(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]
-    height = interpolate_track(clip.time_s, _opening(clip), time_s)
+    height = interpolate_track(clip.time_s, opening_of(clip), time_s)
     closure = np.where(np.isnan(height), np.nan, height < closed_at)
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
     for phone in phones or ():

@@ -1,0 +1,1 @@
+"""Training of the small ear: one network for lips, voice, pitch and effort."""

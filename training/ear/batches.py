@@ -1,0 +1,138 @@
+"""Batches for the small ear: disturbed speech with the targets of the clean recordings.
+
+An excerpt joins recordings, with pauses between some of them. Its speed is drawn, which also moves
+pitch and formants. Then it gets music, voices or noise in the background, and the disturbances of
+:mod:`kouxing.training.neural.augmentation`. Some excerpts contain only a background. Every batch
+has its own random generator, so resumed training gives the same network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.training.ear.network import NUM_INPUTS
+from kouxing.training.ear.targets import PITCH, VOICE, Piece, Samples, Voice
+from kouxing.training.ear.teachers import POSITION_SAMPLES
+from kouxing.training.neural.augmentation import Sound, change_speed, disturb, scale_level
+
+Floats = NDArray[np.float32]
+
+NUM_POSITIONS = 250  # of an excerpt, 5 s
+NUM_EXCERPTS = 28
+BATCH_S = NUM_EXCERPTS * NUM_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
+_MAX_SPEED = 1.3
+_MAX_PIECE = 400  # positions of a recording in an excerpt
+_PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
+_LEVEL_DB = 5.0  # deviation of the levels of recordings in an excerpt
+_MIDDLE = 0.875  # of a position's frames, positions after its first sample
+_CLEAN_PROB, _ONLY_BACKGROUND_PROB, _BACKGROUND_PROB = 0.15, 0.08, 0.65
+_VOICES_PROB, _MAX_VOICES = 0.35, 6  # of a background: other people speak
+_MIN_SNR_DB, _MAX_SNR_DB = 0.0, 25.0
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """The recordings and sounds of batches."""
+
+    pieces: Sequence[Piece]
+    backgrounds: Sequence[Samples]  # music and noise
+
+    def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
+        """Draw a piece; ``probs`` are the cumulative probabilities."""
+        return self.pieces[int(np.searchsorted(probs, rng.random() * probs[-1]))]
+
+
+def batch_of(material: Material, seed: int, number: int) -> tuple[Tensor, Tensor]:
+    """Draw the batch with this number: inputs, (batch, positions, 160), and targets."""
+    rng = np.random.default_rng([seed, number])
+    probs = np.cumsum([piece.weight for piece in material.pieces])
+    excerpts = [_excerpt(material, probs, rng) for _ in range(NUM_EXCERPTS)]
+    inputs, targets = (np.stack(arrays) for arrays in zip(*excerpts, strict=True))
+    return torch.from_numpy(inputs), torch.from_numpy(targets)
+
+
+def inputs_of(samples: Floats) -> Floats:
+    """Compute the network's inputs from samples at 16 kHz, (positions, 160)."""
+    frames = WhisperMel().accept_waveform(samples)[1:]
+    return frames[: len(frames) // 2 * 2].reshape(-1, NUM_INPUTS)
+
+
+def _excerpt(
+    material: Material, probs: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    samples, targets = _speech(material, probs, rng)
+    sound, speed = change_speed(samples, rng)
+    if rng.random() < _ONLY_BACKGROUND_PROB:
+        targets[:] = np.nan
+        targets[:, VOICE] = Voice.NONE
+        sound = _add_background(sound, material, rng, 0.0, with_voices=False) - sound
+    elif rng.random() >= _CLEAN_PROB:
+        if rng.random() < _BACKGROUND_PROB:
+            snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
+            sound = _add_background(sound, material, rng, snr_db, with_voices=True)
+        sound = disturb(sound, rng)
+    inputs = inputs_of(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
+    at = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
+    chosen = targets[np.clip(np.rint(at).astype(np.int64), 0, len(targets) - 1)]
+    chosen[:, PITCH] += np.float32(np.log2(speed))
+    return inputs, chosen
+
+
+def _speech(
+    material: Material, probs: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Join recordings and pauses that fill an excerpt at any speed."""
+    sounds: list[Floats] = []
+    rows: list[Floats] = []
+    missing = int(NUM_POSITIONS * _MAX_SPEED)
+    while missing > 0:
+        piece = material.draw(rng, probs)
+        size = min(len(piece.targets), _MAX_PIECE, missing)
+        start = int(rng.integers(len(piece.targets) - size + 1))
+        sound = as_floats(piece.samples[POSITION_SAMPLES * start :][: POSITION_SAMPLES * size])
+        gain = 10 ** (rng.normal(0.0, _LEVEL_DB) / 20) / (np.sqrt(np.mean(sound**2)) + _TINY)
+        sounds.append(np.float32(gain) * sound)
+        rows.append(piece.targets[start : start + size].astype(np.float32))
+        missing -= size
+        if rng.random() < _PAUSE_PROB:
+            size = int(rng.integers(_MAX_PAUSE))
+            pause = np.full((size, rows[0].shape[1]), np.nan, np.float32)
+            pause[:, VOICE] = Voice.NONE
+            rows.append(pause)
+            sounds.append(np.zeros(POSITION_SAMPLES * size, np.float32))
+            missing -= size
+    spare = np.zeros(2 * POSITION_SAMPLES, np.float32)  # for the last positions' windows
+    return np.concatenate([*sounds, spare]), np.concatenate(rows)
+
+
+def _add_background(
+    sound: Sound, material: Material, rng: np.random.Generator, snr_db: float, *, with_voices: bool
+) -> Sound:
+    """Add music, noise or other voices, ``snr_db`` below a sound."""
+    if with_voices and rng.random() < _VOICES_PROB:
+        numbers = rng.integers(len(material.pieces), size=int(rng.integers(1, _MAX_VOICES + 1)))
+        others = [material.pieces[number].samples for number in numbers]
+    else:
+        others = [material.backgrounds[int(rng.integers(len(material.backgrounds)))]]
+    return mix(sound, others, snr_db, rng)
+
+
+def mix(sound: Sound, others: Sequence[Samples], snr_db: float, rng: np.random.Generator) -> Sound:
+    """Add other sounds of equal levels, together ``snr_db`` below a sound, from random starts."""
+    background = np.zeros(len(sound))
+    for other in others:
+        turned = np.roll(other, -int(rng.integers(len(other))))
+        repeated = as_floats(np.resize(turned, len(sound)))
+        background += repeated / (np.sqrt(np.mean(repeated**2)) + _TINY)
+    level = np.sqrt(np.mean(np.square(sound)) / (np.mean(background**2) + _TINY))
+    return np.asarray(sound + level * 10 ** (-snr_db / 20) * background)

@@ -1,0 +1,125 @@
+"""Export the small ear to ONNX, and write its model file.
+
+The graph computes one step for any number of sessions.
+
+=========== ================================================================ =====================
+symbol      meaning                                                          shape
+=========== ================================================================ =====================
+frames      the two newest log-mel frames, the older one first               (sessions, 160)
+state       states of both recurrent layers                                  (sessions, 2 width)
+features    components of the causal network and of Whisper's encoder: the   (sessions, 256)
+            inputs of a lip model
+phones      log posteriors                                                   (sessions, phones)
+voice       probabilities of no voice, speech, sung or held voice, laughter  (sessions, 4)
+scalars     probability of voicing; pitch, log2 of Hz; level; effort         (sessions, 4)
+new_state   states after the step                                            (sessions, 2 width)
+=========== ================================================================ =====================
+
+Products use 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from pickle import UnpicklingError
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
+from kouxing.shared.errors import UserError
+from kouxing.training.ear.network import MEAN_PITCH, NUM_INPUTS, NUM_OTHER_OUTPUTS, Ear
+from kouxing.training.ear.targets import NUM_COMPONENTS, Voice
+from kouxing.training.neural.onnx_graph import Floats, Graph, arrays_of, floats
+
+FORMAT = "ear 1"
+_AVERAGED = "module."  # prefix of the averaged weights in a checkpoint
+
+
+def save_ear(path: Path, ear: Ear) -> None:
+    """Write the model as an npz file (arrays only, no pickle)."""
+    write_archive(path, {"format": np.array(FORMAT), "network": onnx_of(ear)})
+
+
+def load_ear(path: Path) -> NDArray[np.uint8]:
+    """Read the network of a model file, or of a checkpoint of the training (.pt).
+
+    Raises UserError if the file cannot be read.
+    """
+    try:
+        if path.suffix != ".pt":
+            return read_archive(path).array("network", None)
+        averaged = torch.load(path, weights_only=True)["averaged"]
+        state = {
+            name.removeprefix(_AVERAGED): array
+            for name, array in averaged.items()
+            if name.startswith(_AVERAGED)
+        }
+        num_phones = len(state["output.bias"]) - NUM_OTHER_OUTPUTS
+        ear = Ear(num_phones, width=len(state["entry.bias"]))
+        ear.load_state_dict(state)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except (KeyError, RuntimeError, UnpicklingError, ValueError) as error:
+        raise UserError(f"{path} is not a small ear; give a file of 'kouxing train ear'") from error
+    return onnx_of(ear)
+
+
+def onnx_of(ear: Ear) -> NDArray[np.uint8]:
+    """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
+    return _EarGraph(ear).file_of_step()
+
+
+class _EarGraph(Graph):
+    def __init__(self, ear: Ear) -> None:
+        super().__init__()
+        self._parameters = arrays_of(ear)
+        self._width = len(self._parameters["entry.bias"])
+        self._num_phones = ear.columns.num_phones
+
+    def file_of_step(self) -> NDArray[np.uint8]:
+        """Write all nodes; return the file."""
+        width, features = self._width, 2 * NUM_COMPONENTS
+        entered = self.node("Relu", [self.product("frames", self._parameters, "entry")])
+        states = self.split("state", ["first_state", "second_state"])
+        first = self._step(entered, states[0], "first")
+        second = self._step(first, states[1], "second")
+        self.node("Concat", [first, second], "new_state", axis=-1)
+        rows = self.product(self.node("Add", [first, second]), self._parameters, "output")
+        sizes = (features, self._num_phones, len(Voice), 1, 3)
+        names = ["features", "phone_logits", "voice_logits", "voicing_logit", "others"]
+        _, phones, voice, voicing, others = self.split(rows, names, *sizes)
+        self.node("LogSoftmax", [phones], "phones", axis=-1)
+        self.node("Softmax", [voice], "voice", axis=-1)
+        offset = self.constant("offset", np.array([MEAN_PITCH, 0, 0], np.float32))
+        parts = [self.node("Sigmoid", [voicing]), self.node("Add", [others, offset])]
+        self.node("Concat", parts, "scalars", axis=-1)
+        inputs = [floats("frames", "sessions", NUM_INPUTS), floats("state", "sessions", 2 * width)]
+        outputs = [
+            floats("features", "sessions", features),
+            floats("phones", "sessions", self._num_phones),
+            floats("voice", "sessions", len(Voice)),
+            floats("scalars", "sessions", 4),
+            floats("new_state", "sessions", 2 * width),
+        ]
+        return self.file("ear", inputs, outputs)
+
+    def _step(self, inputs: str, state: str, name: str) -> str:
+        """Run a recurrent layer for one step: (sessions, width) to its new state."""
+        parts = []
+        for kind, values in (("ih", inputs), ("hh", state)):
+            weights: dict[str, Floats] = {
+                f"{name}.{kind}.{part}": self._parameters[f"{name}.{part}_{kind}_l0"]
+                for part in ("weight", "bias")
+            }
+            gates = self.product(values, weights, f"{name}.{kind}")
+            names = [f"{name}.{kind}.{part}" for part in ("gates", "new")]
+            parts.append(self.split(gates, names, 2 * self._width, self._width))
+        (input_gates, from_input), (state_gates, from_state) = parts
+        gates = self.node("Sigmoid", [self.node("Add", [input_gates, state_gates])])
+        reset, update = self.split(gates, [f"{name}.reset", f"{name}.update"])
+        from_state = self.node("Mul", [reset, from_state])
+        new = self.node("Tanh", [self.node("Add", [from_input, from_state])])
+        kept = self.node("Mul", [update, self.node("Sub", [state, new])])
+        return self.node("Add", [new, kept])

@@ -1,0 +1,132 @@
+"""The small ear in PyTorch: a recurrent network of two million weights, one step every 20 ms.
+
+    a = relu(U x)
+    h1 = GRU(a),  h2 = GRU(h1)
+    y = V (h1 + h2)
+
+======== ================================================================== ==================
+symbol   meaning                                                            shape
+======== ================================================================== ==================
+x        two log-mel frames, 2 p + 1 and 2 p + 2, of position p             (160,)
+y        components of the causal network at position p; at position        (outputs,)
+         p - 2: components of Whisper's encoder, phones and voice classes
+         (logits), voicing (logit), pitch, level, effort
+======== ================================================================== ==================
+
+The audio of a step is known until 65 ms after the middle of position p - 2.
+
+    loss = E(causal) + E(encoder) + H(phones) / 3 + H(voice) + H(voicing) / 3
+           + |pitch| + E(level) / 5 + E(effort) / 5
+
+E are mean squared errors and H cross-entropies. Errors of the pitch are in octaves. Unknown
+targets, which are NaN, are left out.
+
+Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder for statistical
+machine translation" (the GRU); Romero et al. 2015, "FitNets: hints for thin deep nets" (hidden
+layers as targets).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, log_softmax
+
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.training.ear.targets import (
+    EFFORT,
+    LEVEL,
+    NUM_COMPONENTS,
+    PITCH,
+    VOICE,
+    Columns,
+    Voice,
+)
+
+NUM_INPUTS = 2 * NUM_MELS
+LOOK_AHEAD = 2  # positions between the newest one and that of all outputs but the first
+WIDTH = 384
+NUM_OTHER_OUTPUTS = 2 * NUM_COMPONENTS + len(Voice) + 4  # all but the phones
+
+_PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 3, 1 / 3, 1 / 5
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The parts of an output row."""
+
+    causal: Tensor  # (..., 128)
+    encoder: Tensor  # (..., 128)
+    phones: Tensor  # (..., phones) logits
+    voice: Tensor  # (..., 4) logits
+    voicing: Tensor  # (...,) logit
+    pitch: Tensor  # (...,) log2 of Hz, relative to `MEAN_PITCH`
+    level: Tensor  # (...,)
+    effort: Tensor  # (...,)
+
+
+MEAN_PITCH = 7.5  # log2 of Hz
+
+
+class Ear(nn.Module):
+    """The network."""
+
+    def __init__(self, num_phones: int, width: int = WIDTH) -> None:
+        super().__init__()
+        self.columns = Columns(num_phones)
+        self.entry = nn.Linear(NUM_INPUTS, width)
+        self.first = nn.GRU(width, width, batch_first=True)
+        self.second = nn.GRU(width, width, batch_first=True)
+        self.sizes = [NUM_COMPONENTS, NUM_COMPONENTS, num_phones, len(Voice), 1, 1, 1, 1]
+        self.output = nn.Linear(width, sum(self.sizes))
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Compute the output rows: (batch, positions, 160) to (batch, positions, outputs)."""
+        first, _ = self.first(torch.relu(self.entry(inputs)))
+        second, _ = self.second(first)
+        rows: Tensor = self.output(first + second)
+        return rows
+
+    def split(self, rows: Tensor) -> Outputs:
+        """Split output rows into their parts."""
+        *ranges, voicing, pitch, level, effort = torch.split(rows, self.sizes, dim=-1)
+        scalars = (scalar.squeeze(-1) for scalar in (voicing, pitch, level, effort))
+        return Outputs(*ranges, *scalars)
+
+    def loss(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        """Compute the loss of a batch; targets have the shape (batch, positions, columns)."""
+        rows = self(inputs).float()
+        now = self.split(rows)
+        late, before = self.split(rows[:, LOOK_AHEAD:]), targets[:, :-LOOK_AHEAD]
+        phones, pitch, voice = (
+            before[..., self.columns.phones],
+            before[..., PITCH],
+            before[..., VOICE],
+        )
+        entropy = -(log_softmax(late.phones, dim=-1) * phones.nan_to_num()).sum(dim=-1)
+        has_phones = ~phones[..., 0].isnan()  # unlike pauses, which were inserted
+        is_voiced = ~pitch.isnan()
+        voicing = binary_cross_entropy_with_logits(
+            late.voicing, is_voiced.float(), reduction="none"
+        )
+        losses = (
+            _squared_error(now.causal, targets[..., self.columns.causal]),
+            _squared_error(late.encoder, before[..., self.columns.encoder]),
+            _PHONES_WEIGHT * _mean(entropy, has_phones),
+            cross_entropy(late.voice.flatten(0, 1), voice.flatten().long()),
+            _VOICING_WEIGHT * _mean(voicing, has_phones),
+            _mean((late.pitch + MEAN_PITCH - pitch.nan_to_num()).abs(), is_voiced),
+            _SCALAR_WEIGHT * _squared_error(late.level, before[..., LEVEL]),
+            _SCALAR_WEIGHT * _squared_error(late.effort, before[..., EFFORT]),
+        )
+        return torch.stack(losses).sum()
+
+
+def _squared_error(outputs: Tensor, targets: Tensor) -> Tensor:
+    return _mean((outputs - targets.nan_to_num()).square(), ~targets.isnan())
+
+
+def _mean(values: Tensor, known: Tensor) -> Tensor:
+    return (values * known).sum() / known.sum().clamp(min=1)

@@ -1,0 +1,64 @@
+"""Sounds without speech: music, noise, babble, laughter, breath.
+
+A folder of sounds has a ``manifest.tsv`` with the columns ``path``, ``kind`` and ``licence``. About
+a quarter of the files of music and noise is held out, by the CRC-32 of their names. The other kinds
+have few files, so the second half of each file is held out.
+"""
+
+from __future__ import annotations
+
+import csv
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.shared.errors import UserError
+from kouxing.training.ear.targets import Samples
+
+_BY_FILE = ("music", "noise")
+
+
+@dataclass(frozen=True, slots=True)
+class Sound:
+    """A sound, or one half of a sound."""
+
+    name: str
+    kind: str
+    samples: Samples
+    is_held_out: bool
+
+
+def read_sounds(folders: Sequence[Path], shipping: bool) -> list[Sound]:
+    """Read folders; UserError if a file is missing or cannot be read.
+
+    ``shipping`` excludes sounds whose license does not allow distributing the model.
+    """
+    sounds = []
+    for folder in folders:
+        try:
+            with (folder / "manifest.tsv").open(encoding="utf-8-sig", newline="") as lines:
+                rows = list(csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE))
+            for row in rows:
+                if may_ship(row["licence"]) or not shipping:
+                    sounds += _parts(row["kind"], folder / row["path"])
+        except OSError as error:
+            raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
+        except KeyError as error:
+            raise UserError(
+                f"{folder / 'manifest.tsv'} lacks the column {error}; add path, kind and licence"
+            ) from error
+        except ValueError as error:
+            raise UserError(f"cannot read a sound of {folder}: {error}") from error
+    return sounds
+
+
+def _parts(kind: str, path: Path) -> list[Sound]:
+    samples = as_integers(read_audio(path))
+    if kind in _BY_FILE:
+        return [Sound(path.name, kind, samples, zlib.crc32(path.name.encode()) % 4 == 2)]
+    middle = len(samples) // 2
+    halves = ((samples[:middle], False), (samples[middle:], True))
+    return [Sound(path.name, kind, half, is_held_out) for half, is_held_out in halves]

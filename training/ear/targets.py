@@ -1,0 +1,256 @@
+"""Recordings with the targets of the small ear, computed once and kept on disk.
+
+The recordings are shuffled, so that a few of them represent all. They form chunks, which are
+computed one after the other while training proceeds. Each file of targets has these columns:
+
+========= ===================================================================== ========
+columns   meaning (:mod:`kouxing.training.ear.teachers`)                        number
+========= ===================================================================== ========
+pitch     log2 of Hz, NaN without voice                                         1
+level     relative to the recording                                             1
+effort    balance of high and low frequencies                                   1
+voice     number of a :class:`Voice`                                            1
+phones    posteriors                                                            phones
+causal    principal components of the causal network's values                   128
+encoder   principal components of Whisper's encoder                             128
+========= ===================================================================== ========
+
+A principal component is divided by the square root of its deviation, so that late ones count less
+than early ones. Some recordings also have a sung or held copy.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.corpora.feature_cache import as_floats, as_integers
+from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.shared.errors import UserError
+from kouxing.training.ear.singing import sing
+from kouxing.training.ear.teachers import POSITION_SAMPLES, Lesson, Teachers
+
+Floats = NDArray[np.float32]
+Samples = NDArray[np.int16]  # 16 kHz
+
+PITCH, LEVEL, EFFORT, VOICE = range(4)  # columns
+NUM_COMPONENTS = 128
+CHUNK_SIZE = 64  # recordings
+_NUM_FITTED = 192  # recordings that the principal components are computed from
+_SUNG_PROB = 0.25
+_MAX_SUNG_SAMPLES = 64_000  # of the speech
+_MIN_SAMPLES, _MAX_SAMPLES = 8000, 320_000
+_SILENT = 0.5  # posterior of silence above which nobody speaks
+_LAUGHING_LEVEL = -2.0  # level above which laughter is audible
+_MIN_VARIANCE = 1e-6
+
+
+class Voice(IntEnum):
+    """Kinds of voice."""
+
+    NONE = 0
+    SPEECH = 1
+    SUNG = 2  # or held
+    LAUGHTER = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording to train on."""
+
+    name: str
+    read: Callable[[], Samples]  # ValueError if it cannot be read
+    weight: float  # how often it is drawn, relative to others
+    voice: Voice = Voice.SPEECH  # where it is audible
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A recording, or a part of one, with its targets."""
+
+    samples: Samples  # (320 positions,)
+    targets: NDArray[np.float16]  # (positions, columns)
+    weight: float
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """The columns of targets that are ranges."""
+
+    num_phones: int
+
+    @property
+    def phones(self) -> slice:
+        """Posteriors of the phones."""
+        return slice(VOICE + 1, VOICE + 1 + self.num_phones)
+
+    @property
+    def causal(self) -> slice:
+        """Components of the causal network."""
+        return slice(self.phones.stop, self.phones.stop + NUM_COMPONENTS)
+
+    @property
+    def encoder(self) -> slice:
+        """Components of Whisper's encoder."""
+        return slice(self.causal.stop, self.causal.stop + NUM_COMPONENTS)
+
+
+class TargetStore:
+    """The chunks in a folder."""
+
+    def __init__(
+        self,
+        folder: Path,
+        recordings: Sequence[Recording],
+        teachers: Teachers,
+        errors: RowErrors,
+        seed: int,
+    ) -> None:
+        """Open a folder; UserError if its targets are of other recordings, or none is usable.
+
+        ``errors`` receives a message for every recording that cannot be read.
+        """
+        self._folder, self._teachers, self._errors, self._seed = folder, teachers, errors, seed
+        rng = np.random.default_rng(seed)
+        order = rng.exponential(size=len(recordings)) / [one.weight for one in recordings]
+        self._recordings = [recordings[number] for number in np.argsort(order)]
+        self.num_chunks = -(-len(recordings) // CHUNK_SIZE)
+        folder.mkdir(parents=True, exist_ok=True)
+        self._check_key()
+        self._basis = self._load_basis()
+        self._pieces: list[Piece] = []
+        self._num_loaded = 0
+
+    def pieces(self, num_chunks: int) -> list[Piece]:
+        """Return the pieces of the first chunks; compute those that are missing."""
+        while self._num_loaded < min(num_chunks, self.num_chunks):
+            self._pieces += self._chunk(self._num_loaded)
+            self._num_loaded += 1
+        return self._pieces
+
+    def _check_key(self) -> None:
+        key = hashlib.sha256(f"1 {self._seed} {self._teachers.digest}".encode())
+        for recording in self._recordings:
+            key.update(f"{recording.name} {recording.voice}\n".encode())
+        path = self._folder / "key"
+        if not path.exists():
+            path.write_text(key.hexdigest())
+        elif path.read_text() != key.hexdigest():
+            raise UserError(
+                f"{self._folder} contains the targets of other recordings or models; delete it"
+            )
+
+    def _load_basis(self) -> dict[str, Floats]:
+        """Load the principal components, or compute them from the first recordings."""
+        path = self._folder / "basis.npz"
+        if not path.exists():
+            speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
+            sounds = [sound for one in speech for sound in self._cut(one)]
+            if not sounds:
+                raise self._errors.no_recording_error("among the first ones")
+            lessons = [self._teachers.teach(sound) for sound in sounds]
+            basis = {}
+            for name in ("causal", "encoder"):
+                values = np.concatenate([getattr(lesson, name) for lesson in lessons])
+                basis[f"{name}_mean"] = values.mean(axis=0)
+                basis[name] = _components_of(values - basis[f"{name}_mean"])
+            np.savez(path.with_suffix(".part.npz"), allow_pickle=False, **basis)
+            path.with_suffix(".part.npz").replace(path)
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+
+    def _chunk(self, number: int) -> list[Piece]:
+        samples, targets, ends = (
+            self._folder / f"{number:04}.{name}.npy" for name in ("samples", "targets", "ends")
+        )
+        if not ends.exists():
+            pieces = self._compute(number)
+            rows = [(len(piece.targets), piece.weight) for piece in pieces]
+            if pieces:
+                np.save(samples, np.concatenate([piece.samples for piece in pieces]))
+                np.save(targets, np.concatenate([piece.targets for piece in pieces]))
+            np.save(unfinished := ends.with_suffix(".part.npy"), np.array(rows).reshape(-1, 2))
+            unfinished.replace(ends)  # it marks the chunk as complete
+        lengths, weights = np.load(ends).T
+        if not len(lengths):
+            return []
+        bounds = np.cumsum(lengths[:-1]).astype(np.int64)
+        sounds = np.split(np.load(samples, mmap_mode="r"), POSITION_SAMPLES * bounds)
+        rows_of = np.split(np.load(targets, mmap_mode="r"), bounds)
+        return [Piece(*one) for one in zip(sounds, rows_of, weights.tolist(), strict=True)]
+
+    def _compute(self, number: int) -> list[Piece]:
+        rng = np.random.default_rng([self._seed, number])
+        pieces = []
+        for recording in self._recordings[CHUNK_SIZE * number :][:CHUNK_SIZE]:
+            for piece in self.pieces_of(recording):
+                pieces.append(piece)
+                if recording.voice == Voice.SPEECH and rng.random() < _SUNG_PROB:
+                    pieces += _sung_copy(piece, rng)
+        return pieces
+
+    def pieces_of(self, recording: Recording) -> list[Piece]:
+        """Compute the targets of a recording."""
+        pieces = []
+        for samples in self._cut(recording):
+            lesson = self._teachers.teach(samples)
+            voice = np.full(len(lesson.level), recording.voice, np.float32)
+            voice[~self._is_audible(lesson, recording.voice)] = Voice.NONE
+            scalars = [lesson.pitch, lesson.level, lesson.effort, voice]
+            components = [self._project(lesson, name) for name in ("causal", "encoder")]
+            targets = np.column_stack([*scalars, lesson.phones, *components]).astype(np.float16)
+            kept = samples[: POSITION_SAMPLES * len(targets)]
+            pieces.append(Piece(kept, targets, recording.weight))
+        return pieces
+
+    def _cut(self, recording: Recording) -> list[Samples]:
+        """Read a recording, in parts of up to 20 s; no parts if it cannot be read."""
+        try:
+            samples = recording.read()
+        except ValueError as error:
+            self._errors.add(recording.name, str(error))
+            return []
+        starts = range(0, max(1, len(samples) - _MIN_SAMPLES), _MAX_SAMPLES)
+        parts = [samples[start : start + _MAX_SAMPLES] for start in starts]
+        return [part for part in parts if len(part) >= _MIN_SAMPLES]
+
+    def _project(self, lesson: Lesson, name: str) -> Floats:
+        """Compute the components of a teacher's values, (positions, 128)."""
+        centered = getattr(lesson, name) - self._basis[f"{name}_mean"]
+        return np.asarray(centered @ self._basis[name], np.float32)
+
+    def _is_audible(self, lesson: Lesson, voice: Voice) -> NDArray[np.bool_]:
+        if voice == Voice.SPEECH:
+            return np.asarray(lesson.phones[:, self._teachers.silence] < _SILENT)
+        return np.asarray(lesson.level > _LAUGHING_LEVEL)
+
+
+def _components_of(centered: Floats) -> Floats:
+    """Find the first principal directions of rows, (n, features), with their scales."""
+    variances, directions = np.linalg.eigh(centered.T @ centered / len(centered))
+    first = slice(-1, -1 - NUM_COMPONENTS, -1)
+    deviation = np.sqrt(np.maximum(variances[first], _MIN_VARIANCE))
+    scale = 1 / np.sqrt(deviation)
+    scale /= np.sqrt(np.mean(deviation))  # so that the mean variance is 1
+    components: Floats = (directions[:, first] * scale).astype(np.float32)
+    return components
+
+
+def _sung_copy(piece: Piece, rng: np.random.Generator) -> list[Piece]:
+    """Sing the start of a recording; no piece if it has no voice."""
+    speech = as_floats(piece.samples[:_MAX_SUNG_SAMPLES])
+    sung = sing(speech, len(speech) // POSITION_SAMPLES, rng)
+    if sung is None:
+        return []
+    targets = np.array(piece.targets[sung.source])
+    targets[:, PITCH] = sung.pitch
+    targets[sung.is_sung & (targets[:, VOICE] == Voice.SPEECH), VOICE] = Voice.SUNG
+    num_positions = min(len(targets), len(sung.samples) // POSITION_SAMPLES)
+    samples = as_integers(sung.samples[: POSITION_SAMPLES * num_positions])
+    return [Piece(samples, targets[:num_positions], piece.weight)]

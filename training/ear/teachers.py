@@ -1,0 +1,225 @@
+"""The teachers of the small ear: what three trained networks compute from a clean recording.
+
+The causal network and the block network are those of the shipped models. Their ONNX files contain
+8-bit weights, which are widened here, so that PyTorch can run whole recordings. This is several
+times faster than the live networks. The third teacher is Whisper's unchanged encoder.
+
+======== ==================================================================== =================
+symbol   meaning                                                              shape
+======== ==================================================================== =================
+p        position: the feature frames 2 p and 2 p + 1
+causal   attention values of the causal network's last two layers. Position   (positions, 2 w)
+         p has seen the frames up to 2 p + 2
+encoder  positions of Whisper's encoder after layers 4 and 6, which have      (positions, 2 w)
+         seen the whole recording
+phones   posteriors of the phones, of the block network                       (positions, phones)
+pitch    log2 of the pitch in Hz; NaN without voice                           (positions,)
+level    log10 of the power, relative to the recording's loudest parts        (positions,)
+effort   log10 of the ratio of the power in 1 to 5 kHz to that below 1 kHz    (positions,)
+======== ==================================================================== =================
+
+Source: Eyben et al. 2016, "The Geneva minimalistic acoustic parameter set (GeMAPS) for voice
+research and affective computing" (the effort is its alpha ratio).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.pitch import PitchTracker
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.services.recognizer.lip_predictor import NUM_LAYERS
+from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.neural.initial_network import load_whisper
+from kouxing.training.neural.network import Layer, Network, ReadoutShape, Shape, mixed_precision
+from kouxing.training.neural.teacher import NUM_LAYERS as NUM_WHISPER_LAYERS
+from kouxing.training.neural.teacher import WholeEncoder
+
+Floats = NDArray[np.float32]
+
+POSITION_SAMPLES = 320
+_ENCODER_LAYERS = (3, 5)  # of Whisper's encoder, the first is 0
+_BLOCK_POSITIONS = 50  # of the block network; longer blocks than live cost less
+_LOW_BANDS, _HIGH_BANDS = slice(1, 27), slice(27, 69)  # below 1 kHz, and 1 to 5 kHz
+_LOUD_PERCENTILE = 95
+_TINY_POWER = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """What the teachers compute from a recording; arrays have the shapes above."""
+
+    causal: Floats
+    encoder: Floats
+    phones: Floats
+    pitch: Floats
+    level: Floats
+    effort: Floats
+
+
+class Teachers:
+    """The three teachers, ready to run."""
+
+    def __init__(self, causal: NeuralModel, blocks: BlockModel, whisper: Path) -> None:
+        sizes = causal.session.sizes
+        shape = Shape(
+            num_states=0,
+            look_aheads=(),
+            width=sizes.width,
+            heads=sizes.num_heads,
+            layers=sizes.num_layers,
+            inner=_inner_of(causal.network),
+        )
+        self._causal = Network(shape)
+        load_exported(self._causal, causal.network)
+        self._values: list[Tensor] = []
+        for layer in list(self._causal.layers)[-NUM_LAYERS:]:
+            assert isinstance(layer, Layer)  # noqa: S101 - PyTorch's lists have no types
+            layer.query_key_value.register_forward_hook(self._keep_values)
+        self._blocks = BlockEncoder(_block_shape(blocks))
+        load_exported(self._blocks, blocks.network)
+        self._readout = _readout_of(blocks)
+        self._encoder = WholeEncoder(
+            Shape(num_states=0, look_aheads=(), layers=NUM_WHISPER_LAYERS), _ENCODER_LAYERS
+        )
+        load_whisper(self._encoder, whisper)
+        for network in (self._causal, self._blocks, self._readout, self._encoder):
+            network.eval()
+        self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
+        self._first_state = blocks.topology.first_state
+        networks = causal.network.tobytes() + blocks.network.tobytes()
+        self.digest = hashlib.sha256(networks).hexdigest()
+
+    @torch.no_grad()
+    def teach(self, samples: NDArray[np.int16]) -> Lesson:
+        """Compute the targets of samples, (n,) at 16 kHz, up to 20 s."""
+        bands = WhisperMel().accept_waveform(as_floats(samples))
+        num_positions = (len(bands) - 1) // 2
+        frames = torch.from_numpy(bands[: 2 * num_positions + 1])[None]
+        power = 10 ** (4 * bands[: 2 * num_positions].reshape(num_positions, 2, -1) - 4)
+        level = np.log10(power.mean(axis=(1, 2)) + _TINY_POWER)
+        low, high = (power[..., part].mean(axis=(1, 2)) for part in (_LOW_BANDS, _HIGH_BANDS))
+        return Lesson(
+            causal=self.causal_values(frames),
+            encoder=self._encoder.features(samples)[:num_positions].astype(np.float32),
+            phones=self._phones(frames),
+            pitch=pitch_of(samples, num_positions),
+            level=(level - np.percentile(level, _LOUD_PERCENTILE)).astype(np.float32),
+            effort=np.log10((high + _TINY_POWER) / (low + _TINY_POWER)).astype(np.float32),
+        )
+
+    @torch.no_grad()
+    def causal_values(self, frames: Tensor) -> Floats:
+        """Run the causal network: (1, frames, 80) to (positions, 2 width)."""
+        self._values.clear()
+        with mixed_precision():
+            self._causal(frames)
+        return torch.cat(self._values, dim=-1)[0].float().numpy()
+
+    def _keep_values(self, _layer: nn.Module, _inputs: object, outputs: Tensor) -> None:
+        self._values.append(outputs[..., 2 * outputs.shape[-1] // 3 :])
+
+    def _phones(self, frames: Tensor) -> Floats:
+        """Compute the phones' posteriors: (1, frames, 80) to (positions, phones)."""
+        num_positions = (frames.shape[1] - 1) // 2
+        missing = -num_positions % _BLOCK_POSITIONS  # few layouts, as PyTorch keeps their masks
+        padded = pad(frames, (0, 0, 0, 2 * missing), mode="replicate")
+        laid = layout(num_positions + missing, _BLOCK_POSITIONS)
+        with mixed_precision():
+            features = self._blocks(padded, laid)
+        states = self._readout.read(features.float(), laid)[0, :num_positions].exp().mean(dim=1)
+        return np.add.reduceat(states.numpy(), self._first_state[:-1], axis=1)
+
+
+def pitch_of(samples: NDArray[np.int16], num_positions: int) -> Floats:
+    """Track the pitch; log2 of Hz, NaN without voice, (positions,)."""
+    tracker, floats = PitchTracker(), as_floats(samples)
+    starts = POSITION_SAMPLES * np.arange(num_positions)
+    pitch = [tracker.track(floats[start : start + POSITION_SAMPLES]) for start in starts]
+    with np.errstate(divide="ignore"):
+        logarithm = np.log2(np.array(pitch, np.float32))
+    return np.where(np.isfinite(logarithm), logarithm, np.float32(np.nan))
+
+
+def _tensors_of(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    graph = onnx.load_from_string(file.tobytes()).graph
+    return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+
+
+def load_exported(
+    module: nn.Module,
+    file: NDArray[np.uint8],
+    prefix: str = "",
+    others: Mapping[str, NDArray[Any]] | None = None,
+) -> None:
+    """Load the weights of an exported network (:mod:`kouxing.training.neural.onnx_graph`).
+
+    ``others`` are weights that the file stores in another form, by the module's names.
+    """
+    tensors = _tensors_of(file)
+    state = {}
+    for name, tensor in module.state_dict().items():
+        stem = f"{prefix}{name}".removesuffix(".weight")
+        if others and name in others:
+            weight = others[name]
+        elif name.endswith(".weight") and f"{stem}.integers" in tensors:
+            weight = (tensors[f"{stem}.integers"] * tensors[f"{stem}.scales"]).T
+            if tensor.ndim == 3:  # a convolution, place by place
+                weight = weight.reshape(len(weight), tensor.shape[2], -1).transpose(0, 2, 1)
+        else:
+            weight = tensors[f"{prefix}{name}"]
+        state[name] = torch.from_numpy(np.array(weight, np.float32))
+    module.load_state_dict(state)
+
+
+def _inner_of(file: NDArray[np.uint8]) -> int:
+    return len(_tensors_of(file)["layers.0.inner.bias"])
+
+
+def _block_shape(model: BlockModel) -> Shape:
+    sizes = model.session.sizes
+    return Shape(
+        num_states=int(model.topology.first_state[-1]),
+        look_aheads=(),
+        width=sizes.width,
+        heads=sizes.heads,
+        layers=sizes.layers,
+        inner=_inner_of(model.network),
+    )
+
+
+def _readout_of(model: BlockModel) -> BlockReadout:
+    """Load the block network's readout, whose recurrent layer is exported in ONNX's layout."""
+    tensors = _tensors_of(model.network)
+    inner = len(tensors["readout.inner.bias"])
+    shape = ReadoutShape(inner=inner, gru=model.session.sizes.state, dropout=0.0, noise=0.0)
+    readout = BlockReadout(len(tensors["readout.mean"]), int(model.topology.first_state[-1]), shape)
+    input_biases, recurrent_biases = np.split(tensors["readout.biases"], 2, axis=1)
+    recurrent = {
+        "weight_ih": tensors["readout.input_weights.halves"],
+        "weight_hh": tensors["readout.recurrent_weights.halves"],
+        "bias_ih": input_biases,
+        "bias_hh": recurrent_biases,
+    }
+    others = {"deviation": 1 / tensors["readout.inverse"]}
+    for name, directions in recurrent.items():
+        for direction, suffix in zip(directions, ("", "_reverse"), strict=True):
+            update, reset, new = np.split(direction, 3)
+            others[f"gru.{name}_l0{suffix}"] = np.concatenate([reset, update, new])
+    load_exported(readout, model.network, "readout.", others)
+    return readout
