@@ -20,6 +20,7 @@ import fcntl
 import json
 import os
 import re
+import shlex
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -87,20 +88,30 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
         path, control_path = folder / f"{name}.key", folder / "control.key"
         if not path.exists():
             if not control_path.exists():
-                if not is_here or any(folder.glob("*.key")):
+                has_keys = any(folder.glob("*.key"))
+                if name == CONTROL and has_keys:
+                    raise UserError(
+                        f"{path} is missing, and the other keys belong to it; run:"
+                        f" {_replace_hint(path)}"
+                    )
+                if has_keys or not is_here:
                     raise UserError(
                         f"{path} is missing, and a new key can be created only on control's"
                         f" machine. Run there: {add_key_hint(roles)}"
                     )
+                (folder / _ALLOWED).unlink(missing_ok=True)  # keys of another control
                 _write(control_path, _new_key())
             if name != CONTROL:
                 _add_key(folder, path, name, roles)
         key = read_key(path)
-        if control_path.exists() and read_key(control_path).public != key.control:
+        control_key = read_key(control_path) if control_path.exists() else None
+        if control_key is not None and control_key.public != key.control:
+            if name == CONTROL:
+                raise _bad_key(path)
             raise UserError(
                 f"{path} belongs to another system than {control_path}. If control runs on another"
                 f" machine, run: rm {control_path} {folder / _ALLOWED}. If it runs here, run:"
-                f" rm {path}"
+                f" {_replace_hint(path)}"
             )
         return key
 
@@ -116,10 +127,8 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     roles_of = {**kinds, CLIENT: CLIENT_ROLES}
     keys = {name: load_key(name, roles) for name, roles in roles_of.items()}
     grants = read_grants()  # also of keys that were just created
-    names = {grant.name for grant in grants.values()}
     reasons: list[str] = []
-    revoked: list[str] = []
-    removed: list[str] = []
+    replaced: list[Path] = []
     for name, key in keys.items():
         path, grant = key_folder() / f"{name}.key", grants.get(key.public, Grant("", ()))
         if _credential(path.name):
@@ -130,11 +139,21 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
             reasons.append(f"{key_folder() / _ALLOWED} does not allow {path}")
         else:
             continue
-        removed.append(str(key_folder() / ("*" if name == CONTROL else path.name)))
-        revoked += [f"kouxing keys revoke {name}"] * (name in names)
+        replaced.append(path)
     if reasons:
-        fix = "; ".join([*revoked, f"rm {' '.join(removed)}"])
-        raise UserError(f"{reasons[0]}; run: {fix}")
+        raise UserError(f"{reasons[0]}; run: {_replace_hint(*replaced)}")
+
+
+def _replace_hint(*paths: Path) -> str:
+    """Return the command that removes keys, so that ``kouxing run`` creates new ones.
+
+    A new key of control replaces all others.
+    """
+    if any(path.stem == CONTROL for path in paths):
+        return shlex.join(("rm", "-r", str(paths[0].parent)))
+    names = {grant.name for grant in _parse_grants(grants_file()).values()}
+    revoke = [f"kouxing keys revoke {path.stem}" for path in paths if path.stem in names]
+    return "; ".join([*revoke, shlex.join(("rm", "-r", *map(str, paths)))])
 
 
 def user_key(*, control: str = "") -> Key:
@@ -261,7 +280,9 @@ def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> Non
             )
     grants = _read_grants(folder / _ALLOWED)
     if any(grant.name == name for grant in grants.values()):
-        raise UserError(f"the name {name!r} is taken; run 'kouxing keys revoke {name}' first")
+        raise UserError(
+            f"{path}: another key has the name {name!r}; run 'kouxing keys revoke {name}' first"
+        )
     text = _new_key(read_key(folder / "control.key").public)
     grants[json.loads(text)["public"]] = Grant(name, tuple(roles))
     _check_number(grants)
@@ -282,7 +303,16 @@ def read_key(path: Path) -> Key:
             return key
     except (ValueError, TypeError):
         pass
-    raise UserError(f"{path} is not a key file; delete it and restart on control's machine")
+    raise _bad_key(path)
+
+
+def _bad_key(path: Path) -> UserError:
+    if path.parent != key_folder():
+        return UserError(f"{path} is not a key file; copy it again")
+    return UserError(
+        f"{path} is not a key file. If it came from another machine, copy it again. Otherwise run:"
+        f" {_replace_hint(path)}"
+    )
 
 
 def _read_grants(path: Path) -> dict[str, Grant]:
@@ -303,7 +333,10 @@ def _parse_grants(path: Path) -> dict[str, Grant]:
         name, *roles = named or [""]
         is_whole = _PUBLIC.fullmatch(public) and _NAME.fullmatch(name)
         if not (is_whole and all(map(_ROLE.fullmatch, roles))):
-            raise UserError(f"{path}: {line!r} is not of the form PUBLIC-KEY NAME ROLE...")
+            raise UserError(
+                f"{path}: {line!r} is not of the form PUBLIC-KEY NAME ROLE...; delete this line,"
+                f" or run: {_replace_hint(path.with_name('control.key'))}"
+            )
         grants[public] = Grant(name, tuple(roles))
     return grants
 
@@ -338,7 +371,10 @@ def _locked_folder() -> Iterator[Path]:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
-        raise UserError(f"cannot create a folder for keys: {error}; set XDG_STATE_HOME") from None
+        raise UserError(
+            f"cannot use the folder of the keys: {error}; correct its mode (700), or set"
+            " XDG_STATE_HOME"
+        ) from None
     try:
         _check_private(folder, 0o700)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -361,6 +397,8 @@ def _check_private(path: Path, mode: int) -> None:
     owners, others = ({0, os.geteuid()}, 0o037) if is_given else ({os.geteuid()}, 0o077)
     if about.st_uid not in owners:
         raise UserError(f"{path} belongs to another user; change its owner")
+    if not about.st_mode & 0o400:
+        raise UserError(f"you cannot read {path}; run 'chmod {mode:o} {path}' and restart")
     if about.st_mode & others:
         raise UserError(f"other users can read {path}; run 'chmod {mode:o} {path}' and restart")
 

@@ -145,6 +145,18 @@ def test_creates_no_key_for_control_on_another_machine() -> None:
             ),
             r"lamp\.key: the secret key .*run: kouxing keys revoke lamp; rm .*lamp\.key",
         ),
+        (
+            lambda folder: (folder / "lamp.key").write_text(""),
+            r"lamp\.key is not a key file.*run: kouxing keys revoke lamp; rm -r .*lamp\.key",
+        ),
+        (
+            lambda folder: (folder / "control.key").write_text("{"),
+            r"control\.key .*rm -r .*kouxing",
+        ),
+        (lambda folder: (folder / "control.key").unlink(), r"control\.key .*rm -r .*kouxing"),
+        (lambda folder: (folder / "lamp.key").unlink(), r"another key has the name 'lamp'"),
+        (lambda folder: (folder / "lamp.key").chmod(0), r"you cannot read .*chmod 600 .*lamp"),
+        (lambda folder: (folder / "allowed").write_text("no key"), r"delete this line.*rm -r "),
     ],
 )
 def test_checks_the_keys_of_a_system(damage: Callable[[Path], object], message: str) -> None:
@@ -152,6 +164,14 @@ def test_checks_the_keys_of_a_system(damage: Callable[[Path], object], message: 
     damage(key_folder())
     with pytest.raises(UserError, match=message):
         check_keys({"lamp": ("service:lamp",), "control": ()})
+
+
+def test_a_new_key_of_control_replaces_all_others() -> None:
+    check_keys({"control": (), "lamp": ("service:lamp",)})
+    for path in key_folder().glob("*.key"):
+        path.unlink()
+    check_keys({"control": ()})
+    assert [grant.name for grant in read_grants().values()] == ["client"]
 
 
 def test_names_the_key_of_another_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
