@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import webbrowser
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,7 @@ import typer
 
 from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
-from kouxing.services.cli.running_system import announce, find_control
+from kouxing.services.cli.running_system import announce, find_control, starting
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.kinds import (
@@ -76,6 +77,10 @@ def run(
     out = Path(driver.out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     arguments = ["--config", str(config)] if config else []
+    startup = contextlib.ExitStack()
+    startup.enter_context(
+        starting(lambda: print_message("another kouxing is starting; this one waits for it"))
+    )
     addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
     bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
@@ -92,24 +97,21 @@ def run(
     client_control = control_endpoint(control, insecure=control_config.insecure)
     more = extra_worker_environments(settings, workers)
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment, more=more)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a shell's background processes ignore it
-    for remark in _port_remarks(settings, addresses, control):
+    _install_signal_handlers()
+    if remark := _port_remark(settings, addresses, control):
         print_message(remark)
     try:
         with CONSOLE.status(f"starting {', '.join(KINDS)}"):
             ensure_page_heads()
             supervisor.start()
             supervisor.wait_ready(client_control)
+        startup.close()
         supervisor.watch()
         page = supervisor.page_address(client_control)
         with announce(client_control):
             print_message(f"the face is at {page}")
-            has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-            if browser and not stop_after and (has_display or sys.platform == "darwin"):
-                webbrowser.open(page)
+            if browser and not stop_after:
+                _open_browser(page)
             if sample is not None:
                 _play_sample(sample, client_control)
             if stop_after:
@@ -162,21 +164,37 @@ def _control_address(bound: str) -> str:
     return with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
 
 
-def _port_remarks(settings: Settings, moved: Mapping[str, str], control: str) -> Iterator[str]:
-    """Yield messages about default ports that are in use."""
+def _port_remark(settings: Settings, moved: Mapping[str, str], control: str) -> str:
+    """Return a message about default ports that are in use, or an empty string."""
     taken = [
         setting.text
         for kind in KINDS.values()
         for setting in settings.describe(kind.config_type)
         if setting.is_default and variable(kind.name, setting.key) in moved
     ]
-    if taken:
-        yield f"other programs use {', '.join(taken)}; free ports are used instead"
+    running = find_control() if BOUND_CONTROL in moved else ""
+    if running:
+        owner = f"another kouxing is running, with control at {running.partition(' ')[0]}"
+    else:
+        owner = f"other programs use {', '.join(taken)}"
+    remarks = [f"{owner}; this one uses free ports"] if taken else []
     if BOUND_CONTROL in moved:
-        if running := find_control():
-            address, _, _ = running.partition(" ")
-            yield f"another kouxing is already running, with control at {address}"
-        yield f"your kouxing commands use this one; for other programs, KOUXING_CONTROL={control}"
+        remarks.append(
+            f"your kouxing commands use this one; for other programs, KOUXING_CONTROL={control}"
+        )
+    return "; ".join(remarks)
+
+
+def _install_signal_handlers() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    # a shell's background processes ignore SIGINT
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _open_browser(page: str) -> None:
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if has_display or sys.platform == "darwin":
+        webbrowser.open(page)
 
 
 def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:

@@ -61,6 +61,8 @@ class Supervisor:
         self._backoff_s = dict.fromkeys(self._names, 0.0)
         self._restart_at_s: dict[str, float] = {}
         self._restarted: set[str] = set()  # services that are not ready again
+        self._followers: dict[str, threading.Thread] = {}  # that copy the logs
+        self._errors: dict[str, str] = {}  # newest error in the configuration
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
         self._process_ended = threading.Event()
@@ -135,7 +137,9 @@ class Supervisor:
                     self._restarted.remove(name)
                     self._print(f"{name} is running again", "green")
             elif status == USER_ERROR:
-                raise UserError(f"{name} cannot start; see the message above")
+                self._followers[name].join()
+                missing = f"{name} cannot start; see {self._log_path(name)}"
+                raise UserError(self._errors.get(name, missing))
             else:
                 self._schedule_restart(name, status, now_s)
         for name, restart_at_s in list(self._restart_at_s.items()):
@@ -195,7 +199,9 @@ class Supervisor:
         )
         self._processes[name] = process
         self._started_s[name] = time.monotonic()
-        threading.Thread(target=self._follow, args=(name, process), daemon=True).start()
+        follower = threading.Thread(target=self._follow, args=(name, process), daemon=True)
+        self._followers[name] = follower
+        follower.start()
 
     def _hang_limit_s(self, name: str) -> float:
         """Return the hang limit: short for a worker, unless it has already been restarted twice."""
@@ -217,7 +223,10 @@ class Supervisor:
         with stream, contextlib.closing(log):
             for line in stream:
                 log.write(line)
-                if text := _console_text(line):
+                text = _console_text(line)
+                if text.startswith((f"{kind_of(name)}:", f"{kind_of(name)}.")):
+                    self._errors[name] = text  # `check` raises it
+                elif text:
                     self._print(with_name(name, text))
 
     def _warn(self, text: str) -> None:

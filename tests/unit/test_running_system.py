@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.services.cli.clients import control_address
-from kouxing.services.cli.running_system import announce, find_control
+from kouxing.services.cli.running_system import announce, find_control, starting
 from kouxing.shared.keys import user_key
 
 
@@ -53,3 +54,18 @@ def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
         (folder,) = tmp_path.iterdir()
         folder.chmod(0o777)
         assert find_control() == ""
+
+
+def test_a_second_start_waits_for_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    operations: list[int] = []
+
+    def flock(_descriptor: int, operation: int) -> None:
+        operations.append(operation)
+        if operation & fcntl.LOCK_NB:
+            raise BlockingIOError
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    waits: list[str] = []
+    with starting(lambda: waits.append("waits")):
+        assert operations == [fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_EX]
+    assert waits == ["waits"]
