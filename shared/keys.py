@@ -91,8 +91,8 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
                 has_keys = any(folder.glob("*.key"))
                 if name == CONTROL and has_keys:
                     raise UserError(
-                        f"{path} is missing, and the other keys belong to it; run:"
-                        f" {_replace_hint(path)}"
+                        f"{path} is missing, and the other keys there belong to it. Run this on"
+                        f" control's machine. To run control here, first run: {_replace_hint(path)}"
                     )
                 if has_keys or not is_here:
                     raise UserError(
