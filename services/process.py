@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterable
@@ -42,6 +43,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     from kouxing.shared.errors import UserError, with_name
     from kouxing.shared.logs import LOG, configure
     from kouxing.shared.metrics import use_single_malloc_arena
+    from kouxing.shared.service import PARENT_VARIABLE
 
     configure(name, log_level)
     use_single_malloc_arena()
@@ -59,6 +61,10 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     except Exception:  # also a UserError, which is not the user's mistake any more
         LOG.critical("internal error", exc_info=True, extra={"session": service.current_session})
         return 1
+    if service.has_new_key:
+        if PARENT_VARIABLE in os.environ:
+            return 1  # the supervisor starts it again
+        os.execv(sys.executable, sys.orig_argv)  # noqa: S606 - this program again
     return 0
 
 

@@ -97,7 +97,7 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
                 if has_keys or not is_here:
                     raise UserError(
                         f"{path} is missing, and a new key can be created only on control's"
-                        f" machine. Run there: {add_key_hint(roles)}"
+                        f" machine. Run there: {_add_key_hint(roles)} and start this again"
                     )
                 (folder / _ALLOWED).unlink(missing_ok=True)  # keys of another control
                 _write(control_path, _new_key())
@@ -188,9 +188,11 @@ def rejection_hint(control: str, name: str, roles: Collection[str]) -> str:
             f"control at {address} rejects this machine: insecure = true is set only here,"
             " or see control's log"
         )
+    path = key_folder() / f"{name}.key"
     return (
-        f"control at {address} does not accept {key_folder() / name}.key. If control runs on this"
-        f" machine, restart it. Otherwise create a key there: {add_key_hint(roles)}"
+        f"control at {address} does not accept {path}. If control runs on this machine, run:"
+        f" {_replace_hint(path)} (or set XDG_STATE_HOME as for control). Otherwise run there:"
+        f" {_add_key_hint(roles)}. A running service then starts again by itself"
     )
 
 
@@ -199,10 +201,10 @@ def key_text(key: Key) -> str:
     return json.dumps(asdict(key), indent=1) + "\n"
 
 
-def add_key_hint(roles: Collection[str]) -> str:
-    """Return the command that creates a key, for messages about a missing key."""
+def _add_key_hint(roles: Collection[str]) -> str:
+    """Return the command that creates a key for this machine."""
     options = "".join(f" --role {role}" for role in roles)
-    return f"kouxing keys add NAME{options} (then copy the file here, and start this again)"
+    return f"kouxing keys add NAME{options}, then copy the file here"
 
 
 def read_grants() -> dict[str, Grant]:

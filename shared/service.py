@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar
 
+from kouxing_client.keys import Key
+
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
@@ -78,13 +80,9 @@ class Service(MessageLoop):
         self.config = config
         self.name = self.kind.name
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
-        self.key = (
-            None
-            if config.insecure
-            else load_key(
-                self.name, self.kind.key_roles, control=config.control if has_control else ""
-            )
-        )
+        self.has_new_key = False  # so it must start again
+        self._has_control = has_control
+        self.key = None if config.insecure else self._load_key()
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
         super().__init__(Bus(self.key, extra_connections=extra_connections))
         self.stall = StallDetector(time.monotonic())
@@ -321,6 +319,10 @@ class Service(MessageLoop):
             self.control.wait(left_s)
             self.handle_messages(self.control)
 
+    def _load_key(self) -> Key:
+        control = self.config.control if self._has_control else ""
+        return load_key(self.name, self.kind.key_roles, control=control)
+
     def _connect_to_control(self) -> Socket:
         socket = self.bus.connect_dealer(self.control_endpoint)
         self.register(socket, self.control_handlers())
@@ -377,6 +379,10 @@ class Service(MessageLoop):
         """Log why control does not answer, and what to do; runs on a thread, as it waits."""
         with contextlib.suppress(UserError), Bus(self.key) as bus:
             if bus.probe(self.control_endpoint) is Reach.REFUSED:
+                if self.key is not None and self._load_key() != self.key:
+                    LOG.warning("starting again with a new key")
+                    self.has_new_key = self._exit_requested = True
+                    return
                 LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))
             elif reason := reach_error(*split_endpoint(self.config.control, "control")):
                 LOG.warning("waiting for control at %s: %s", self.config.control, reason)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import contextlib
+from collections.abc import Collection, Iterator, Mapping
 from importlib.metadata import version
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -11,6 +12,7 @@ from kouxing_client import ServiceState
 from kouxing_client.keys import Key
 
 from kouxing.services.cli.clients import find_system
+from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import KINDS
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.control_client import connect
@@ -22,9 +24,8 @@ from kouxing.shared.terminal import plural
 MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # of the newest heartbeat
 MIN_SERVICES = ("control", "recognizer", "synthesizer")  # without them, no face moves
-# Endpoints that accept every allowed key; only services use the others.
-PUBLISHERS = ("phones", "faps", "events")
-ROUTERS = ("audio", "unpaced_audio")
+PUBLISHERS = ("phones", "faps", "events")  # accept every allowed key
+ROUTERS = {"audio": "client", "unpaced_audio": "client", "phone_input": "service"}  # and its role
 
 
 class Finding(NamedTuple):
@@ -51,42 +52,56 @@ def examine(given: str) -> Iterator[Finding]:
         except UserError as error:
             yield Finding("keys", "cannot be used", str(error))
             return
-    accepted: list[tuple[Key | None, str]] = []
+    accepted: dict[str, Key | None] = {}
     for name, key in keys.items():
-        endpoint = with_key(address, key.control if key else "")
-        finding = _check_key(name, key, endpoint)
+        finding = _check_key(name, key, address)
         if not finding.fix:
-            accepted.append((key, endpoint))
+            accepted[name] = key
         yield finding
     if not accepted:
         return
-    key, endpoint = accepted[0]
+    key = next(iter(accepted.values()))
     try:
-        with connect(endpoint, key=key, timeout_s=5.0) as client:
+        with connect(
+            with_key(address, key.control if key else ""), key=key, timeout_s=5.0
+        ) as client:
             services = client.status().services
     except UserError as error:
         yield Finding("status", "control does not answer", str(error))
         return
-    with Bus(key) as bus:
+    with contextlib.ExitStack() as stack:
+        buses = {name: stack.enter_context(Bus(key)) for name, key in accepted.items()}
         for service in services:
-            yield from _check_service(service, bus)
+            yield from _check_service(service, buses)
     for name in MIN_SERVICES:
         if name not in {service.service for service in services}:
             yield Finding(name, "is not running", f"start it: kouxing {name} --config kouxing.toml")
 
 
-def _check_key(name: str, key: Key | None, control: str) -> Finding:
+def _check_key(name: str, key: Key | None, address: str) -> Finding:
+    control = with_key(address, key.control if key else "")
     with Bus(key) as bus:
         reach = bus.probe(control)
     if reach is Reach.ACCEPTED:
         return Finding(f"key {name}", "control accepts it")
-    roles = KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
+    running, _, running_key = find_control().partition(" ")
+    if key is not None and running == address and running_key not in ("", key.control):
+        return Finding(
+            f"key {name}",
+            "belongs to another system than this control",
+            "set XDG_STATE_HOME to the same folder as for 'kouxing run'",
+        )
     return Finding(
-        f"key {name}", "control does not accept it", rejection_hint(control, name, roles)
+        f"key {name}", "control does not accept it", rejection_hint(control, name, _roles(name))
     )
 
 
-def _check_service(service: ServiceState, bus: Bus) -> Iterator[Finding]:
+def _roles(name: str) -> Collection[str]:
+    """Return the usual roles of a key, by its name."""
+    return KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
+
+
+def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[Finding]:
     problems = []
     if service.age_s > MAX_AGE_S:
         problems.append(f"silent for {service.age_s:.0f} s; look at its log")
@@ -102,22 +117,29 @@ def _check_service(service: ServiceState, bus: Bus) -> Iterator[Finding]:
         )
     for name, endpoint in service.endpoints.items():
         address = endpoint.partition(" ")[0]
-        if problem := _endpoint_problem(name, endpoint, bus):
+        if problem := _endpoint_problem(name, endpoint, buses):
             problems.append(f"{name} at {address}: {problem}")
     endpoints = plural(len(service.endpoints), "endpoint")
-    about = f"{endpoints}, clock {service.clock_offset_ms:+.0f} ms"
+    about = f"{endpoints}, clock {round(service.clock_offset_ms, 0) + 0:+.0f} ms"
     yield Finding(service.instance, about, "\n".join(problems))
 
 
-def _endpoint_problem(name: str, endpoint: str, bus: Bus) -> str:
+def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str:
     if endpoint.startswith("http"):
         page = urlsplit(endpoint)
         default = 443 if page.scheme == "https" else 80
         return reach_error(page.hostname or "", str(page.port or default))
     if reason := reach_error(*split_endpoint(endpoint.partition(" ")[0], name)):
         return reason
-    if name not in (*PUBLISHERS, *ROUTERS):
+    is_publisher = name in PUBLISHERS
+    for key_name, bus in buses.items():
+        roles = {role.partition(":")[0] for role in _roles(key_name)}
+        if not is_publisher and ROUTERS.get(name) not in roles:
+            continue
+        if bus.probe(endpoint, is_publisher=is_publisher) is Reach.REFUSED:
+            return (
+                f"it does not accept the key {key_name}; see its roles with 'kouxing keys list' on"
+                " control's machine, or restart the service"
+            )
         return ""
-    if bus.probe(endpoint, is_publisher=name in PUBLISHERS) is Reach.REFUSED:
-        return "it does not accept this machine's key; restart the service, or look at its log"
     return ""
