@@ -72,9 +72,11 @@ class WorkerLoad:
         num_new = _num_recent(self._placed_s, now_s) - _num_recent(self._ended_s, now_s)
         return max(of_sessions, self._measured + num_new * self.cost)
 
-    def has_room(self, now_s: float, max_load: float) -> bool:
-        """Return whether another session stays within a limit; the first sessions always do."""
-        return self.num_sessions < MIN_SESSIONS or self.expected(now_s) + self.cost <= max_load
+    def has_room(self, num_new: int, now_s: float, max_load: float) -> bool:
+        """Return whether further sessions stay within a limit; the first sessions always do."""
+        if self.num_sessions + num_new <= MIN_SESSIONS or not num_new:
+            return True
+        return self.expected(now_s) + num_new * self.cost <= max_load
 
     def _is_unpaced(self, now_s: float) -> bool:
         """Return whether the load means nothing: unpaced audio takes all the time that is free."""

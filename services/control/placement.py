@@ -27,21 +27,21 @@ class Placement:
         now_s: float,
         language: str | None = None,
         *,
-        may_refuse: bool = False,
+        min_room: int = 0,
     ) -> dict[str, str]:
         """Return a worker for each endpoint that a client or a chosen worker needs.
 
         A worker that is chosen for one endpoint also serves its other endpoints. Workers in
-        ``kept`` stay. A session that moves needs a worker of its ``language``. If ``may_refuse``, a
-        session without room is refused; a session that moves never is. Raises ``Refusal`` if no
-        ready worker provides one of the endpoints, or all workers are busy.
+        ``kept`` stay. A session that moves needs a worker of its ``language``, but no room. Raises
+        ``Refusal`` if no ready worker provides one of the endpoints, or none has room for
+        ``min_room`` sessions.
         """
         workers: dict[str, str] = {}
         needed = list(CLIENT_NEEDS)
         for endpoint in needed:  # grows
             placed = {*kept.values(), *workers.values()}
             instance = kept.get(endpoint) or self._choose(
-                endpoint, placed, now_s, language, may_refuse=may_refuse
+                endpoint, placed, now_s, language, min_room=min_room
             )
             workers[endpoint] = instance
             needs = self._registry[instance].heartbeat.needs
@@ -57,7 +57,7 @@ class Placement:
         now_s: float,
         language: str | None,
         *,
-        may_refuse: bool,
+        min_room: int,
     ) -> str:
         providers = self._registry.providers(endpoint)
         names = [name for name, record in providers.items() if _can_serve(record, language)]
@@ -71,7 +71,7 @@ class Placement:
             text = f"{missing}; {start} (or everything with 'kouxing run')"
             raise Refusal(ErrorCode.NO_SERVICE, text)
         best = min(names, key=lambda name: self._rank(name, now_s))
-        if may_refuse and not self._registry.load(best).has_room(now_s, self._max_load):
+        if not self._registry.load(best).has_room(min_room, now_s, self._max_load):
             text = (
                 f"every {kind or f'provider of {endpoint}'} is busy with other sessions; "
                 f"try again in {RETRY_AFTER_S:g} s"

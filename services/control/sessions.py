@@ -120,7 +120,8 @@ class Sessions:
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
             text = f"your key has its maximum of open sessions, {num_of_key}; close one first"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
-        workers = self._placement.place({}, now_s, may_refuse=True)
+        leaves_room = client.key and num_of_key and not opening.paced  # for another client
+        workers = self._placement.place({}, now_s, min_room=2 if leaves_room else 1)
         facts = self._registry.facts(workers.values())
         record = SessionRecord(
             name=name,

@@ -28,7 +28,7 @@ def loaded(num_sessions: int, load: float) -> WorkerLoad:
 def num_admitted(load: WorkerLoad, now_s: float) -> int:
     """Place sessions until there is no room; return their number."""
     before = load.num_sessions
-    while load.has_room(now_s, MAX_LOAD):
+    while load.has_room(1, now_s, MAX_LOAD):
         load.add_session(now_s, paced=True)
     return load.num_sessions - before
 
@@ -85,6 +85,15 @@ def test_refuses_a_session_without_room_and_says_when_to_try_again(system: Syste
         open_at(system, 6.0)  # its two sessions may speak again
     measure(system, "recognizer-2", 0.2, 300.0)
     assert open_at(system, 300.0) == "recognizer-2"
+
+
+def test_unpaced_sessions_of_one_key_leave_room_for_another_client(system: System) -> None:
+    opening, greedy = OpenSession(request="r", paced=False), Peer(b"a", "greedy")
+    for _ in range(4):  # two of the three for which each recognizer has room
+        system.sessions.open(opening, greedy, 0.0)
+    with pytest.raises(Refusal, match="busy"):
+        system.sessions.open(opening, greedy, 0.0)
+    assert system.sessions.open(opening, Peer(b"b", "other"), 0.0)
 
 
 def test_never_refuses_the_first_sessions_nor_one_that_moves(system: System) -> None:
