@@ -9,8 +9,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from kouxing.services.kinds import KINDS
-from kouxing.shared.config import variable
-from tests.system import System, free_port
+from tests.system import System
 from tests.videos import write_video
 
 settings.register_profile(
@@ -34,9 +33,8 @@ def _own_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")  # an idle system costs more than a start
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    """All services on this host, with metrics."""
-    settings = {variable(name, "metrics_port"): str(free_port()) for name in KINDS}
-    with System(KINDS, tmp_path_factory.mktemp("system"), settings) as running:
+    """All services on this host."""
+    with System(KINDS, tmp_path_factory.mktemp("system")) as running:
         yield running
 
 

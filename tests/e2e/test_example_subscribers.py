@@ -14,7 +14,7 @@ import soundfile
 from kouxing_client import Client
 
 from tests.e2e.following import Stream, samples_of_file
-from tests.system import CHAIN, NODE, ROOT, VOWELS_FILE, System, free_port
+from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port
 
 FOLDER = ROOT / "examples" / "subscribe"
 STREAM_CLIENTS = ROOT / "examples" / "stream"
@@ -83,9 +83,8 @@ def test_without_a_server_each_program_prints_one_line(
         assert process.returncode == 1
 
 
-def test_follow_a_session_that_moves_to_its_end(tmp_path: Path, programs: list[list[str]]) -> None:
+def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[list[str]]) -> None:
     with (
-        System(CHAIN, tmp_path) as system,
         Client(system.control) as client,
         client.open_session(encoding="f32le") as session,
         ExitStack() as stack,

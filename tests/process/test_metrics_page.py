@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import urllib.request
+from collections.abc import Iterator
 
 import pytest
 from kouxing_client import Client, FapFrame
@@ -14,9 +15,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.config import variable
 from tests.raw_bytes import pour
-from tests.system import ROOT, VOWELS_FILE, System
+from tests.system import CHAIN, ROOT, VOWELS_FILE, System, free_port
 
-SERVICES = ("control", "recognizer", "synthesizer")
 ELSEWHERE = {  # metrics of other services, or of what does not happen here
     *("frames_missed", "videos", "video_seconds", "repeated", "other_epoch", "too_early")
 }
@@ -24,9 +24,16 @@ SUFFIXES = ("_total", "_bucket", "_count", "_sum")
 
 
 @pytest.fixture(scope="module")
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    settings = {variable(name, "metrics_port"): str(free_port()) for name in CHAIN}
+    with System(CHAIN, tmp_path_factory.mktemp("system"), settings) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
 def families(system: System) -> dict[str, list[Metric]]:
     """Metrics of each service while a session is open."""
-    ports = [int(system.environment[variable(name, "metrics_port")]) for name in SERVICES]
+    ports = [int(system.environment[variable(name, "metrics_port")]) for name in CHAIN]
     with Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)
         session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz, paced=False)
@@ -39,7 +46,7 @@ def families(system: System) -> dict[str, list[Metric]]:
         for port in ports:
             pour(port, 0.2)  # which the pages outlast
         pages = [[*text_string_to_metric_families(_page(port))] for port in ports]
-    return dict(zip(SERVICES, pages, strict=True))
+    return dict(zip(CHAIN, pages, strict=True))
 
 
 def _heartbeats(client: Client) -> float:
