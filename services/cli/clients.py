@@ -14,6 +14,7 @@ from kouxing.services.cli.options import AudioTrack, CurveForm, ListenOutput, Mo
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
+from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
@@ -297,7 +298,13 @@ def control_address(given: str) -> str:
 
 def find_system(given: str) -> tuple[str, ServiceConfig]:
     """Return control's endpoint in the user's newest system, if it applies, and the settings."""
+    if given:
+        split_endpoint(given, "--control")
     settings, overrides = read_settings(), {"control": given} if given else {}
     keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
     running = find_control() if keys["control"].is_default else ""
-    return running, settings.load(ServiceConfig, overrides)
+    config = settings.load(ServiceConfig, overrides)
+    if "*" in config.control:
+        key = "--control" if given else "common.control"
+        raise UserError(f"{key}: {config.control!r} does not name a host and port to connect to")
+    return running, config

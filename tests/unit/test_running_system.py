@@ -11,6 +11,7 @@ import pytest
 
 from kouxing.services.cli.clients import control_address
 from kouxing.services.cli.running_system import announce, find_control, starting
+from kouxing.shared.errors import UserError
 from kouxing.shared.keys import user_key
 
 
@@ -47,6 +48,8 @@ def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.Monkey
         assert control_address("") == f"tcp://127.0.0.1:5 {key}"
         monkeypatch.setenv("KOUXING_INSECURE", "true")
         assert control_address("") == "tcp://127.0.0.1:5"
+    with pytest.raises(UserError, match="--control: 'localhost' is not an endpoint"):
+        control_address("localhost")
 
 
 def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
