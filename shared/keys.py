@@ -21,6 +21,7 @@ import json
 import os
 import re
 import shlex
+import stat
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -395,6 +396,8 @@ def _credential(name: str) -> Path | None:
 def _check_private(path: Path, mode: int) -> None:
     """Reject a file that other users can read. Credentials may be readable by the group."""
     about = path.stat()
+    if mode == 0o600 and not stat.S_ISREG(about.st_mode):
+        raise UserError(f"{path} is not a regular file; run 'rm -r {path}'")
     is_given = path.parent == Path(os.environ.get("CREDENTIALS_DIRECTORY", ""))
     owners, others = ({0, os.geteuid()}, 0o037) if is_given else ({os.geteuid()}, 0o077)
     if about.st_uid not in owners:

@@ -6,6 +6,7 @@ The other end is the product's own, so it checks what the package sends.
 from __future__ import annotations
 
 import asyncio
+import os
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,7 +72,13 @@ def test_finds_the_key_that_commands_use(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(KouxingError, match="kouxing keys add"):
         Client()
     (tmp_path / "kouxing").mkdir()
-    (tmp_path / "kouxing" / "client.key").write_text('{"public": "short"}')
+    path = tmp_path / "kouxing" / "client.key"
+    for text in ('{"public": "short"}', "[" * 100_000):
+        path.write_text(text)
+        with pytest.raises(KouxingError, match="is not a key file"):
+            Client()
+    path.unlink()
+    os.mkfifo(path)
     with pytest.raises(KouxingError, match="is not a key file"):
         Client()
 

@@ -6,6 +6,7 @@ import errno
 import socket
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -13,7 +14,7 @@ from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
-from kouxing.shared.keys import Peer
+from kouxing.shared.keys import Peer, key_folder, revoke_key
 from kouxing.shared.service import RESYNC_AFTER_S, SESSIONS_PER_HEARTBEAT, Service
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted, StartSession
@@ -44,6 +45,10 @@ class Slow(Service):
     def _on_progress(self, _progress: Progress, _sender: Peer) -> None:
         self.num_handled += 1
         time.sleep(0.005)
+
+
+class Keyed(Service):
+    kind = ServiceKind(name="keyed", role="worker")
 
 
 @pytest.fixture
@@ -209,6 +214,25 @@ def test_registers_at_an_address_where_another_program_answered_before(
     wait_until(lambda: worker.instance in control._registry, step=step)
     for service in (worker, control):
         service.bus.close()
+
+
+def test_starts_again_when_a_rejected_key_was_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    local = "tcp://127.0.0.1:*"
+    control = ControlService(ControlConfig(control=local, events=local))
+    address, _, _ = control.endpoints["commands"].partition(" ")
+    service = Keyed(ServiceConfig(control=address))
+    revoke_key("keyed")
+    service._warn_about_control()
+    assert not service.should_exit
+    (key_folder() / "keyed.key").unlink()
+    service._warn_about_control()
+    assert service.should_exit
+    assert service.has_new_key
+    for one in (service, control):
+        one.bus.close()
 
 
 def test_reports_draining_before_it_finishes_its_sessions(control: FakeControl) -> None:
