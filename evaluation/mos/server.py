@@ -74,7 +74,8 @@ class ListeningTest:
         place = self._next_place(judge)
         if place is None or request.match_info["place"] != str(place):
             raise web.HTTPNotFound
-        return web.FileResponse(self._study.files[places_of_judge(judge, self._study)[place]])
+        file = self._study.files[places_of_judge(judge, self._study)[place]]
+        return web.FileResponse(file, http.CHUNK_BYTES)
 
     async def _add_answer(self, request: web.Request) -> web.Response:
         judge, answer = self._judge(request), await _read_answer(request)

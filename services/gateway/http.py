@@ -24,6 +24,7 @@ PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
 PING_S = 20.0  # a browser that has vanished is detected within this time
 MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message, unless it has audio
+CHUNK_BYTES = 32 * 1024  # of a file; a client that does not read holds two
 DISCARD_S = 5.0
 LINGER_S = 1.0  # data is still read, and discarded, after an invalid message
 MAX_REASON_BYTES = 123  # of a close frame, RFC 6455
@@ -154,14 +155,14 @@ def make_application(
         face_mesh = modules / "@mediapipe" / "face_mesh"
 
         async def serve_face_mesh(request: web.Request) -> web.StreamResponse:
-            return web.FileResponse(
-                _find(face_mesh, request.match_info["name"], _FACE_MESH_SUFFIXES)
-            )
+            file = _find(face_mesh, request.match_info["name"], _FACE_MESH_SUFFIXES)
+            return web.FileResponse(file, CHUNK_BYTES)
 
         application.router.add_get("/modules/face_mesh/{name}", serve_face_mesh)
         for folder in ("build", "examples/jsm"):
             path = modules / "three" / folder
-            application.router.add_static(f"/modules/three/{folder}", path)
+            prefix = f"/modules/three/{folder}"
+            application.router.add_static(prefix, path, chunk_size=CHUNK_BYTES)
     return application
 
 
@@ -208,7 +209,7 @@ def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamRes
         path = Path(head_file) if head_file and name == "head.glb" else _page_head(name)
     else:
         path = LIGHT if name == LIGHT.name else _find(PAGE, name, _PAGE_SUFFIXES)
-    response = web.FileResponse(path)
+    response = web.FileResponse(path, CHUNK_BYTES)
     if name == "index.html":
         response.headers["Content-Security-Policy"] = _content_policy(path, frame_ancestors)
     elif name == FACE_MESH_FRAME:

@@ -20,6 +20,7 @@ from aiohttp.typedefs import Handler
 from kouxing.services.gateway.config import ADDRESS_SHARE
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG, RateLimit
+from kouxing.shared.metrics import trim_heap
 
 MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # until a request arrives, and until the next one
@@ -287,8 +288,12 @@ class WebServer:
         return bool(rivals)
 
     async def _close_late_connections(self) -> None:
+        num_before = 0
         while True:
             await asyncio.sleep(_CHECK_S)
+            if len(self._connections) < num_before:
+                trim_heap()  # a client may have queued 20 MiB of audio
+            num_before = len(self._connections)
             for connection, task in self._connections.items():
                 if time.monotonic() > connection.deadline_s:
                     task.cancel()

@@ -146,7 +146,8 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
         session = FakeSession()
         audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
         async with audio_input.running():
-            await audio_input.push(bytes(MAX_QUEUED_BYTES + 3 * 16000 * 2))
+            for num_bytes in (MAX_QUEUED_BYTES, 3 * 16000 * 2):
+                await audio_input.push(bytes(num_bytes))
             assert 2.5 < asyncio.get_running_loop().time() < 3.5
             await audio_input.flush()
             assert session.num_flushes == 1
