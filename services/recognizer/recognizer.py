@@ -21,7 +21,6 @@ from kouxing.services.recognizer.speech_scorer import score_streams
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
-_WARM_UP_ROWS = 100  # of equal scores: enough live paths for the search to drop records
 
 
 class Recognizer:
@@ -96,7 +95,7 @@ class Recognizer:
         silence = np.zeros(round(_WARM_UP_S * SAMPLE_RATE_HZ), np.float32)
         scores = score_segment(self.model, self.model.create_front_end().accept_waveform(silence))
         decoder = Decoder(self.model.topology)
-        decoder.advance(np.zeros((_WARM_UP_ROWS, scores.shape[1]), np.float32))
         decoder.advance(scores)
+        decoder.drop_records()
         decoder.final_path()
         VoiceActivityDetector().detect(np.zeros(BLOCK_SAMPLES, np.float32))

@@ -128,7 +128,7 @@ class Decoder:
         """Search the next frames, given the scores of their states, (frames, states)."""
         while len(scores):
             if self._num_records + _MAX_TOKENS > len(self._records):
-                self._drop_records()
+                self.drop_records()
             num_done, self._num_tokens, self._num_records, token, state, self._confidence = _steps(
                 self.num_frames,
                 scores,
@@ -182,7 +182,7 @@ class Decoder:
         last = Segment(int(phones[best]), self._end(link), self.num_frames)
         return [*self._shared, *self._trace(link), last]
 
-    def _drop_records(self) -> None:
+    def drop_records(self) -> None:
         """Store the phones that all paths share, and drop records that no path needs."""
         live = self._tokens.score[: self._num_tokens] > _IMPOSSIBLE
         links = self._tokens.link[: self._num_tokens][live]
