@@ -42,5 +42,4 @@ def cluster(
     if not hosts:
         typer.echo("no workers are running on this cluster")
         return
-    rows = ((name, host or "waits for a free core") for name, host in hosts.items())
-    print_table(Console(), "", ("worker", "host"), rows)
+    print_table(Console(), "", ("worker", "host"), hosts.items())

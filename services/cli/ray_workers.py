@@ -29,7 +29,7 @@ from kouxing.shared.service import DRAIN_TIMEOUT_S
 from kouxing.shared.service_kind import ServiceKind
 
 NAMESPACE = "kouxing"  # of the actors' names
-PLACEMENT_LIMIT_S = 5.0  # an actor that is not placed by then has no free core
+PLACEMENT_LIMIT_S = 60.0  # until Ray has started as many actors as there are cores
 
 
 class Worker:
@@ -121,13 +121,28 @@ class RayWorkers:
             ray.kill(actor)  # if it has no host yet, or did not finish
 
     def hosts(self) -> dict[str, str]:
-        """Return the host of each worker by name. While no core is free, the host is empty."""
+        """Return the host of each worker by name, or why it has none; waits until they start."""
         names = [name for kind in KINDS for name in _names(kind)]
         answers = {ray.get_actor(name).host.remote(): name for name in names}
-        if not answers:
-            return {}
-        placed, _ = ray.wait([*answers], num_returns=len(answers), timeout=PLACEMENT_LIMIT_S)
-        return dict.fromkeys(names, "") | {answers[host]: ray.get(host) for host in placed}
+        num_cores = int(ray.cluster_resources().get("CPU", 0))
+        num_ready = min(len(answers), num_cores)
+        placed = []
+        if num_ready:
+            placed, _ = ray.wait([*answers], num_returns=num_ready, timeout=PLACEMENT_LIMIT_S)
+        if len(placed) == num_cores:
+            reason = "waits for a free core"
+        elif ray.available_resources().get("CPU", 0) >= 1:
+            reason = "is starting"
+        else:
+            reason = "is starting, or waits for a core that another program uses"
+        return dict.fromkeys(names, reason) | {answers[host]: _host(host) for host in placed}
+
+
+def _host(answer: ray.ObjectRef) -> str:
+    try:
+        return str(ray.get(answer))
+    except ray.exceptions.RayError:
+        return "is restarting"
 
 
 def _environment(kind: ServiceKind, settings: Settings) -> dict[str, str]:

@@ -107,6 +107,8 @@ class Registry:
         record = self._services.get(instance)
         if record is None:
             record = self._services[instance] = self._register(heartbeat, peer)
+        elif not peer.connection:  # the message was read after its connection had ended
+            peer = record.peer
         elif record.peer.connection != peer.connection:
             self._by_connection.pop(record.peer.connection, None)
         if peer.connection:
@@ -153,6 +155,11 @@ class Registry:
             self._lost.popitem(last=False)
         if not self.load(instance).num_sessions:
             self.forget_load(instance)
+
+    def is_left_over(self, instance: str, peer: Peer) -> bool:
+        """Return whether a heartbeat is from an ended connection of a service that is lost."""
+        lost = self._lost.get(instance, NO_PEER)
+        return lost.connection > 0 and peer.connection == 0
 
     def is_other_process(self, heartbeat: Heartbeat, peer: Peer) -> bool:
         """Return whether a known instance is now another process."""
@@ -237,7 +244,7 @@ class Registry:
 
     def exclude_pause(self, pause_s: float) -> None:
         """Exclude a time in which control did not run from the age of heartbeats."""
-        self._paused_s += pause_s
+        self._paused_s += max(0.0, pause_s)
 
     def note_return(self, after_s: float, now_s: float) -> None:
         """Wait longer for heartbeats if a service that was declared lost had only been late.

@@ -56,7 +56,7 @@ from kouxing.shared.wire.speech import Speech
 STOPPED = "stopped"  # reason for a service that shut down
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # until a session that no worker takes over is closed
-MAX_PAUSE_S = 0.1  # a longer pause between ticks is control's, not the services'
+MAX_PAUSE_S = 0.1  # between ticks; the rest of a longer pause is control's, not the services'
 SERVICE_EVENTS = (EventName.ERROR, EventName.RECORDED)  # events that a service may publish
 
 
@@ -115,7 +115,7 @@ class ControlService(Service):
 
     def on_tick(self, now_s: float) -> None:
         """Find lost services, sessions that wait too long, and keys that changed."""
-        self._registry.exclude_pause(self._tick_stall.check(now_s))
+        self._registry.exclude_pause(self._tick_stall.check(now_s) - MAX_PAUSE_S)
         if self.bus.zap is not None:
             self.bus.zap.refresh()
             self._end_revoked_sessions()
@@ -220,7 +220,8 @@ class ControlService(Service):
         if is_other:
             self._on_service_lost(instance, "it restarted")
         is_new = instance not in self._registry
-        if is_new and heartbeat.state == "draining":
+        is_gone = heartbeat.state == "draining" or self._registry.is_left_over(instance, sender)
+        if is_new and is_gone:
             self._check_sessions(heartbeat, sender)  # those that have moved
             return
         replaced = self._registry.replaced_by(heartbeat, sender) if is_new else None

@@ -140,7 +140,10 @@ def test_all_outputs_have_the_same_phones(system: System, command: Command, tmp_
     assert all(phone.duration > 0 for phone in spoken)
     starts = [phone.media_time for phone in spoken]
     assert starts == sorted(starts)
-    said = command("speak", path, "--fast")
+    options, says = ("awaited", "--show", "phones"), "waiting for session awaited"
+    listener = listening(system.control, *options, says=says)
+    said = command("speak", path, "--fast", "--session", "awaited")
+    assert len(output_of(listener)[0].splitlines()) == len(spoken), "it was there in time"
     live = command("render", path, tmp_path / "live.csv", "--live")
     assert num_phones(said) == num_phones(live) == len(spoken)
 

@@ -76,6 +76,8 @@ def test_a_session_continues_without_its_worker(
             sent.send(unsent[:1600], paced=True)
             sent.collect(0.1 if len(unsent) == 0 else 0.0)
             unsent = unsent[1600:]
+            if blow == signal.SIGTERM and name not in instances_of(client):
+                assert session.info["epoch"] > before["epoch"], "it left before its session moved"
         while witness.wait(0.2):
             list(witness.receive())
         if blow == signal.SIGSTOP:
@@ -106,6 +108,10 @@ def test_a_session_continues_without_its_worker(
         largest = np.maximum(np.abs(np.diff(undisturbed.faps, axis=0)).max(axis=0), UNSEEN)
         steps = np.abs(np.diff(sent.faps, axis=0)).max(axis=0)
         assert (steps <= LARGEST_STEP * largest).all()
+
+
+def instances_of(client: Client) -> set[str]:
+    return {state.instance for state in client.status().services}
 
 
 def num_missing_samples(sent: Stream, num_samples: int) -> int:

@@ -162,6 +162,15 @@ class Follower:
             self._transport.drain(self._connection)
         self._deliver_held()
 
+    def await_confirmation(self) -> Any:
+        """Wait until every publisher confirms again; return the connection.
+
+        The caller must subscribe to ``joined`` again on this connection.
+        """
+        self.is_complete = False
+        self._confirmed.clear()
+        return self._connection
+
     def close(self) -> None:
         """Unsubscribe; no message is passed on any more."""
         for connection in (self._connection, self._old_connection):

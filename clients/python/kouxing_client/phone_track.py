@@ -6,15 +6,17 @@ from collections.abc import Iterable, Iterator
 
 from msgspec.structs import replace
 
-from kouxing_client.messages import SILENCE, Phone
+from kouxing_client.messages import SILENCE, Phone, Speech
+
+_TOLERANCE = 160  # samples
 
 
 class PhoneTrack:
-    """Passes on each phone of a session once, whichever recognizers publish it.
+    """Passes on each phone of a session once, even if several recognizers publish it.
 
     A recognizer that takes a session over numbers its phones again, and may repeat phones. The
     track continues the numbers and drops the repeated phones. ``num_missed`` counts final phones
-    that were published but did not arrive, by gaps in their numbers.
+    that were published but did not arrive, by gaps in their numbers and times.
     """
 
     def __init__(self) -> None:
@@ -25,8 +27,24 @@ class PhoneTrack:
         self._open: dict[int, Phone] = {}  # that are not final, by index
         self._next_final: int | None = None  # the recognizer's index of its next final phone
         self._end = 0  # media time at which the last final phone ends
+        self._is_speaking = False
+        self._speech_time = 0  # media time of the last change of that
 
-    def restart(self) -> list[Phone]:
+    def add_speech(self, speech: Speech) -> list[Phone]:
+        """Note that speech starts or stops; return the phones that change for the program.
+
+        The first message of another recognizer has the time at which it continues.
+        """
+        changed: list[Phone] = []
+        if speech.sequence == 1:
+            known = max(self._end, self._speech_time) + _TOLERANCE
+            if self._epoch and self._is_speaking | speech.active and speech.media_time > known:
+                self.num_missed += 1  # at least
+            changed = self._restart()
+        self._is_speaking, self._speech_time = speech.active, speech.media_time
+        return changed
+
+    def _restart(self) -> list[Phone]:
         """Continue with another recognizer; return the open phones as withdrawn."""
         withdrawn = [_withdraw(phone) for phone in self._open.values()]
         self._open.clear()
@@ -38,7 +56,7 @@ class PhoneTrack:
         changed: list[Phone] = []
         if phone.epoch > self._epoch and phone.index < (self._next_final or 0):
             self.num_missed += 1  # at least: another recognizer's first messages
-            changed = self.restart()
+            changed = self._restart()
         self._epoch = phone.epoch
         if phone.final:
             first = phone.index if self._next_final is None else self._next_final
@@ -47,16 +65,14 @@ class PhoneTrack:
         phone = replace(phone, index=self._base + phone.index)
         was_open = self._open.pop(phone.index, None) is not None
         is_new = phone.media_time + phone.duration // 2 >= self._end
-        if not is_new and phone.final and was_open:
-            phone, is_new = _withdraw(phone), True
-        if not is_new:
+        if phone.final:
+            self._end = max(self._end, phone.media_time + phone.duration)
+        if not is_new and not (phone.final and was_open):
             return changed
         self._next = max(self._next, phone.index + 1)
         if not phone.final:
             self._open[phone.index] = phone
-        else:
-            self._end = max(self._end, phone.media_time + phone.duration)
-        return [*changed, phone]
+        return [*changed, phone if is_new else _withdraw(phone)]
 
     def _skip(self, indices: Iterable[int]) -> Iterator[Phone]:
         """Withdraw phones that an interruption dropped; count those that never arrived."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
@@ -13,6 +14,7 @@ from kouxing_client.messages import (
     EndOfFaps,
     FapFrame,
     Fields,
+    Joined,
     Message,
     Phone,
     Result,
@@ -20,6 +22,7 @@ from kouxing_client.messages import (
     Speech,
     decode,
     encode,
+    topic,
 )
 from kouxing_client.phone_track import PhoneTrack
 
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 
 RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
 MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may take to move
+END_LIMIT_S = 5.0  # after the last face, for the last phones
 LAST_S = 0.5  # for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
 SILENT_S = 2.0  # without results, a followed session may have moved or ended unnoticed
@@ -102,18 +106,26 @@ class Subscription:
             needed | {Speech} if Phone in classes else needed,
             self._on_message,
             live=session.is_live,
-            on_complete=lambda: self._join(None),
+            on_complete=self._on_complete,
         )
+        self._end_limit_s = math.inf
 
     def start(self) -> None:
         """Subscribe where the session is published now."""
         self.follower.start(self._session.epoch, self._session.endpoints)
 
+    def tick(self) -> None:
+        """Notice deadlines that have passed; call this regularly."""
+        self.follower.tick()
+        if self.follower.has_ended and self._session.sockets.now_s > self._end_limit_s:
+            self._end_limit_s = math.inf
+            self.inbox.end(None)
+
     def end(self, failure: KouxingError | None) -> None:
         """Stop; a failure says why the session is over."""
         self.follower.drain()
         self.follower.close()
-        self.inbox.end(failure)
+        self.inbox.end(None if self.follower.has_ended else failure)
         self._join(failure or KouxingError("the subscription is closed"))
 
     def _join(self, failure: KouxingError | None) -> None:
@@ -123,12 +135,11 @@ class Subscription:
 
     def _on_message(self, message: Any) -> None:
         if isinstance(message, EndOfFaps):
-            self.follower.drain()  # results of the other publisher may have arrived
-            self.inbox.end(None)
+            self._on_end()
         elif isinstance(message, Phone):
             self._pass_on(self._phones.update(message))
-        elif isinstance(message, Speech) and message.sequence == 1:  # of another recognizer
-            self._pass_on(self._phones.restart())
+        elif isinstance(message, Speech):
+            self._pass_on(self._phones.add_speech(message))
         self.inbox.num_missed = self.follower.num_missed + self._phones.num_missed
         if type(message) in self._classes and not isinstance(message, Phone):
             self._on_result(message)
@@ -137,6 +148,25 @@ class Subscription:
             if weights is not None:
                 place = {name: getattr(message, name) for name in Message.__struct_fields__}
                 self._on_result(Shapes(**place, set=self._shape_set, weights=weights))
+
+    def _on_end(self) -> None:
+        """End; before that, wait for the last phones, because they have another publisher.
+
+        It confirms a subscription after everything that it has published before.
+        """
+        if Phone not in self._classes:
+            self.inbox.end(None)
+            return
+        self._end_limit_s = self._session.sockets.now_s + END_LIMIT_S
+        joined = [topic(Joined.kind, self._session.name)]
+        connection = self.follower.await_confirmation()
+        for on in (False, True):
+            self._session.sockets.set_topics(connection, joined, on=on)
+
+    def _on_complete(self) -> None:
+        if self.follower.has_ended:
+            self.inbox.end(None)
+        self._join(None)
 
     def _pass_on(self, phones: list[Phone]) -> None:
         for phone in phones:
@@ -257,7 +287,7 @@ class SessionCore:
         """Send audio that waits; notice missing answers and deadlines that have passed."""
         now_s = self.sockets.now_s
         for subscription in self._subscriptions:
-            subscription.follower.tick()
+            subscription.tick()
         if self._closing and now_s > self._closing[0]:
             self.end(KouxingError(f"control has closed the session: {self._closing[1]}"))
         elif self._unknown and now_s > self._unknown[0] + MOVE_LIMIT_S:
