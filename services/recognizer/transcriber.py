@@ -78,5 +78,6 @@ def _recognizer_in(folder: Path) -> Any:
 
 def _model_in(folder: Path, name: str) -> str | None:
     """Return the smallest file whose name starts with a name."""
-    paths = sorted(folder.glob(f"{name}*.onnx"), key=lambda path: path.stat().st_size)
+    files = filter(Path.is_file, folder.glob(f"{name}*.onnx"))
+    paths = sorted(files, key=lambda path: path.stat().st_size)
     return str(paths[0]) if paths else None
