@@ -61,8 +61,7 @@ _BRACES = re.compile(r"\{[^{}]*\}")
 _INLINE_TIME = re.compile(r"<\d{1,3}:[\d:.]+>")
 _TAG = re.compile(r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--")
 _MARKUP = re.compile(  # one pass, without going back
-    r"<!\[CDATA\[(?P<plain>[^\]]*(?:\](?!\]>)[^\]]*)*)\]\]>"
-    r"|<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
+    r"<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
     r"|(?P<data><?[^<]+|<)"
 )
 _ALIAS = re.compile(r"""\balias\s*=\s*(["'])(.*?)\1""", re.DOTALL)
@@ -74,6 +73,7 @@ _UNSPOKEN_ELEMENTS = {
     *("metadata", "desc", "copyright", "lexicon", "styling", "layout"),
 }
 _LINE_ELEMENTS = {"br", "div", "h1", "h2", "h3", "h4", "li", "p", "s", "td", "text", "tr"}
+_MAX_OPEN = 100  # elements in each other; an end tag looks at all of them
 _UNSPOKEN_LABELS = {"sil", "sp", "spn", "pau", "silence", "<sil>", "<eps>", "#"}
 
 
@@ -263,13 +263,16 @@ def _read_markup(text: str) -> str:
     """
     first, *others = _INLINE_TIME.sub("", text).split("<!--")
     text = first + "".join(comment.partition("-->")[2] for comment in others)
+    first, *others = text.split("<![CDATA[")
+    sections = (other.partition("]]>") for other in others)
+    text = first + "".join(html.escape(plain) + rest for plain, _, rest in sections)
     spoken: list[str] = []
     unspoken: list[str] = []  # open elements whose text is not spoken
     for match in _MARKUP.finditer(text):
         if match["tag"]:
             _handle_tag(match, spoken, unspoken)
         elif not unspoken:
-            spoken.append(match["plain"] or html.unescape(match["data"] or ""))
+            spoken.append(html.unescape(match["data"] or ""))
     return "".join(spoken)
 
 
@@ -284,7 +287,8 @@ def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> N
     alias = _ALIAS.search(tag["rest"]) if name == "sub" else None
     if alias and not unspoken:
         spoken.append(html.unescape(alias[2]))
-    if (name in _UNSPOKEN_ELEMENTS or alias) and not tag["rest"].endswith("/"):
+    is_open = not tag["rest"].endswith("/") and len(unspoken) < _MAX_OPEN
+    if is_open and (name in _UNSPOKEN_ELEMENTS or alias):
         unspoken.append(name)
 
 

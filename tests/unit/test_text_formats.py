@@ -245,3 +245,18 @@ def test_reports_each_word_that_cannot_be_read(capsys: pytest.CaptureFixture[str
 )
 def test_reads_pinyin_with_any_punctuation(text: str) -> None:
     assert MANDARIN.read(text).phones == [("n", "i"), ("h", "ao"), ("n", "v"), ("er",)]
+
+
+@pytest.mark.parametrize(
+    ("text", "spoken"),
+    [
+        ("<html>" + "<a " * 500_000, "<a " * 500_000),
+        ("<html>" + "<![CDATA[" * 500_000, ""),
+        ("<html>" + "<!--" * 500_000, ""),
+        ("<html>" + "<title>" * 200_000 + "</x>" * 200_000, ""),
+        ("# a\n" + "![" * 500_000, "a\n" + "![" * 500_000),
+    ],
+)
+def test_reads_damaged_markup_in_linear_time(text: str, spoken: str) -> None:
+    """The test would need hours otherwise."""
+    assert extract_text(text).text.strip() == spoken.strip()
