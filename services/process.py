@@ -50,6 +50,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     raise_file_limit()
     try:
         service = make_service()
+        service.startup()
     except ImportError as error:
         print(f"{name}: {error}; install kouxing again (in a checkout: make)", file=sys.stderr)
         return 2

@@ -179,17 +179,16 @@ class Service(MessageLoop):
     # --- life cycle ----------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Run until a signal or the end of the supervisor."""
+        """Run after ``startup()``, until a signal or the end of the supervisor."""
         self._install_signal_handlers()
         gc.freeze()  # a full collection would stop the loop for 100 ms
         gc.enable()  # see services.process
         trim_heap()
-        self.startup()
         self.main_loop()
         self.shutdown()
 
     def startup(self) -> None:
-        """Register with control."""
+        """Register with control. Raises ``UserError`` if the metrics' port cannot be bound."""
         self.on_startup()
         if self.config.metrics_port:
             from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used

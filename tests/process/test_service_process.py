@@ -42,16 +42,20 @@ def test_ctrl_c_in_imports_prints_nothing(tmp_path: Path, module: str, slow_impo
     assert ended(module, PYTHONPATH=path) == (-signal.SIGINT, "")
 
 
-@pytest.mark.parametrize(("service", "key"), [("recognizer", "audio"), ("gateway", "port")])
+@pytest.mark.parametrize(
+    ("service", "key"),
+    [("recognizer", "audio"), ("gateway", "port"), ("synthesizer", "metrics_port")],
+)
 def test_reports_a_port_in_use(service: str, key: str) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        value = str(port) if service == "gateway" else f"tcp://127.0.0.1:{port}"
-        status, log = ended(f"kouxing.services.{service}", **{variable(service, key): value})
+        value = str(port) if key.endswith("port") else f"tcp://127.0.0.1:{port}"
+        environment = {**own_addresses([service]), variable(service, key): value}
+        status, log = ended(f"kouxing.services.{service}", **environment)
     assert status == 2
-    assert f"{service}.{key}" in log
+    assert key in log
     assert "Traceback" not in log
 
 

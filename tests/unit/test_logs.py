@@ -16,6 +16,9 @@ from kouxing.shared.logs import LOG, configure
 class Crashing:
     current_session = "second"
 
+    def startup(self) -> None:
+        pass
+
     def run(self) -> None:
         LOG.warning("dropped", extra={"session": "first"})
         raise ZeroDivisionError
