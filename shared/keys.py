@@ -426,4 +426,6 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
         new.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            new.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None

@@ -18,21 +18,20 @@ from pathlib import Path
 def announce(control: str) -> Iterator[None]:
     """Let this user's commands find a system while it runs.
 
-    If the folder cannot be used, nothing is announced.
+    If the folder cannot be used or written, nothing is announced.
     """
     folder = _folder()
     if folder is None:
         yield
         return
     path = folder / str(os.getpid())
-    with path.open("w", encoding="utf-8") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        file.write(control)
-        file.flush()
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
+    with contextlib.ExitStack() as stack:
+        stack.callback(path.unlink, missing_ok=True)
+        with contextlib.suppress(OSError):  # such as a full disk
+            file = stack.enter_context(path.open("wb", buffering=0))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(control.encode())
+        yield
 
 
 @contextlib.contextmanager
@@ -67,7 +66,9 @@ def find_control() -> str:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                return file.read()
+                if control := file.read():
+                    return control
+                continue
             path.unlink()  # its system has ended
     return ""
 

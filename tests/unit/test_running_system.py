@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from contextlib import ExitStack
@@ -72,3 +73,14 @@ def test_a_second_start_waits_for_the_first(monkeypatch: pytest.MonkeyPatch) -> 
     with starting(lambda: waits.append("waits")):
         assert operations == [fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_EX]
     assert waits == ["waits"]
+
+
+def test_a_system_that_cannot_be_announced_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full_disk:
+        full_disk.setattr(Path, "open", fail)
+        with announce("tcp://127.0.0.1:1"):
+            pass
+    assert find_control() == ""
