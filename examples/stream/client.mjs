@@ -108,9 +108,12 @@ async function speak() {
 }
 const speaking = speak(); // while frames are received
 
+let newest = 0;
 for await (const message of faps) {
   const [kind, frame] = read(message);
   if (kind === "end-of-faps") break;
+  if (kind !== "fap-frame" || frame.sequence <= newest) continue; // some are repeated for others
+  newest = frame.sequence;
   const values = new Float32Array(new Uint8Array(frame.values).buffer); // 68
   console.log("at", frame.media_time / 16000, "s the jaw opens by", values[2]); // FAP 3
 }

@@ -113,9 +113,13 @@ while not is_last:
     )
     num_sent += num_frames
 
-while (message := receive(faps))[0] == "fap-frame":
-    values = struct.unpack("<68f", message[1]["values"])
-    print("at", message[1]["media_time"] / 16000, "s the jaw opens by", values[2])  # FAP 3
+newest = 0
+while (message := receive(faps))[0] != "end-of-faps":
+    kind, frame = message
+    if kind == "fap-frame" and frame["sequence"] > newest:  # some are repeated for others
+        newest = frame["sequence"]
+        values = struct.unpack("<68f", frame["values"])
+        print("at", frame["media_time"] / 16000, "s the jaw opens by", values[2])  # FAP 3
 
 send(control, "close-session", session, request="2", token=token)
 receive(control)
