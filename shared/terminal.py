@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import sys
@@ -26,8 +27,12 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the re
 
 
 def print_message(text: str) -> None:
-    """Print a message to standard error. Standard output is for results."""
-    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+    """Print a message to standard error, unless that is a file on a full disk.
+
+    Standard output is for results.
+    """
+    with contextlib.suppress(OSError):
+        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def open_progress() -> Progress:

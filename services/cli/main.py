@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 from collections.abc import Callable
 from importlib.metadata import entry_points, version
@@ -138,5 +140,13 @@ def main() -> None:
     try:
         app(prog_name="kouxing")
     except UserError as error:
-        CONSOLE.print(f"kouxing: {error}", style="red", markup=False, soft_wrap=True)
-        sys.exit(2)
+        text = str(error)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        text = f"{error.filename or 'the output'}: cannot be written: {error.strerror}"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python writes the rest when it exits
+    else:
+        return
+    CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)
+    sys.exit(2)

@@ -264,3 +264,17 @@ command_line.main()
         text=True,
     )
     assert done.stdout == "step 1\n"
+
+
+def test_a_full_disk_gives_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "kouxing", "--version"],
+            cwd=ROOT,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+            text=True,
+        )
+    text = "kouxing: the output: cannot be written: No space left on device\n"
+    assert (done.returncode, done.stderr) == (2, text)
