@@ -44,7 +44,8 @@ _CLOSED_LICENSE = re.compile(
     r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
 )
 _MIN_PHONE_S = 0.03
-_MAX_LIST_BYTES = 256 << 20  # a million recordings
+_MAX_LIST_BYTES = 256 << 20
+_MAX_ROWS = 1_000_000
 _AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")
 
@@ -192,8 +193,7 @@ def duration_s(path: Path) -> float:
 
 
 def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:
-    lines = io.StringIO(read_text(path, _MAX_LIST_BYTES), newline="")
-    reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
+    reader = csv.DictReader(_lines(path), delimiter="\t", quoting=csv.QUOTE_NONE)
     columns = set(reader.fieldnames or ())
     missing = sorted({"utt_id", "path"} - columns)
     if not columns & {"pinyin", "text"}:
@@ -249,8 +249,15 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
             )
 
 
+def _lines(path: Path) -> Iterator[str]:
+    for number, line in enumerate(io.StringIO(read_text(path, _MAX_LIST_BYTES), None)):
+        if number > _MAX_ROWS:
+            raise UserError(f"{path} has more than {_MAX_ROWS} rows; split it")
+        yield line
+
+
 def _pairs(path: Path) -> Iterator[tuple[str, str]]:
-    for line in io.StringIO(read_text(path, _MAX_LIST_BYTES), None):
+    for line in _lines(path):
         key, _, value = line.strip().partition(" ")
         if key:
             yield key, value.strip()

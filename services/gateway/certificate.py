@@ -15,7 +15,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import open_file
 
+_MAX_BYTES = 1 << 20
 _VALID_DAYS = 397  # browsers reject certificates that are valid for longer
 
 
@@ -29,6 +31,7 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     try:
         if not certificate.exists():
             _write_private(certificate, _self_signed(hosts))
+        open_file(certificate, _MAX_BYTES).close()  # OpenSSL would wait for a FIFO
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.load_cert_chain(certificate)
     except (OSError, ssl.SSLError) as error:

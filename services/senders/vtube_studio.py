@@ -24,8 +24,10 @@ from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import key_folder
 from kouxing.shared.logs import LOG
+from kouxing.shared.user_file import parse_json, read_text
 
 _TOKENS = "vtube-studio.json"
+_MAX_TOKENS_BYTES = 1 << 20
 TIMEOUT_S = 5.0  # of a connection attempt, and of sending a frame
 
 PLUGIN = {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
@@ -276,8 +278,8 @@ class VTubeStudioConnection(Connection):
 def _read_tokens() -> dict[str, str]:
     """Return the tokens issued by VTube Studio, by its address."""
     try:
-        tokens = json.loads((key_folder() / _TOKENS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        tokens = parse_json(read_text(key_folder() / _TOKENS, _MAX_TOKENS_BYTES))
+    except (UserError, ValueError):
         return {}
     return tokens if isinstance(tokens, dict) else {}
 

@@ -36,12 +36,14 @@ import torch
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import open_file
 from kouxing.training.neural.network import Encoder, Network, Shape
 from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
 
 _FILE_NAME = "model.bin"
 _MIN_VERSION = 4
 _MAX_RANK = 4
+_MAX_BYTES = 4 << 30
 _KINDS = {0: "<f4", 1: "<i1", 2: "<i2", 3: "<i4", 4: "<f2"}  # elements of an array
 _OF_LAYER = {
     "attention_norm": "self_attention/layer_norm",
@@ -115,7 +117,7 @@ def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.flo
 
 def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the encoder's arrays; ValueError if the file is invalid."""
-    with path.open("rb") as file:
+    with open_file(path, _MAX_BYTES) as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)  # ValueError if it is empty
     version = _number(content, "<I")
     if version < _MIN_VERSION:

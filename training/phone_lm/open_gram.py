@@ -22,8 +22,10 @@ from rich.progress import track
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.user_file import open_file, read_file
 from kouxing.training.phone_lm.recipe import Stream, phones_of_text
 
+_MAX_BYTES = 4 << 30
 _BASE = 100_000  # of the n-grams' codes, greater than the number of words
 _NUM_CHAINS = 100_000  # drawn in parallel
 _CONTEXT_WORDS = 2
@@ -116,9 +118,9 @@ def _next_words(
 def _levels(path: Path) -> list[_Level]:
     rows: list[list[tuple[int, float]]] = []
     try:
-        with path.open(encoding="ascii") as lines:
+        with open_file(path, _MAX_BYTES) as lines:
             for line in track(lines, description="n-grams"):
-                if line.startswith("\\"):
+                if line.startswith(b"\\"):
                     rows.append([])
                     continue
                 columns = line.split()
@@ -140,7 +142,7 @@ def _levels(path: Path) -> list[_Level]:
 
 def _words(path: Path) -> list[str]:
     try:
-        content = path.read_bytes()
+        content = read_file(path, _MAX_BYTES)
         (start,) = struct.unpack("<I", content[_WORDS_OFFSET])
         return content[start:].decode("utf-32-le").split("\0")
     except (OSError, struct.error, UnicodeDecodeError) as error:

@@ -39,10 +39,12 @@ from kouxing.services.recognizer.acoustic.model_file import (
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.user_file import read_text
 from kouxing.training.training_set import MAX_WORD_PHONES, Example, Report
 
 Stream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
 
+_MAX_TEXT_BYTES = 1 << 30
 _UNSEEN_COUNT = 0.5  # added to the count of each single phone
 _MIN_REMAINDER = 1e-4
 _MAX_CODE = np.iinfo(np.int64).max
@@ -265,10 +267,7 @@ def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
 
 
 def _sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
-    try:
-        lines = text.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"cannot read {text} as UTF-8: {error}") from error
+    lines = read_text(text, _MAX_TEXT_BYTES).splitlines()
     sentences = []
     for line in track(lines, description=text.name):
         for sentence in inventory.readable.findall(line):
