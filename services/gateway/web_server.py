@@ -34,7 +34,7 @@ LOG_PERIOD_S = 60.0  # between two log lines about errors at the same place
 _CHECK_S = 1.0
 _SHUTDOWN_S = 0.5  # until handlers are cancelled
 _RETRY_S = 1.0  # when the system has no free descriptor
-# asyncio logs an error if a connection ends while the system sends a file to it.
+# If a connection ends during the system call sendfile, asyncio logs an error.
 web_fileresponse.NOSENDFILE = True  # type: ignore[misc]
 _HEADERS = {  # of every answer
     "X-Content-Type-Options": "nosniff",
