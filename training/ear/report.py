@@ -51,6 +51,7 @@ _PROBABLE = 0.5
 _SNR_DB, _SUNG_SNR_DB = 10.0, 5.0
 _DELAY_S = 0.055
 _KNOWN_SAMPLES = 720  # from the first sample of a position to the end of the known audio
+_MIN_KNOWN = 50  # positions of a clip with a known opening
 _NUM_FOLDS = 4  # groups of speakers
 _NUM_COMPONENTS = 96
 _STRIDE = 2  # every second position fits the linear maps
@@ -203,8 +204,10 @@ def _print_lips(
     console: Console,
 ) -> None:
     conditions = _conditions(sounds)
-    used = [clip for clip in clips if clip.is_in_sync and len(clip.samples) > SAMPLE_RATE_HZ]
-    targets = [_target_of(clip) for clip in used]
+    in_sync = [(clip, _opening_at_positions(clip)) for clip in clips if clip.is_in_sync]
+    usable = [pair for pair in in_sync if np.isfinite(pair[1]).sum() >= _MIN_KNOWN]
+    used = [clip for clip, _ in usable]
+    targets = [(one - np.nanmean(one)) / np.nanstd(one) for _, one in usable]
     features: dict[str, dict[str, list[Floats]]] = {}
     for condition, disturb in conditions.items():
         of_clips: dict[str, list[Floats]] = defaultdict(list)
@@ -219,13 +222,12 @@ def _print_lips(
     print_table(console, "correlation of the opening, clips", ("input", "clips", *conditions), rows)
 
 
-def _target_of(clip: LipClip) -> Floats:
-    """Return the opening at each position, with the mean 0 and the deviation 1; NaN if unknown."""
+def _opening_at_positions(clip: LipClip) -> Floats:
+    """Return the opening at each position, FAP units; NaN if it is unknown."""
     num_positions = len(inputs_of(clip.samples))
     known_s = (POSITION_SAMPLES * np.arange(num_positions) + _KNOWN_SAMPLES) / SAMPLE_RATE_HZ
     opening = interpolate_track(clip.time_s, opening_of(clip), known_s - _DELAY_S)
-    standard: Floats = ((opening - np.nanmean(opening)) / np.nanstd(opening)).astype(np.float32)
-    return standard
+    return opening.astype(np.float32)
 
 
 def _lip_features(ear: EarRunner, teachers: Teachers, samples: Floats) -> dict[str, Floats]:

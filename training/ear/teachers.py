@@ -40,6 +40,7 @@ from torch.nn.functional import pad
 
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.network import MAX_POSITIONS
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
@@ -125,11 +126,17 @@ class Teachers:
 
     @torch.no_grad()
     def causal_values(self, frames: Tensor) -> Floats:
-        """Run the causal network: (1, frames, 80) to (positions, 2 width)."""
-        self._values.clear()
-        with mixed_precision():
-            self._causal(frames)
-        return torch.cat(self._values, dim=-1)[0].float().numpy()
+        """Run the causal network: (1, frames, 80) to (positions, 2 width).
+
+        After 30 s it starts again with an empty past, like the live network.
+        """
+        parts = []
+        for start in range(0, frames.shape[1] - 2, 2 * MAX_POSITIONS):
+            self._values.clear()
+            with mixed_precision():
+                self._causal(frames[:, start : start + 2 * MAX_POSITIONS + 1])
+            parts.append(torch.cat(self._values, dim=-1)[0].float())
+        return torch.cat(parts).numpy()
 
     def _keep_values(self, _layer: nn.Module, _inputs: object, outputs: Tensor) -> None:
         self._values.append(outputs[..., 2 * outputs.shape[-1] // 3 :])
