@@ -140,10 +140,14 @@ class Chromium:
         x, y = self.evaluate(
             "(async () => {"
             "const drawn = () => new Promise((done) => requestAnimationFrame(done));"
-            "await drawn(); await drawn();"
             f"const target = document.querySelector('#{name}');"
+            "let x, y, width, height, before;"
+            "do {"  # until the page no longer moves
+            "before = x + ',' + y;"
+            "await drawn(); await drawn();"
             "target.scrollIntoView({ block: 'nearest' });"
-            "const { x, y, width, height } = target.getBoundingClientRect();"
+            "({ x, y, width, height } = target.getBoundingClientRect());"
+            "} while (before !== x + ',' + y);"
             "const place = [x + width / 2, y + height / 2];"
             "const hit = document.elementFromPoint(...place);"
             "if (!target.contains(hit)) throw Error(`at ${place}: ${hit?.outerHTML}`);"

@@ -179,5 +179,6 @@ def test_reports_a_missing_camera(browser: Browser) -> None:
 def test_explains_that_cameras_need_https(browser: Browser) -> None:
     browser.evaluate("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
     browser.click("learn")
+    browser.wait_for("window.kouxing.state.lesson === 'intro'")
     assert "https" in text_of(browser, "lesson-insecure")
     browser.wait_for("document.getElementById('lesson-start').disabled")
