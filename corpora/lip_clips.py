@@ -13,7 +13,6 @@ folder names further clips and speakers to hold out.
 from __future__ import annotations
 
 import csv
-import io
 import itertools
 import zlib
 from collections.abc import Collection
@@ -34,7 +33,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.user_file import check_content, parse_json, read_text
+from kouxing.shared.user_file import check_content, parse_json, read_text, split_lines
 
 Array = NDArray[np.float64]
 
@@ -160,8 +159,9 @@ def _read_clip(
         if language not in (None, clip_language):
             return None
         license_name, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
-        table = io.StringIO(read_text(path.with_suffix(".csv"), _MAX_BYTES), newline="")
-        rows = list(itertools.islice(csv.DictReader(table), _MAX_ROWS + 1))
+        table = path.with_suffix(".csv")
+        lines = split_lines(table, read_text(table, _MAX_BYTES))
+        rows = list(itertools.islice(csv.DictReader(lines), _MAX_ROWS + 1))
         if not rows or None in rows[0] or len(rows) > _MAX_ROWS:
             raise ValueError(
                 f"its table has no rows, more than {_MAX_ROWS}, or rows longer than its header"

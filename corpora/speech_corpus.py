@@ -22,7 +22,6 @@ are cut into pieces that overlap by 0.48 s, and so are their texts.
 from __future__ import annotations
 
 import csv
-import io
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -33,7 +32,7 @@ from kouxing.shared.audio_file import read_duration_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 from kouxing.shared.terminal import plural
-from kouxing.shared.user_file import check_content, read_text
+from kouxing.shared.user_file import check_content, read_text, split_lines
 
 # Licenses that allow distributing a model trained on the data.
 _FREE_LICENSE = re.compile(
@@ -250,7 +249,7 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    for number, line in enumerate(io.StringIO(read_text(path, _MAX_LIST_BYTES), None)):
+    for number, line in enumerate(split_lines(path, read_text(path, _MAX_LIST_BYTES))):
         if number > _MAX_ROWS:
             raise UserError(f"{path} has more than {_MAX_ROWS} rows; split it")
         yield line

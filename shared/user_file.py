@@ -7,6 +7,7 @@ before they are opened. A file that grows is read up to the size that it had.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import stat
@@ -16,6 +17,7 @@ from typing import Any, BinaryIO
 
 from kouxing.shared.errors import UserError
 
+_MAX_LINE = 1_000_000
 _MAX_JSON_VALUES = 2_000_000  # a value needs up to 150 bytes of memory
 
 
@@ -55,6 +57,14 @@ def read_text(path: Path, max_bytes: int) -> str:
         return read_file(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UserError(f"{path}: this is not text in UTF-8; convert it") from None
+
+
+def split_lines(path: Path, text: str) -> Iterator[str]:
+    """Yield the lines of a file's text; ``UserError`` if one is too long to split into columns."""
+    for number, line in enumerate(io.StringIO(text, None), start=1):
+        if len(line) > _MAX_LINE:
+            raise UserError(f"{path}: line {number} has more than {_MAX_LINE} characters; cut it")
+        yield line
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import codecs
 import csv
-import io
 import itertools
 import re
 from collections.abc import Iterable, Iterator
@@ -25,7 +24,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.user_file import parse_json, read_file
+from kouxing.shared.user_file import parse_json, read_file, split_lines
 
 TABLE_SUFFIXES = (".csv", ".jsonl")
 MAX_BYTES = 128 << 20  # about two hours
@@ -90,7 +89,7 @@ def _read_lines(path: Path) -> Iterator[str]:
         text = "\0"
     if "\0" in text:
         raise UserError(f"{path}: this is not a text file; give a table of curves in UTF-8")
-    return (line for line in io.StringIO(text, None) if line.strip(" ,;\t\n"))
+    return (line for line in split_lines(path, text) if line.strip(" ,;\t\n"))
 
 
 def _csv_rows(path: Path, lines: Iterator[str]) -> Iterator[list[str]]:

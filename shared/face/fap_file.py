@@ -16,7 +16,6 @@ expression_intensity1 expression_select2 expression_intensity2 init_face express
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
 from collections.abc import Iterator
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.user_file import read_file
+from kouxing.shared.user_file import read_file, split_lines
 
 _VERSION = "2.1"
 MAX_BYTES = 256 << 20  # several hours
@@ -72,7 +71,7 @@ def read_fap(path: Path) -> FapAnimation:
     """
     text = read_file(path, MAX_BYTES).decode("utf-8-sig", "replace")
     try:
-        return _parse(text)
+        return _parse(path, text)
     except _BadFileError as error:
         raise UserError(f"{path}, {error}; give a .fap file of version {_VERSION}") from error
 
@@ -101,8 +100,8 @@ def write_fap(path: Path, animation: FapAnimation) -> None:
         raise UserError(f"cannot write {path}: {error.strerror}; choose another path") from error
 
 
-def _parse(text: str) -> FapAnimation:
-    lines = _lines(text)
+def _parse(path: Path, text: str) -> FapAnimation:
+    lines = _lines(path, text)
     number, line = next(lines, (1, ""))
     name, frame_rate_hz, num_frames = _parse_header(number, line.split())
     if num_frames > MAX_FRAMES:
@@ -114,7 +113,7 @@ def _parse(text: str) -> FapAnimation:
             raise _BadFileError(number, f"more frames than the header announces: {num_frames}")
     if num_lines < 2 * num_frames:
         raise _BadFileError(number, f"the file ends after {num_lines // 2} of {num_frames} frames")
-    lines = itertools.islice(_lines(text), 1, None)
+    lines = itertools.islice(_lines(path, text), 1, None)
     faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
     visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
     expressions = np.zeros((num_frames, len(_EXPRESSION_LIMITS)), dtype=np.int64)
@@ -143,9 +142,9 @@ def _parse(text: str) -> FapAnimation:
     return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
 
 
-def _lines(text: str) -> Iterator[tuple[int, str]]:
+def _lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
     """Yield the lines that are neither empty nor comments, with their numbers."""
-    for number, line in enumerate(io.StringIO(text, None), start=1):
+    for number, line in enumerate(split_lines(path, text), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line
 

@@ -103,6 +103,13 @@ def test_open_file_rejects_everything_but_small_regular_files(tmp_path: Path) ->
         open_audio(tmp_path / "device")
 
 
+@pytest.mark.parametrize("name", ["a.csv", "a.fap", "a.tsv"])
+def test_lines_of_tables_are_limited(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("utt_id" * 200_000)
+    with pytest.raises(UserError, match="line 1 has more than 1000000 characters"):
+        dict(READERS)[name](tmp_path / name)
+
+
 def test_a_file_of_the_kernel_is_empty() -> None:
     assert read_file(Path("/proc/self/pagemap"), 1) == b""
 
