@@ -13,7 +13,8 @@ from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 _CODES = {"s16le": "h", "f32le": "f"}
 _FULL_SCALE = 32767
-RESEND_S = 10.0  # acknowledged audio that is kept in case another recognizer needs it
+# Audio before the newest acknowledgement that is kept in case another recognizer needs it
+RESEND_S = 10.0
 MAX_KEPT = 5000  # messages
 # Shortest and longest wait for an acknowledgement before reconnecting
 ANSWER_LIMITS_S = (0.6, 10.0)
@@ -104,12 +105,13 @@ class AudioStream:
         numbered = {**fields, "sequence": self.sequence, "media_time": self.media_time}
         self._kept.append({**numbered, "acknowledge": True})
         self._sent_s.append((self.sequence, now_s))
-        oldest = self.media_time - RESEND_S * MEDIA_RATE_HZ
         self._num_frames += num_frames
-        while self._kept[0]["sequence"] <= self.acknowledged:
-            if self._kept[0]["media_time"] >= oldest:
-                break
-            self._kept.popleft()
+        num_acknowledged = self.acknowledged - self._kept[0]["sequence"] + 1
+        if num_acknowledged > 0:
+            newest = self._kept[min(num_acknowledged, len(self._kept)) - 1]
+            oldest = newest["media_time"] - RESEND_S * MEDIA_RATE_HZ
+            while self._kept[0]["media_time"] < oldest:
+                self._kept.popleft()
 
     def skip(self, num_frames: int) -> None:
         """Advance media time without audio."""

@@ -194,6 +194,8 @@ class Session(BaseSession):
     ) -> Results[Any]:
         """Return results of several classes from now on; raises as ``frames``.
 
+        For 10 s after the session has opened or moved, earlier results since then arrive first.
+
         Parameters
         ----------
         shapes
