@@ -161,7 +161,7 @@ def _utterance(
             raise ValueError(f"no audio file {path}")
         syllables = inventory.pronounce(row.get("pinyin") or row["text"])
         seconds = float(row.get("seconds") or duration_s(path))
-    except (UserError, ValueError, OSError) as error:  # OSError: not a possible name
+    except (UserError, ValueError, OSError) as error:  # OSError: invalid file name
         errors.add(place, str(error))
         return None
     phones = tuple(inventory.index[phone] for syllable in syllables for phone in syllable)

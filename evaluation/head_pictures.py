@@ -97,5 +97,5 @@ def _save(path: Path, image: Image.Image) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         image.save(path, quality=85)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
     return path

@@ -71,7 +71,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
 
 def run_module(name: str) -> None:
     """Run one service, as ``python -m kouxing.services.<name>`` does."""
-    gc.disable()  # until the service runs: collections find nothing, and take a tenth of the start
+    gc.disable()  # until the service runs: collection frees nothing, and takes a tenth of the start
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.kinds import KINDS
     from kouxing.shared.errors import UserError, with_name

@@ -24,7 +24,7 @@ def read_arrays(path: Path, max_bytes: int, expected: str) -> dict[str, NDArray[
     """Read all arrays of an npz file, never a pickle.
 
     Raises ``UserError`` if the file cannot be read, is not an npz file of plain arrays, or has more
-    than ``max_bytes``. The error says that it is not what is ``expected``.
+    than ``max_bytes``. The error says that the file is not ``expected``.
     """
     with open_file(path, max_bytes) as file, check_content(path, expected):
         # ZipFile reads the whole table, so its entries are counted first
@@ -55,6 +55,6 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any
         if stream.tell() + prod(shape) * max(1, kind.itemsize) > entry.file_size:
             raise ValueError(f"{entry.filename} is cut off")
     with archive.open(entry) as stream:
-        content = io.BytesIO(stream.read(entry.file_size))  # at once, so that other threads run
+        content = io.BytesIO(stream.read(entry.file_size))  # one call lets other threads run
         array: NDArray[Any] = npy.read_array(content, allow_pickle=False)
         return array

@@ -44,7 +44,7 @@ from kouxing.shared.user_file import check_content, read_text
 
 PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10
-_MAX_DOTS = 1000  # in a line; tomllib needs memory for the square of a key's parts
+_MAX_DOTS = 1000  # per line; tomllib's memory grows with the square of a key's parts
 COMMON = "common"  # table of the keys that every service has
 
 

@@ -36,8 +36,8 @@ MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of mem
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
 MAX_CONNECTIONS = 1024
-MAX_SHARE = 0.75  # of them, with one key or, until the key is known, from one address
-SERVICES_SHARE = 0.1  # of them, only for services
+MAX_SHARE = 0.75  # of all connections, for one key or, until the key is known, one address
+SERVICES_SHARE = 0.1  # of all connections, reserved for services
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
@@ -48,7 +48,7 @@ MIN_BUDGET = 100.0  # of a new connection: enough for an honest client of a key 
 PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
-MANY_ENDED = 50  # connections, with about 1 MB; giving memory back takes up to 60 ms
+NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENT = struct.Struct("=HI")  # of a monitor: event and descriptor
 _WARNINGS = RateLimit()
 
@@ -261,7 +261,7 @@ class ConnectionLimiter:
         self._sockets: list[LimitedSocket] = []
         self._topic_bytes = 0  # at most; the socket's thread only
         self._trims_s: list[float] = []  # when to give memory back
-        self._num_ended = 0  # connections that ended since memory was given back
+        self._num_ended = 0  # connections that ended since memory was last freed
         self._stops = threading.Event()
         self._thread = threading.Thread(target=self._run, name="connections", daemon=True)
 
@@ -303,7 +303,7 @@ class ConnectionLimiter:
         return [c for c in connections if c.socket is socket and not c.is_cut]
 
     def restore_budget(self, connection: Connection) -> None:
-        """Start a connection with the budget that its owner's earlier ones left."""
+        """Start a connection with the rest of its owner's budget."""
         if (kept := self._budgets.get(connection.owner)) is not None:
             connection.budget = Budget(max(MIN_BUDGET, kept.left))
 
@@ -373,7 +373,7 @@ class ConnectionLimiter:
     def _limit_number(self, connections: list[Connection]) -> None:
         """Disconnect some peers if there are too many: silent ones first, services last.
 
-        The owner with the most connections loses its oldest silent or else its newest one first.
+        The owner with the most connections first loses its oldest silent one, else its newest one.
         """
         max_shared = MAX_SHARE * self._max_connections
         if len(connections) <= max_shared:
@@ -399,7 +399,7 @@ class ConnectionLimiter:
             num_excess = len(group) - max_number
             for connection in group:
                 if num_excess > 0:
-                    connection.disconnect("there are too many connections")
+                    connection.disconnect("too many connections")
                 elif -ranks[connection] > max_shared:
                     owner = "key" if connection.key else "address"
                     connection.disconnect(f"its {owner} has too many connections")
@@ -410,7 +410,7 @@ class ConnectionLimiter:
             del self._connections[connection.inode]
             connection.socket.ended.append(connection.inode)
             self._num_ended += 1
-            if connection.is_cut or connection.unread or self._num_ended >= MANY_ENDED:
+            if connection.is_cut or connection.unread or self._num_ended >= NUM_ENDED_BEFORE_TRIM:
                 self._trims_s = [now_s + delay_s for delay_s in TRIMS_S]
             self.save_budget(connection)
         for owner in [owner for owner, kept in self._budgets.items() if kept.left >= BUDGET]:

@@ -92,13 +92,13 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
                 has_keys = any(folder.glob("*.key"))
                 if name == CONTROL and has_keys:
                     raise UserError(
-                        f"{path} is missing, and the other keys there belong to it. Run this on"
-                        f" control's machine. To run control here, first run: {_replace_hint(path)}"
+                        f"{path} is missing, but other keys need it. Run this on control's machine."
+                        f" To run control here, first run: {_replace_hint(path)}"
                     )
                 if has_keys or not is_here:
                     raise UserError(
                         f"{path} is missing, and a new key can be created only on control's"
-                        f" machine. Run there: {_add_key_hint(roles)} and start this again"
+                        f" machine. Run there: {_add_key_hint(roles)} and try again"
                     )
                 (folder / _ALLOWED).unlink(missing_ok=True)  # keys of another control
                 _write(control_path, _new_key())
@@ -192,8 +192,8 @@ def rejection_hint(control: str, name: str, roles: Collection[str]) -> str:
     path = key_folder() / f"{name}.key"
     return (
         f"control at {address} does not accept {path}. If control runs on this machine, run:"
-        f" {_replace_hint(path)} (or set XDG_STATE_HOME as for control). Otherwise run there:"
-        f" {_add_key_hint(roles)}. A running service then starts again by itself"
+        f" {_replace_hint(path)} (or set XDG_STATE_HOME as for control). Otherwise, run there:"
+        f" {_add_key_hint(roles)}. A running service then restarts by itself"
     )
 
 
@@ -375,8 +375,7 @@ def _locked_folder() -> Iterator[Path]:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
         raise UserError(
-            f"cannot use the folder of the keys: {error}; correct its mode (700), or set"
-            " XDG_STATE_HOME"
+            f"cannot use the key folder: {error}; set its mode to 700, or set XDG_STATE_HOME"
         ) from None
     try:
         _check_private(folder, 0o700)
@@ -403,7 +402,7 @@ def _check_private(path: Path, mode: int) -> None:
     if about.st_uid not in owners:
         raise UserError(f"{path} belongs to another user; change its owner")
     if not about.st_mode & 0o400:
-        raise UserError(f"you cannot read {path}; run 'chmod {mode:o} {path}' and restart")
+        raise UserError(f"no permission to read {path}; run 'chmod {mode:o} {path}' and restart")
     if about.st_mode & others:
         raise UserError(f"other users can read {path}; run 'chmod {mode:o} {path}' and restart")
 

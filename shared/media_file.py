@@ -18,7 +18,7 @@ from kouxing.shared.sound_formats import MIN_UNKNOWN_BYTES, is_sound, why_unread
 
 _MAX_STREAMS = 64
 _MAX_RATE_HZ = 1_000_000
-OPTIONS = {"protocol_whitelist": "none"}  # no network, and no files that a playlist names
+OPTIONS = {"protocol_whitelist": "none"}  # no network access, and no files from playlists
 # A pipe's first frame is decoded as soon as its bytes are there.
 _PIPE_OPTIONS = OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
 _JITTER_S = 0.05  # timestamps that differ less from the number of samples are inexact

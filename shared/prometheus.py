@@ -27,7 +27,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import BUCKETS_MS, Distribution, Metrics
 
 REQUEST_LIMIT_S = 5.0  # for a peer to send its request and read the answer
-MAX_REQUESTS = 16  # at the same time; then the oldest connection is closed
+MAX_REQUESTS = 16  # at the same time; above this, the oldest connection is closed
 # Counters with these prefixes become one metric with a label: name, label and help text.
 LABELED = {
     "in_": ("messages_received", "kind", "Messages received."),

@@ -17,7 +17,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge
 
 RESEND_AFTER_S = 0.5
-MAX_RESENT = 200  # messages at a time; resending more would delay a busy receiver further
+MAX_RESENT = 200  # messages at a time; more would delay a busy receiver further
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
 
 

@@ -11,7 +11,7 @@ from collections import deque
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 
-REPLAY_S = 10.0  # after a session has started at a worker; a busy machine connects slowly
+REPLAY_S = 10.0  # after a worker starts a session; connecting is slow on a busy machine
 MAX_REPLAYED = 2000  # messages
 
 

@@ -56,7 +56,7 @@ NO_REPLY_S = 10.0  # without a reply from control, until the service looks for t
 FIRST_REPLY_S = 3.0  # the same at startup
 LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0
-HAND_OVER_S = 3.0  # in which control moves the sessions of a worker that stops
+HAND_OVER_S = 3.0  # time for control to move the sessions of a stopping worker
 MAX_TICK_GAP_S = 5.0  # without a tick, the service is not healthy
 EXIT_AFTER_S = 15.0  # without a tick, a health check ends the process
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id; the underscore: not a setting
@@ -80,7 +80,7 @@ class Service(MessageLoop):
         self.config = config
         self.name = self.kind.name
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
-        self.has_new_key = False  # so it must start again
+        self.has_new_key = False  # True: the process must restart
         self._has_control = has_control
         self.key = None if config.insecure else self._load_key()
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
@@ -179,7 +179,7 @@ class Service(MessageLoop):
     # --- life cycle ----------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Run after ``startup()``, until a signal or the end of the supervisor."""
+        """Run after ``startup()``, until a signal arrives or the supervisor ends."""
         self._install_signal_handlers()
         gc.freeze()  # a full collection would stop the loop for 100 ms
         gc.enable()  # see services.process
@@ -379,7 +379,7 @@ class Service(MessageLoop):
         with contextlib.suppress(UserError), Bus(self.key) as bus:
             if bus.probe(self.control_endpoint) is Reach.REFUSED:
                 if self.key is not None and self._load_key() != self.key:
-                    LOG.warning("starting again with a new key")
+                    LOG.warning("restarting with a new key")
                     self.has_new_key = self._exit_requested = True
                     return
                 LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))

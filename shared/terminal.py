@@ -27,7 +27,7 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the re
 
 
 def print_message(text: str) -> None:
-    """Print a message to standard error, unless that is a file on a full disk.
+    """Print a message to standard error; ignore a full disk.
 
     Standard output is for results.
     """
@@ -172,9 +172,9 @@ def write_error(path: Path, error: OSError) -> UserError:
     """Return the error for a file that cannot be written."""
     if isinstance(error, FileNotFoundError):
         return UserError(
-            f"{path}: cannot be written: the folder does not exist; run: mkdir -p {path.parent}"
+            f"cannot write {path}: the folder does not exist; run: mkdir -p {path.parent}"
         )
-    return UserError(f"{path}: cannot be written: {error.strerror}")
+    return UserError(f"cannot write {path}: {error.strerror}")
 
 
 def _to_python(value: object) -> object:

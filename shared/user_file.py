@@ -1,4 +1,4 @@
-"""Reads files that a user names: regular files only, up to a limit, with clear errors.
+"""Reads files given by a user: only regular files, up to a size limit, with clear errors.
 
 A FIFO blocks its reader, and a device may never end. Such files are rejected by their status,
 before they are opened. A file that grows is read up to the size that it had.
@@ -38,7 +38,7 @@ def open_file(path: Path, max_bytes: int, *, pipe: bool = False) -> BinaryIO:
         return path.open("rb")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # ValueError: not a possible name
+    except (OSError, ValueError) as error:  # ValueError: invalid file name
         raise _unreadable(path, error) from None
 
 
@@ -56,7 +56,7 @@ def read_text(path: Path, max_bytes: int) -> str:
     try:
         return read_file(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise UserError(f"{path}: this is not text in UTF-8; convert it") from None
+        raise UserError(f"{path}: this is not UTF-8 text; convert it") from None
 
 
 def split_lines(path: Path, text: str) -> Iterator[str]:
@@ -85,7 +85,7 @@ def parse_json(text: str | bytes) -> Any:
 def check_content(path: Path, expected: str) -> Iterator[None]:
     """Raise ``UserError`` for every error of the enclosed parser, whatever its class.
 
-    ``expected`` says what the file must be, and what to do.
+    ``expected`` describes what the file must be; it can add what to do.
     """
     try:
         yield
@@ -99,4 +99,4 @@ def check_content(path: Path, expected: str) -> Iterator[None]:
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
-    return UserError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}")
+    return UserError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}")

@@ -206,11 +206,12 @@ def ear(
     sounds: Sounds,
     untranscribed: Untranscribed = None,
     clips: Annotated[
-        Path | None, typer.Option(help="Folder of clips with tracked lips, for their speech.")
+        Path | None,
+        typer.Option(help="Folder of clips with tracked lips; only their audio is used."),
     ] = None,
     seed: Seed = 0,
     steps: Annotated[
-        int, typer.Option(min=1, help="Number of batches of 140 s of audio.")
+        int, typer.Option(min=1, help="Number of batches, each with 140 s of audio.")
     ] = 20_000,
     any_license: AnyLicense = False,
     force: Force = False,
@@ -234,7 +235,7 @@ def ear(
 
 @app.command()
 def ear_report(
-    model: Annotated[Path, typer.Argument(help="Model file, or checkpoint of the training (.pt).")],
+    model: Annotated[Path, typer.Argument(help="Model file, or training checkpoint (.pt).")],
     corpus: Corpora,
     whisper: Whisper,
     sounds: Sounds,

@@ -45,7 +45,7 @@ class Store:
             path.chmod(0o600)  # in case it existed
             self._file = path.open("a", encoding="utf-8")
         except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+            raise UserError(f"cannot write {path}: {error.strerror}") from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -92,7 +92,7 @@ class Store:
 def read_answers(folder: Path) -> list[Answer]:
     """Read all answers; raises UserError if the file cannot be read."""
     path = folder / FILE_NAME
-    with check_content(path, "a file of answers"):
+    with check_content(path, "a file of listening-test answers"):
         return [Answer(**line) for line in _read_lines(path) if "token" not in line]
 
 

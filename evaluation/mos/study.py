@@ -67,7 +67,7 @@ def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str
     try:
         file.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     except OSError as error:
-        raise UserError(f"{file}: cannot be written: {error.strerror}") from None
+        raise UserError(f"cannot write {file}: {error.strerror}") from None
     return study
 
 

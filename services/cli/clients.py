@@ -306,5 +306,5 @@ def find_system(given: str) -> tuple[str, ServiceConfig]:
     config = settings.load(ServiceConfig, overrides)
     if "*" in config.control:
         key = "--control" if given else "common.control"
-        raise UserError(f"{key}: {config.control!r} does not name a host and port to connect to")
+        raise UserError(f"{key}: {config.control!r} is not a host and port to connect to")
     return running, config

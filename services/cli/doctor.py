@@ -97,7 +97,7 @@ def _check_key(name: str, key: Key | None, address: str) -> Finding:
 
 
 def _roles(name: str) -> Collection[str]:
-    """Return the usual roles of a key, by its name."""
+    """Return the default roles for a key name."""
     return KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
 
 
@@ -138,8 +138,8 @@ def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str
             continue
         if bus.probe(endpoint, is_publisher=is_publisher) is Reach.REFUSED:
             return (
-                f"it does not accept the key {key_name}; see its roles with 'kouxing keys list' on"
-                " control's machine, or restart the service"
+                f"it does not accept the key {key_name}; check its roles with 'kouxing keys list'"
+                " on control's machine, or restart the service"
             )
         return ""
     return ""

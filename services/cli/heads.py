@@ -90,7 +90,7 @@ def export_page_heads(folder: Path) -> None:
             export_glb(load_head(name), part)
             part.replace(folder / file)
     except OSError as error:
-        raise UserError(f"{folder}: cannot be written: {error.strerror}") from None
+        raise UserError(f"cannot write {folder}: {error.strerror}") from None
 
 
 def ensure_page_heads() -> None:

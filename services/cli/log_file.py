@@ -41,7 +41,7 @@ class LogFile:
         except OSError as error:
             self.close()
             if not self._num_dropped:
-                self._warn(f"{self._path}: cannot be written: {error.strerror}")
+                self._warn(f"cannot write {self._path}: {error.strerror}")
             self._num_dropped += 1
         else:
             if self._num_dropped:
@@ -63,11 +63,11 @@ class LogFile:
             descriptor = self._open()
         size = os.fstat(descriptor).st_size
         if os.write(descriptor, line) < len(line):
-            os.ftruncate(descriptor, size)  # otherwise, the next line would follow half of this one
+            os.ftruncate(descriptor, size)  # otherwise, the next line would be appended to this one
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _open(self) -> int:
-        """Return the descriptor of the file; create the file if somebody has deleted it."""
+        """Return the file's descriptor; recreate the file if it was deleted."""
         if self._descriptor is not None and os.fstat(self._descriptor).st_nlink:
             return self._descriptor
         self.close()

@@ -144,8 +144,8 @@ def main() -> None:
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        text = f"{error.filename or 'the output'}: cannot be written: {error.strerror}"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python writes the rest when it exits
+        text = f"cannot write {error.filename or 'the output'}: {error.strerror}"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
     else:
         return
     CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)

@@ -29,7 +29,7 @@ from kouxing.shared.service import DRAIN_TIMEOUT_S
 from kouxing.shared.service_kind import ServiceKind
 
 NAMESPACE = "kouxing"  # of the actors' names
-PLACEMENT_LIMIT_S = 60.0  # until Ray has started as many actors as there are cores
+PLACEMENT_LIMIT_S = 60.0  # maximum wait for Ray to start one actor per core
 
 
 class Worker:
@@ -121,7 +121,7 @@ class RayWorkers:
             ray.kill(actor)  # if it has no host yet, or did not finish
 
     def hosts(self) -> dict[str, str]:
-        """Return the host of each worker by name, or why it has none; waits until they start."""
+        """Wait until the workers start; return each worker's host, or why it has no host."""
         names = [name for kind in KINDS for name in _names(kind)]
         answers = {ray.get_actor(name).host.remote(): name for name in names}
         num_cores = int(ray.cluster_resources().get("CPU", 0))

@@ -79,7 +79,7 @@ def run(
     arguments = ["--config", str(config)] if config else []
     startup = contextlib.ExitStack()
     startup.enter_context(
-        starting(lambda: print_message("another kouxing is starting; this one waits for it"))
+        starting(lambda: print_message("waiting until another kouxing has started"))
     )
     addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
@@ -177,10 +177,10 @@ def _port_remark(settings: Settings, moved: Mapping[str, str], control: str) -> 
         owner = f"another kouxing is running, with control at {running.partition(' ')[0]}"
     else:
         owner = f"other programs use {', '.join(taken)}"
-    remarks = [f"{owner}; this one uses free ports"] if taken else []
+    remarks = [f"{owner}; this kouxing uses free ports"] if taken else []
     if BOUND_CONTROL in moved:
         remarks.append(
-            f"your kouxing commands use this one; for other programs, KOUXING_CONTROL={control}"
+            f"your commands use this kouxing; for other programs, set KOUXING_CONTROL={control}"
         )
     return "; ".join(remarks)
 

@@ -36,7 +36,7 @@ def announce(control: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def starting(on_wait: Callable[[], None]) -> Iterator[None]:
-    """Let this user's systems start one after the other, so that each sees the ports of the others.
+    """Let only one of the user's systems start at a time, so that each detects the others' ports.
 
     ``on_wait`` is called if another system is starting. If the folder cannot be used, nothing
     waits.

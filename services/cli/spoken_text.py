@@ -14,7 +14,7 @@ from kouxing.shared.user_file import read_file
 
 _MAX_BYTES = 8 << 20
 _MAX_CHARACTERS = 150_000
-_MAX_DIGITS = 10_000  # reading a number takes long
+_MAX_DIGITS = 10_000  # converting numbers to words is slow
 _MAX_NAMED = 20  # words in a message
 _TEXT_SUFFIXES = {
     *(".txt", ".text", ".md", ".markdown", ".html", ".htm", ".xml", ".ssml", ".json", ".textgrid"),
@@ -86,7 +86,7 @@ def text_of(text: str) -> str:
 
 
 def _path_of(text: str) -> Path | None:
-    """Return the file that a text names, None if it names none."""
+    """Return the file that a text names; None if the text is not a file name."""
     try:
         path = Path(text)
         if path.suffix.lower() in _TEXT_SUFFIXES or (path.exists() and not path.is_dir()):

@@ -68,8 +68,8 @@ def stream(
 def missed_remark(count: int, noun: str) -> str:
     """Return the message about results that did not arrive."""
     return (
-        f"at least {plural(count, noun)} did not arrive; close other programs, or use a faster"
-        " network, and try again"
+        f"missed at least {plural(count, noun)}; close other programs or use a faster network,"
+        " then try again"
     )
 
 
@@ -128,7 +128,7 @@ class _Streaming:
         return Progress(*columns, console=self._console, transient=True, disable=not is_shown)
 
     def _update(self, timeout_s: float) -> None:
-        """Process what has arrived, waiting up to the timeout for a phone."""
+        """Process received results, waiting up to the timeout for a phone."""
         self._num_phones += sum(phone.is_spoken for phone in self._phones.available(timeout_s))
         for frame in self._frames.available():
             self._show_time(completed=frame.time_s)
@@ -193,7 +193,7 @@ class _Streaming:
             while True:
                 drawn_s = self._drawn_s(DRIVER_TIMEOUT_S)
                 if drawn_s < newest_s:
-                    raise UserError("the driver restarted, so the video is not complete; try again")
+                    raise UserError("the driver restarted, so the video is incomplete; try again")
                 newest_s = drawn_s
                 progress.update(task, completed=drawn_s - drawn_before_s)
                 for event in self._events.available(STATUS_S):

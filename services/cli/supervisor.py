@@ -61,7 +61,7 @@ class Supervisor:
         self._backoff_s = dict.fromkeys(self._names, 0.0)
         self._restart_at_s: dict[str, float] = {}
         self._restarted: set[str] = set()  # services that are not ready again
-        self._followers: dict[str, threading.Thread] = {}  # that copy the logs
+        self._followers: dict[str, threading.Thread] = {}  # threads that copy the logs
         self._errors: dict[str, str] = {}  # newest error in the configuration
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
@@ -74,7 +74,7 @@ class Supervisor:
                 LogFile(path, self._warn).check()
         except OSError as error:
             raise UserError(
-                f"{path}: cannot be written: {error.strerror}; start kouxing in a folder that"
+                f"cannot write {path}: {error.strerror}; start kouxing in a folder that"
                 " you can write to, or add --set driver.out=FOLDER"
             ) from None
 

@@ -60,7 +60,7 @@ _LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
 _BRACES = re.compile(r"\{[^{}]*\}")
 _INLINE_TIME = re.compile(r"<\d{1,3}:[\d:.]+>")
 _TAG = re.compile(r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--")
-_MARKUP = re.compile(  # one pass, without going back
+_MARKUP = re.compile(  # matches in linear time
     r"<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
     r"|(?P<data><?[^<]+|<)"
 )
@@ -73,7 +73,7 @@ _UNSPOKEN_ELEMENTS = {
     *("metadata", "desc", "copyright", "lexicon", "styling", "layout"),
 }
 _LINE_ELEMENTS = {"br", "div", "h1", "h2", "h3", "h4", "li", "p", "s", "td", "text", "tr"}
-_MAX_OPEN = 100  # elements in each other; an end tag looks at all of them
+_MAX_OPEN = 100  # nested elements; each end tag searches all of them
 _UNSPOKEN_LABELS = {"sil", "sp", "spn", "pau", "silence", "<sil>", "<eps>", "#"}
 
 
@@ -258,8 +258,8 @@ def _read_markdown(text: str) -> str:
 def _read_markup(text: str) -> str:
     """Extract the text from SSML, TTML, HTML and subtitles with tags.
 
-    ``html.parser`` is not used: its time grows with the square of a damaged text. Entities that a
-    document defines are not resolved, so they cannot grow.
+    ``html.parser`` is not used, because it needs quadratic time for a damaged text. Entities that
+    a document defines are not expanded, so they cannot exhaust memory.
     """
     first, *others = _INLINE_TIME.sub("", text).split("<!--")
     text = first + "".join(comment.partition("-->")[2] for comment in others)

@@ -25,7 +25,7 @@ MAX_SERVICES = 2000
 MAX_SERVICES_PER_KEY = 1500
 MAX_REMEMBERED = 1000  # lost services that are recognized when they return
 MAX_LATE_S = 5.0  # a service that is back by then was late, not lost
-CALM_S = 60.0  # without a late service, until the usual limit applies again
+TIMEOUT_RESET_S = 60.0  # without a late service, after which the usual timeout applies again
 
 
 @dataclass(slots=True)
@@ -156,8 +156,8 @@ class Registry:
         if not self.load(instance).num_sessions:
             self.forget_load(instance)
 
-    def is_left_over(self, instance: str, peer: Peer) -> bool:
-        """Return whether a heartbeat is from an ended connection of a service that is lost."""
+    def is_stale(self, instance: str, peer: Peer) -> bool:
+        """Return whether a heartbeat is from an ended connection of a lost service."""
         lost = self._lost.get(instance, NO_PEER)
         return lost.connection > 0 and peer.connection == 0
 
@@ -246,8 +246,8 @@ class Registry:
         """Exclude a time in which control did not run from the age of heartbeats."""
         self._paused_s += max(0.0, pause_s)
 
-    def note_return(self, after_s: float, now_s: float) -> None:
-        """Wait longer for heartbeats if a service that was declared lost had only been late.
+    def adapt_timeout(self, after_s: float, now_s: float) -> None:
+        """Increase the heartbeat timeout if a service that was declared lost was only late.
 
         Otherwise, the sessions of a busy machine would move from one late worker to the next.
         """
@@ -261,7 +261,7 @@ class Registry:
 
     def overdue(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
-        if now_s > self._late_at_s + CALM_S:
+        if now_s > self._late_at_s + TIMEOUT_RESET_S:
             self._limit_s = self._usual_limit_s
         oldest = takewhile(
             lambda item: self.age_s(item[0], now_s) > self._limit_s, self._services.items()
@@ -292,5 +292,5 @@ def _check_endpoints(heartbeat: Heartbeat) -> None:
         except UserError as error:
             raise Refusal(ErrorCode.BAD_MESSAGE, str(error)) from None
         if "*" in (host, port):
-            text = f"{name}: {endpoint!r} does not name a host and port to connect to"
+            text = f"{name}: {endpoint!r} is not a host and port to connect to"
             raise Refusal(ErrorCode.BAD_MESSAGE, text)

@@ -103,7 +103,7 @@ class Requests:
         return grant is not None and not set(roles).isdisjoint(grant.roles)
 
     def may_see_token(self, sender: Peer) -> bool:
-        """Return whether a sender may have the page's token: it opens sessions, or is a service."""
+        """Return whether a sender may have the page's token: a client or a service."""
         zap, key = self._bus.zap, sender.key
         return zap is None or self.has_role(key, "client") or zap.is_service(key)
 

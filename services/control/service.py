@@ -55,8 +55,8 @@ from kouxing.shared.wire.speech import Speech
 
 STOPPED = "stopped"  # reason for a service that shut down
 START_TIMEOUT_S = 5.0
-MOVE_TIMEOUT_S = 20.0  # until a session that no worker takes over is closed
-MAX_PAUSE_S = 0.1  # between ticks; the rest of a longer pause is control's, not the services'
+MOVE_TIMEOUT_S = 20.0  # after which a session without a worker is closed
+MAX_PAUSE_S = 0.1  # between ticks; anything longer is control's own delay
 SERVICE_EVENTS = (EventName.ERROR, EventName.RECORDED)  # events that a service may publish
 
 
@@ -220,7 +220,7 @@ class ControlService(Service):
         if is_other:
             self._on_service_lost(instance, "it restarted")
         is_new = instance not in self._registry
-        is_gone = heartbeat.state == "draining" or self._registry.is_left_over(instance, sender)
+        is_gone = heartbeat.state == "draining" or self._registry.is_stale(instance, sender)
         if is_new and is_gone:
             self._check_sessions(heartbeat, sender)  # those that have moved
             return
@@ -259,7 +259,7 @@ class ControlService(Service):
             self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
         uninformed = []
         if was_lost:
-            self._registry.note_return(lasted_s, now_s)
+            self._registry.adapt_timeout(lasted_s, now_s)
             uninformed = self._sessions.reinstate_worker(heartbeat.instance)
         self._restore_sessions()
         for record in self._sessions.pending():
@@ -299,7 +299,7 @@ class ControlService(Service):
             self._announce_if_started(record)
 
     def _on_start_refused(self, error: Error, instance: str) -> None:
-        """Refuse a session that one of its services refuses, unless its client already uses it."""
+        """Reject a session that a service rejected, unless its client already uses it."""
         record = self._sessions.get(error.session)
         if record is None or record.announced or error.request != record.start_request:
             return
@@ -414,7 +414,7 @@ class ControlService(Service):
             self._refuse_session(record, error)
 
     def _refuse_session(self, record: SessionRecord, error: Error) -> None:
-        """End a session that its client does not have yet."""
+        """Reject a session that was not announced to its client, and end it."""
         request = record.opening.request
         self._requests.answer(record.client, request, replace(error, request=request))
         self._end_session(record, error.text)
@@ -431,7 +431,7 @@ class ControlService(Service):
         LOG.info("session closed: %s", reason, extra={"session": record.name})
 
     def _end_revoked_sessions(self) -> None:
-        """End the sessions of keys that were revoked or may open no sessions now."""
+        """End the sessions of keys that were revoked or can no longer open sessions."""
         has_role = self._requests.has_role
         revoked = {key for key in self._sessions.client_keys() if not has_role(key, "client")}
         for record in self._sessions if revoked else ():

@@ -118,7 +118,7 @@ class Sessions:
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         num_of_key = self._num_per_key[client.key]
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
-            text = f"your key has its maximum of open sessions, {num_of_key}; close one first"
+            text = f"your key has {num_of_key} open sessions, the maximum; close one first"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         leaves_room = client.key and num_of_key and not opening.paced  # for another client
         workers = self._placement.place({}, now_s, min_room=2 if leaves_room else 1)

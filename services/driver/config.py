@@ -38,8 +38,8 @@ class DriverConfig(FaceConfig):
     out: str = "out"
     """Folder for recorded videos."""
     max_videos: Annotated[int, Field(ge=1, le=1000)] = 8
-    """Maximum number of videos that are being written. One key can write at most three quarters
-    of them."""
+    """Maximum number of videos that are written at the same time. One key can use at most three
+    quarters."""
     head: str = "woman"
     """Name of a built-in head, or an avatar (.glb, .gltf, .vrm, or an imported .npz)."""
     background: str = "studio"

@@ -1,7 +1,7 @@
 """The process that draws and writes the driver's videos.
 
-OpenGL and the encoder hold Python's lock for up to a second, so they would delay the heartbeats of
-the driver. They also keep memory until their process ends.
+OpenGL and the encoder hold the GIL for up to a second, so they would delay the driver's heartbeats.
+They also keep memory until their process ends.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG, configure
 
 MAX_QUEUED_FRAMES = 180_000  # of one video: an hour at 50 frames per second, 75 MB
-MAX_TURN = 500  # commands before the next image
+MAX_COMMANDS = 500  # commands handled before the next image
 ALIVE_S = 1.0  # between two reports that the process runs
 
 
 class Recorder:
-    """Draws the images of all videos in turn: each client's key gets the same number of images.
+    """Draws the images of all videos in turn, with the same number of images for each key.
 
     ``make`` opens a video. ``report`` is called with ``("image", number)``, ``("written", number,
     path)``, ``("failed", number, reason)`` or, if a video must end before its session,
@@ -41,14 +41,14 @@ class Recorder:
     def __init__(self, make: Callable[[Path], Recording], report: Callable[..., None]) -> None:
         self._make = make
         self._report = report
-        self._recordings: dict[int, Recording] = {}  # in the order of their turns
+        self._recordings: dict[int, Recording] = {}  # least recently drawn first
         self._keys: dict[int, str] = {}
         self._newest_turn: Counter[str] = Counter()  # by key
         self._num_turns = 0
         self._ended: set[int] = set()
 
     def begin(self, number: int, key: str, path: Path) -> None:
-        """Open a video of a client."""
+        """Open a video for a client's key."""
         self._keys[number] = key
         with self._reports_failure(number):
             self._recordings[number] = self._make(path)
@@ -62,8 +62,8 @@ class Recorder:
         if recording.num_queued >= MAX_QUEUED_FRAMES:
             self.end(number)
             reason = (
-                f"the video ends after {time_s / 60:.0f} minutes: {MAX_QUEUED_FRAMES} FAP frames"
-                " are not drawn yet, the limit; send audio in real time, or use 'kouxing render'"
+                f"the video ends after {time_s / 60:.0f} minutes: {MAX_QUEUED_FRAMES} frames are"
+                " queued, the maximum; send audio in real time, or use 'kouxing render'"
             )
             self._report("short", number, reason)
 
@@ -84,7 +84,7 @@ class Recorder:
         for number in sorted(self._recordings, key=lambda n: self._newest_turn[self._keys[n]]):
             with self._reports_failure(number):
                 if self._recordings[number].step():
-                    self._recordings[number] = self._recordings.pop(number)  # the last now
+                    self._recordings[number] = self._recordings.pop(number)  # moves to the end
                     self._num_turns += 1
                     self._newest_turn[self._keys[number]] = self._num_turns
                     self._report("image", number)
@@ -111,21 +111,21 @@ class Recorder:
 
     @contextmanager
     def _reports_failure(self, number: int) -> Iterator[None]:
-        """Report an error as the end of one video; the others continue."""
+        """Report an error as the failure of one video; the others continue."""
         try:
             yield
         except Exception as error:
             if not isinstance(error, UserError):
-                LOG.exception("a video failed")
+                LOG.exception("recording a video failed")
             if recording := self._recordings.pop(number, None):
                 recording.discard()
             self._report("failed", number, str(error))
 
 
 def run(connection: Connection, config: DriverConfig) -> None:
-    """Process main: call the methods of a ``Recorder`` that arrive, until None or the end arrives.
+    """Call the ``Recorder`` methods named by commands, until None arrives or the connection closes.
 
-    Videos that are unfinished then end early. Reports ``("alive",)`` about once a second.
+    Unfinished videos then end early. Reports ``("alive",)`` about once a second.
     """
     os.setsid()  # Ctrl-C in the terminal reaches only the driver, which stops this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
@@ -145,7 +145,7 @@ def run(connection: Connection, config: DriverConfig) -> None:
     is_drawing = False
     try:
         while True:
-            for _ in range(MAX_TURN):
+            for _ in range(MAX_COMMANDS):
                 if not connection.poll(0.0 if is_drawing else ALIVE_S):
                     report("alive")
                     break
@@ -156,7 +156,7 @@ def run(connection: Connection, config: DriverConfig) -> None:
                 is_drawing = True
             is_drawing = recorder.draw_image()
     except (EOFError, OSError):
-        LOG.warning("the driver ended, so its videos end early")
+        LOG.warning("the driver ended; its videos are incomplete")
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         recorder.close_early()

@@ -1,4 +1,4 @@
-"""The videos of recorded sessions. A process draws and writes them while there are any."""
+"""The videos of recorded sessions. A separate process draws and writes them."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.video.writer import remove_unfinished
 
 MAX_KEY_SHARE = 0.75  # of the videos, for one key
-MAX_QUEUED = 100_000  # commands that the process has not read
-IDLE_S = 10.0  # without a video, until the process ends and its memory is free
+MAX_QUEUED = 100_000  # unread commands
+IDLE_S = 10.0  # without a video, after which the process ends and frees its memory
 HANG_S = 600.0  # without a report; completing a long video may take minutes
-MAX_TICK_S = 0.1  # a longer pause was the driver's
+MAX_TICK_S = 0.1  # anything longer is the driver's own delay
 CLOSE_LIMIT_S = 3.0
 KILL_LIMIT_S = 1.0
-HANGS = "the process that draws videos hangs; record again"
-ENDED = "the process that draws videos has ended; see the driver's log, and record again"
+HANGS = "the process that draws videos does not respond; record again"
+ENDED = "the process that draws videos ended unexpectedly; see the driver's log, and record again"
 
 _SPAWN = multiprocessing.get_context("spawn")
 
 
 class _RecorderProcess:
-    """The process, and a thread that sends commands to it so that the driver never waits."""
+    """The process, and a thread that sends its commands, so that the driver never blocks."""
 
     def __init__(self, config: DriverConfig) -> None:
         self.connection, child_end = _SPAWN.Pipe()
@@ -55,8 +55,8 @@ class _RecorderProcess:
 class Recordings:
     """Passes each session's frames and sound to its video.
 
-    ``on_written`` receives the session and the path of its video, ``on_failed`` the session and the
-    reason why it has no complete video.
+    ``on_written`` receives the session and its video's path. ``on_failed`` receives the session and
+    the reason why its video is incomplete or missing.
     """
 
     def __init__(
@@ -87,17 +87,17 @@ class Recordings:
         """Return whether a session's video still accepts frames."""
         return session in self._open
 
-    def refusal(self, key: str) -> str:
+    def rejection_reason(self, key: str) -> str:
         """Return why a key cannot record another session now; empty if it can."""
         limit = self._config.max_videos
         if len(self._unfinished) >= limit:
-            reason = f"the driver is writing {limit} videos, the limit of driver.max_videos"
+            reason = f"the driver is writing {limit} videos, the maximum (driver.max_videos)"
         else:
             limit = math.ceil(MAX_KEY_SHARE * limit)
-            num_of_key = sum(owner == key for _, owner in self._unfinished.values())
-            if not key or num_of_key < limit:
+            num_unfinished = sum(owner == key for _, owner in self._unfinished.values())
+            if not key or num_unfinished < limit:
                 return ""
-            reason = f"your key has its maximum of unfinished videos, {limit}"
+            reason = f"your key has {limit} unfinished videos, the maximum"
         return f"{reason}; wait until one is written, or open the session without 'record'"
 
     def begin(self, session: str, key: str) -> None:
@@ -128,7 +128,7 @@ class Recordings:
         self._open.pop(session, None)
 
     def tick(self, now_s: float) -> None:
-        """Handle what the process reports, and end it when it has been idle for a while."""
+        """Handle the reports of the process, and end it after ``IDLE_S`` without a video."""
         if self._recorder is None:
             return
         self._silent_s += min(now_s - self._ticked_s, MAX_TICK_S)
@@ -146,7 +146,7 @@ class Recordings:
         if self._recorder is not None:
             self._recorder.commands.put(None)
             while self._unfinished and self._receive(CLOSE_LIMIT_S):
-                pass  # if it takes longer, the process ends by itself
+                pass  # on a timeout, the process still ends by itself
 
     def _send(self, session: str, command: str, *arguments: object) -> None:
         number = self._open.get(session)
@@ -157,7 +157,7 @@ class Recordings:
             self._fail_all(HANGS)
 
     def _receive(self, timeout_s: float) -> bool:
-        """Handle the reports that arrive until the timeout; return whether there was one."""
+        """Handle reports, waiting up to the timeout for the first; return whether one arrived."""
         has_received = False
         try:
             while self._recorder is not None and self._recorder.connection.poll(timeout_s):

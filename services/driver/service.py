@@ -36,7 +36,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode
 
 LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
-MAX_DRAIN_S = 3.0  # for the remaining images when the driver stops; then the videos end early
+MAX_DRAIN_S = 3.0  # time to draw the remaining images when the driver stops
 RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
 
 
@@ -86,7 +86,7 @@ class DriverService(Service):
             session = None
         if session is None:
             key = start.client_key or ""
-            if start.record and (reason := self.recordings.refusal(key)):
+            if start.record and (reason := self.recordings.rejection_reason(key)):
                 self._refuse(start, reason)
                 return False
             session = self._sessions[start.session] = self._make_session(start)
@@ -112,7 +112,7 @@ class DriverService(Service):
         return {"unfinished_videos": len(self.recordings.unfinished)}
 
     def on_startup(self) -> None:
-        """Remove what a killed driver left."""
+        """Delete the unfinished videos of a killed driver."""
         remove_unfinished(Path(self._config.out))
 
     def on_tick(self, now_s: float) -> None:
@@ -197,7 +197,7 @@ class DriverService(Service):
     # --- videos --------------------------------------------------------------------------------
 
     def _refuse(self, start: StartSession, reason: str) -> None:
-        """Let control refuse a session that cannot be recorded."""
+        """Ask control to reject a session that cannot be recorded."""
         LOG.info(reason, extra={"session": start.session})
         self.send_to_control(
             Error(

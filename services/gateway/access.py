@@ -77,7 +77,8 @@ class AccessPolicy:
         schemes = {request.scheme, *self.proxy_schemes}
         if origin not in {f"{scheme}://{request.headers.get('Host')}" for scheme in schemes}:
             text = (
-                f"pages of {origin!r} may not connect; add the origin to gateway.allowed_origins\n"
+                f"connections from {origin!r} are not allowed;"
+                " add the origin to gateway.allowed_origins\n"
             )
             raise web.HTTPForbidden(text=text)
 

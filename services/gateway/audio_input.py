@@ -13,7 +13,7 @@ from kouxing.services.gateway.audio_sessions import AudioSession
 from kouxing.services.gateway.limits import COMMAND_S, RateLimit
 from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
 
-MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo float; then the client must wait
+MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
 CHUNK_S = 0.04  # duration of the pieces in which queued audio is passed on
 KEEP_ALIVE_S = 20.0  # without audio, until a piece of silence keeps the session open
@@ -119,7 +119,7 @@ class RealTimeQueue:
         return not self._queued
 
     async def put(self, pcm: bytes) -> None:
-        """Queue audio, once there is room for it."""
+        """Queue audio, waiting until there is room for it."""
         while self._queued and len(self._queued) + len(pcm) > MAX_QUEUED_BYTES:
             await asyncio.sleep(CHUNK_S)
         self._queued += pcm

@@ -31,7 +31,7 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     try:
         if not certificate.exists():
             _write_private(certificate, _self_signed(hosts))
-        open_file(certificate, _MAX_BYTES).close()  # OpenSSL would wait for a FIFO
+        open_file(certificate, _MAX_BYTES).close()  # OpenSSL would block on a FIFO
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.load_cert_chain(certificate)
     except (OSError, ssl.SSLError) as error:

@@ -24,7 +24,7 @@ PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
 PING_S = 20.0  # a browser that has vanished is detected within this time
 MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message, unless it has audio
-CHUNK_BYTES = 32 * 1024  # of a file; a client that does not read holds two
+CHUNK_BYTES = 32 * 1024  # of a file; a client that does not read occupies two
 DISCARD_S = 5.0
 LINGER_S = 1.0  # data is still read, and discarded, after an invalid message
 MAX_REASON_BYTES = 123  # of a close frame, RFC 6455
@@ -167,7 +167,7 @@ def make_application(
 
 
 async def discard_body(request: web.Request) -> None:
-    """Discard the rest of an upload for a while, because a browser reads no answer before."""
+    """Discard the rest of an upload for up to ``DISCARD_S``: browsers read the answer after it."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(DISCARD_S):
             while await request.content.readany():

@@ -32,7 +32,7 @@ KEEPALIVE_S = 20  # without data, until a client that has vanished is looked for
 _KEEPALIVE_PROBES, _PROBE_S = 3, 5
 LOG_PERIOD_S = 60.0  # between two log lines about errors at the same place
 _CHECK_S = 1.0
-_SHUTDOWN_S = 0.5  # until handlers are cancelled
+_SHUTDOWN_S = 0.5  # after which handlers are canceled
 _RETRY_S = 1.0  # when the system has no free descriptor
 # If a connection ends during the system call sendfile, asyncio logs an error.
 web_fileresponse.NOSENDFILE = True  # type: ignore[misc]
@@ -86,7 +86,7 @@ def _enable_keepalive(connection: socket.socket) -> None:
 
 
 class _ErrorResponse(web.Response):
-    """An answer to a request that no application has seen, so that the signals are not sent."""
+    """An answer to a request that reached no application; it sends no application signals."""
 
     async def _prepare_headers(self) -> None:
         await super()._prepare_headers()
@@ -94,7 +94,7 @@ class _ErrorResponse(web.Response):
 
 
 class _Connection(web.RequestHandler):
-    """One connection. It answers errors that handlers do not answer, without a traceback."""
+    """One connection. It answers errors that no handler has caught, without a traceback."""
 
     def __init__(self, server: web.Server, address: str, log_limit: RateLimit) -> None:
         super().__init__(server, loop=asyncio.get_running_loop(), **_OPTIONS)
@@ -111,7 +111,7 @@ class _Connection(web.RequestHandler):
         self.is_lost.set()
 
     def data_received(self, data: bytes) -> None:
-        """Handle data; close if a request's head is too long, or if requests do not wait."""
+        """Handle data; close if a request's head is too long, or too many requests are queued."""
         super().data_received(data)
         is_head = self._waiter is not None and not self._waiter.done()
         self._head_bytes = self._head_bytes + len(data) if is_head else 0
@@ -132,12 +132,12 @@ class _Connection(web.RequestHandler):
                 self.transport.resume_reading()
 
     def set_timeout(self, timeout_s: float) -> None:
-        """Close the connection after a time; infinite: its client keeps its place."""
+        """Close the connection after a timeout; infinite: never close it."""
         self.changed_s = time.monotonic()
         self.deadline_s = self.changed_s + timeout_s
 
     def on_body_end(self, request: web.BaseRequest) -> None:
-        """Let a request whose body is complete take any time."""
+        """Remove the time limit of a request once its body is complete."""
         if self.request is request:
             self.set_timeout(math.inf)
 
@@ -153,16 +153,16 @@ class _Connection(web.RequestHandler):
             raise exc
         if isinstance(exc, HttpProcessingError | web.RequestPayloadError):
             status, text = 400, "this is not a valid HTTP request"
-            self._warn("dropped a request that is not HTTP")
+            self._warn("dropped an invalid HTTP request")
         elif isinstance(exc, OSError) and exc.errno == errno.ENAMETOOLONG:
             status, text = 404, "the path is too long"
         elif isinstance(exc, ValueError):
             status, text = 400, "the request contains an invalid value"
-            self._warn(f"{request.path[:80]!r}: rejected a request: {exc!r:.200}", exc)
+            self._warn(f"rejected a request for {request.path[:80]!r}: {exc!r:.200}", exc)
         else:
             text = "internal error; see the log of the service"
-            self.log_exception("%r: a request failed", request.path[:80])
-        if request.writer.output_size > 0:  # the client has received a part of an answer
+            self.log_exception("a request for %r failed", request.path[:80])
+        if request.writer.output_size > 0:  # part of an answer has been sent
             raise ConnectionResetError
         response = _ErrorResponse(status=status, text=f"{text}\n")
         response.force_close()
@@ -268,14 +268,14 @@ class WebServer:
         if not self._make_room(address):
             accepted.close()
             if self._log_limit.allows("refused"):
-                LOG.warning("refused a connection from %s: too many are open", address)
+                LOG.warning("rejected a connection from %s: too many connections are open", address)
             return
         _enable_keepalive(accepted)
         connection = _Connection(self._server, address, self._log_limit)
         self._connections[connection] = loop.create_task(self._serve(connection, accepted))
 
     def _make_room(self, address: str) -> bool:
-        """Close a connection if all places are taken; return False if none may be closed."""
+        """Close a connection if the server is full; return False if none may be closed."""
         rivals = [other for other in self._connections if other.address == address]
         if len(rivals) < self._max_per_address:
             if len(self._connections) < MAX_CONNECTIONS:
@@ -314,4 +314,4 @@ class WebServer:
         finally:
             self._connections.pop(connection, None)
             if transport is not None:
-                transport.abort()  # close() waits for a client that reads nothing
+                transport.abort()  # close() would wait for a client that reads nothing

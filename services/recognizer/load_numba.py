@@ -1,4 +1,4 @@
-"""Loads numba's run time, which takes as long as loading the models."""
+"""Loads numba's runtime, which takes as long as loading the models."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import sys
 
 from numba.core.registry import cpu_target
 
-# numba imports these for matrix products and foreign functions, which no compiled function here
-# uses. Without them it loads in half the time.
+# numba imports these for matrix products and foreign functions. No compiled function here uses
+# them, and numba loads in half the time without them.
 _UNUSED = ("scipy.linalg.cython_blas", "cffi")
 
 
 def load_numba() -> None:
-    """Load what every compiled function needs, before the first one runs."""
+    """Load numba's runtime before the first compiled function runs."""
     hidden = [name for name in _UNUSED if name not in sys.modules]
     for name in hidden:
         sys.modules[name] = None  # type: ignore[assignment] # its import fails

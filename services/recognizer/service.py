@@ -141,7 +141,7 @@ class RecognizerService(Service):
             session.start = start
             socket = self._connect(start.endpoints["phone_input"])
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
-            if not is_new:  # so that the new synthesizer learns of a stalled client
+            if not is_new:  # the new synthesizer must receive the stalled state
                 session.without_audio_s = 0.0
             self._close_unused_synthesizers()
         return True
@@ -182,7 +182,7 @@ class RecognizerService(Service):
                 self._acknowledge(session, now_s)
             self.metrics.count("resent", session.link.tick(now_s))
             if session.link.check_overdue(now_s):
-                text = "the synthesizer is too slow, so the face misses a part of the speech"
+                text = "the synthesizer is too slow, so the face misses part of the speech"
                 self.warn(ErrorCode.NO_LINK, text, session.name)
                 self.publish_event(EventName.ERROR, session.name, f"{ErrorCode.NO_LINK}: {text}")
             if session.link.is_full:
@@ -386,7 +386,7 @@ class RecognizerService(Service):
     def _send_results(self, session: RecognizerSession) -> None:
         """Send new results to the subscribers, the synthesizer and control.
 
-        Subscribers are first: another recognizer would not repeat what the synthesizer has.
+        Subscribers are first: a new recognizer does not repeat results that the synthesizer has.
         """
         now_s = time.monotonic()
         for result in session.new_results(self._recognizer):

@@ -30,7 +30,7 @@ MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
 ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
 STALLED_AFTER_S = 0.2  # without audio of a live client
-MOVE_S = 3.0  # in addition after a move, for the client to connect to this recognizer
+MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
 
 
@@ -85,8 +85,8 @@ class RecognizerSession:
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded
         self.last_audio_s = now_s
-        # time in which this process could receive audio and did not
-        self.without_audio_s = -MOVE_S if start.epoch > 1 else 0.0
+        # time in which this process could have received audio but did not
+        self.without_audio_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
         self.sequence_out = 0
@@ -159,7 +159,7 @@ class RecognizerSession:
             self._report(AudioState.STALLED, now_s)
 
     def on_new_audio(self, now_s: float) -> None:
-        """Note that audio has arrived: the face must not rest until it is processed."""
+        """Record that audio arrived; the face must not return to rest until it is processed."""
         if self.start.paced and self.without_audio_s > STALLED_AFTER_S:
             self._report(AudioState.RESUMED, now_s)
         self.last_audio_s, self.without_audio_s = now_s, 0.0

@@ -15,8 +15,8 @@ from kouxing.shared.wire.events import is_report
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
-MAX_BACKLOG = 2000  # unacknowledged messages before audio must wait
-MAX_OVERDUE_S = 5.0  # then new messages are dropped, for the sake of other sessions
+MAX_BACKLOG = 2000  # unacknowledged messages above which audio waits
+MAX_OVERDUE_S = 5.0  # after which new messages are dropped, so that other sessions continue
 KEPT = to_samples(3.0)  # media time of the messages that a new synthesizer gets, samples
 
 
@@ -56,7 +56,7 @@ class SynthesizerLink:
         return self.backlog > MAX_BACKLOG and not self._drops
 
     def check_overdue(self, now_s: float) -> bool:
-        """Return whether the link now starts to drop messages, until none is unacknowledged."""
+        """Return whether the link starts to drop messages; it stops when all are acknowledged."""
         if self.backlog <= MAX_BACKLOG:
             self._full_since_s = None
             self._drops = self._drops and self.backlog > 0
@@ -69,7 +69,7 @@ class SynthesizerLink:
         return True
 
     def send(self, message: Message, now_s: float) -> None:
-        """Send a message, if there is a synthesizer that takes it."""
+        """Send a message, if there is a synthesizer and the link is not dropping messages."""
         if self._sender is not None and not self._drops:
             self._sender.send(message, now_s)
 

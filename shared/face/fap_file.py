@@ -110,7 +110,7 @@ def _parse(path: Path, text: str) -> FapAnimation:
     for number, _ in lines:
         num_lines += 1
         if num_lines > 2 * num_frames:
-            raise _BadFileError(number, f"more frames than the header announces: {num_frames}")
+            raise _BadFileError(number, f"more frames than the header states: {num_frames}")
     if num_lines < 2 * num_frames:
         raise _BadFileError(number, f"the file ends after {num_lines // 2} of {num_frames} frames")
     lines = itertools.islice(_lines(path, text), 1, None)
@@ -143,7 +143,7 @@ def _parse(path: Path, text: str) -> FapAnimation:
 
 
 def _lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are neither empty nor comments, with their numbers."""
+    """Yield line numbers and lines, without empty lines and comments."""
     for number, line in enumerate(split_lines(path, text), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line

@@ -17,7 +17,7 @@ SPEECH_MESSAGES: tuple[type[SpeechMessage], ...] = get_args(SpeechMessage)
 
 
 def is_report(message: Message) -> bool:
-    """Return whether a message is about the client or another synthesizer, and has no event."""
+    """Return whether a message only reports the state of the client or another synthesizer."""
     return isinstance(message, Progress) and (
         message.newest_frame is not None
         or message.state in (AudioState.STALLED, AudioState.RESUMED)

@@ -27,7 +27,7 @@ class AudioState(StrEnum):
 
     RUNNING = "running"
     STALLED = "stalled"  # the client sends no audio: media time stands still
-    RESUMED = "resumed"  # it sends audio again, which is not processed yet
+    RESUMED = "resumed"  # it sends audio again; that audio is not processed yet
     ENDED = "ended"  # no more results follow
 
 

@@ -276,5 +276,5 @@ def test_a_full_disk_gives_one_line() -> None:
             check=False,
             text=True,
         )
-    text = "kouxing: the output: cannot be written: No space left on device\n"
+    text = "kouxing: cannot write the output: No space left on device\n"
     assert (done.returncode, done.stderr) == (2, text)

@@ -97,7 +97,7 @@ def test_renders_a_transparent_picture_of_any_head(face: Path, tmp_path: Path) -
         ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to sound"),
         ("a.mp4", {"live": True}, "--live applies to sound"),
         ("a.csv", {"text": "你好"}, "--text applies to sound"),
-        ("no/a.png", {"size": "64x48"}, "cannot be written"),
+        ("no/a.png", {"size": "64x48"}, "cannot write"),
     ],
 )
 def test_rejects_options_that_do_not_fit(

@@ -84,7 +84,7 @@ def test_reports_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "out/logs/recognizer.log").mkdir(parents=True)
     result = kouxing("run", environment=environment)
     assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
-    assert "recognizer.log: cannot be written" in result.stderr
+    assert "/logs/recognizer.log: it is not a regular file" in result.stderr
     shutil.rmtree(tmp_path / "out")
     (tmp_path / "out").touch()
     result = kouxing("run", environment=environment)

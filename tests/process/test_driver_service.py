@@ -175,10 +175,10 @@ def test_refuses_more_videos_than_the_limit(stage: Stage) -> None:
 def test_limits_the_videos_of_one_key(stage: Stage) -> None:
     videos = stage.driver.recordings
     for number in range(3):
-        assert videos.refusal("greedy") == ""
+        assert videos.rejection_reason("greedy") == ""
         videos.begin(f"film-{number}", "greedy")
-    assert "your key has its maximum of unfinished videos, 3" in videos.refusal("greedy")
-    assert videos.refusal("other") == ""
+    assert "your key has 3 unfinished videos, the maximum" in videos.rejection_reason("greedy")
+    assert videos.rejection_reason("other") == ""
 
 
 def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(stage: Stage) -> None:

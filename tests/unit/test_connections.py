@@ -13,9 +13,9 @@ from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
     BUDGET,
     BUDGET_PER_S,
-    MANY_ENDED,
     MAX_QUEUED,
     MIN_BUDGET,
+    NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
     TRIMS_S,
     Budget,
@@ -142,7 +142,9 @@ def test_silent_connections_make_room(scene: Scene) -> None:
     assert not talker.is_cut
 
 
-@pytest.mark.parametrize(("number", "trims"), [(MANY_ENDED - 1, 0), (MANY_ENDED, 1)])
+@pytest.mark.parametrize(
+    ("number", "trims"), [(NUM_ENDED_BEFORE_TRIM - 1, 0), (NUM_ENDED_BEFORE_TRIM, 1)]
+)
 def test_gives_memory_back_after_many_peers_left(scene: Scene, number: int, trims: int) -> None:
     trim = mock.Mock()
     scene.patch.setattr(connections, "trim_heap", trim)

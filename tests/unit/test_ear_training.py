@@ -53,19 +53,19 @@ def piece(samples: np.ndarray, voice: Voice = Voice.SPEECH) -> Piece:
 
 def test_teachers_give_the_values_of_the_live_networks(whisper: Path) -> None:
     networks, _ = load_teachers(whisper)
-    lesson = networks.teach(as_integers(HELLO))
-    num_positions = len(lesson.phones)
-    assert {len(getattr(lesson, name)) for name in lesson.__slots__} == {num_positions}
-    np.testing.assert_allclose(lesson.phones.sum(axis=1), 1, atol=1e-3)
+    outputs = networks.compute_targets(as_integers(HELLO))
+    num_positions = len(outputs.phones)
+    assert {len(getattr(outputs, name)) for name in outputs.__slots__} == {num_positions}
+    np.testing.assert_allclose(outputs.phones.sum(axis=1), 1, atol=1e-3)
     model = load_model(model_path("neural"))
     assert isinstance(model, NeuralModel)
     stream = model.create_stream(keep_positions=True)
     stream.score(WhisperMel().accept_waveform(HELLO))
     live = [position.values[-2:].ravel() for position in stream.positions]
-    assert np.corrcoef(np.ravel(live), np.ravel(lesson.causal[: len(live)]))[0, 1] > 0.98
+    assert np.corrcoef(np.ravel(live), np.ravel(outputs.causal[: len(live)]))[0, 1] > 0.98
     assert len(networks.causal_values(torch.zeros(1, 3_201, 80))) == 1_600  # over 30 s
     inventory = model.inventory
-    assert {inventory.phones[phone] for phone in lesson.phones.argmax(axis=1)} >= {"n", "i", "h"}
+    assert {inventory.phones[phone] for phone in outputs.phones.argmax(axis=1)} >= {"n", "i", "h"}
 
 
 def test_sings_and_holds_speech() -> None:

@@ -83,7 +83,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("a.fap", {"form": CurveForm.ARKIT}, "holds faps; for arkit, write .csv"),
         ("a.glb", {"form": CurveForm.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
         ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "a curve file holds one face"),
-        ("no/a.csv", {}, "cannot be written"),
+        ("no/a.csv", {}, "cannot write"),
         ("no/a.mp4", {}, "cannot write"),
         ("a.jsonl", {"form": CurveForm.LIVELINK}, "for livelink, write .csv"),
         ("a.mp4", {"form": CurveForm.ARKIT}, "--as does not apply .* .fap, .csv"),

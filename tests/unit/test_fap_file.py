@@ -74,7 +74,7 @@ def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
         (["2.1 x 25 2", mask(3), "0 1", mask(3), "5 1"], "line 5: found frame 5, expected frame 1"),
         (
             ["2.1 x 25 1", mask(3), "0 1", mask(3)],
-            "line 4: more frames than the header announces: 1",
+            "line 4: more frames than the header states: 1",
         ),
     ],
 )

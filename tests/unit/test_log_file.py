@@ -47,7 +47,7 @@ def test_a_full_disk_is_reported_once_and_costs_only_whole_lines(tmp_path: Path)
     log.close()
     assert path.read_text() == "fifteen letters\nkept\n"
     assert warnings == [
-        f"{path}: cannot be written: No space left on device",
+        f"cannot write {path}: No space left on device",
         f"{path}: 2 lines were dropped",
     ]
 

@@ -15,7 +15,7 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import (
     MAX_LEAD_S,
     MAX_MEDIA_TIME,
-    MOVE_S,
+    MOVE_GRACE_S,
     STALLED_AFTER_S,
     AudioRejected,
     RecognizerSession,
@@ -129,7 +129,9 @@ def test_reports_a_live_client_that_stalls_and_resumes() -> None:
         assert reports_of(session, silent_s=1.0) == ["stalled", "resumed"]
     assert reports_of(session, silent_s=STALLED_AFTER_S / 2) == []
     assert reports_of(make_session(paced=False), silent_s=1.0) == []
-    assert reports_of(make_session(epoch=2), silent_s=MOVE_S) == [], "the client is connecting"
+    assert reports_of(make_session(epoch=2), silent_s=MOVE_GRACE_S) == [], (
+        "the client is connecting"
+    )
 
 
 def test_a_mouth_profile_that_does_not_fit_is_not_used() -> None:

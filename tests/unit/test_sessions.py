@@ -246,12 +246,12 @@ def test_services_become_silent_in_the_order_of_their_heartbeats(system: System)
 
 
 def test_waits_longer_for_heartbeats_after_a_service_was_late(system: System) -> None:
-    system.registry.note_return(after_s=60.0, now_s=0.0)
+    system.registry.adapt_timeout(after_s=60.0, now_s=0.0)
     assert len(system.registry.overdue(3.5)) == 2
-    system.registry.note_return(after_s=1.0, now_s=3.5)
+    system.registry.adapt_timeout(after_s=1.0, now_s=3.5)
     assert system.registry.overdue(4.9) == []
     assert len(system.registry.overdue(5.1)) == 2
-    system.registry.note_return(after_s=1.0, now_s=6.0)
+    system.registry.adapt_timeout(after_s=1.0, now_s=6.0)
     system.add(worker("recognizer", "recognizer-1"), now_s=66.0)
     assert system.registry.overdue(66.1) == ["synthesizer-1"]
     assert len(system.registry.overdue(69.1)) == 2, "the usual limit applies again"
@@ -263,8 +263,8 @@ def test_ignores_what_arrives_from_a_connection_that_has_ended(system: System) -
     system.registry.add(heartbeat, replace(peer, connection=0), 0.0)
     assert system.registry.instance_on(7) == "recognizer-1"
     system.lose("recognizer-1")
-    assert system.registry.is_left_over("recognizer-1", replace(peer, connection=0))
-    assert not system.registry.is_left_over("recognizer-1", replace(peer, connection=8))
+    assert system.registry.is_stale("recognizer-1", replace(peer, connection=0))
+    assert not system.registry.is_stale("recognizer-1", replace(peer, connection=8))
 
 
 def test_distinguishes_a_restarted_worker_from_the_crashed_one(system: System) -> None:

@@ -116,7 +116,7 @@ def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="lacks the columns pinyin or text"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))
-    with pytest.raises(UserError, match="not text in UTF-8"):
+    with pytest.raises(UserError, match="not UTF-8 text"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
 
 

@@ -118,7 +118,7 @@ def test_text_must_be_utf_8(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes("\ufeff你".encode())
     assert read_text(tmp_path / "a", 100) == "你"
     (tmp_path / "a").write_bytes("你".encode("gb18030"))
-    with pytest.raises(UserError, match="not text in UTF-8"):
+    with pytest.raises(UserError, match="not UTF-8 text"):
         read_text(tmp_path / "a", 100)
 
 

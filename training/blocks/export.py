@@ -71,7 +71,7 @@ class _BlockGraph(Graph):
         self._new: list[str] = []  # keys and values of the block
 
     def file_of_block(self) -> NDArray[np.uint8]:
-        """Write all nodes; return the file."""
+        """Add all nodes; return the ONNX file."""
         shape, length = self._shape, self._length
         gru = self._readout["readout.gru.weight_hh_l0"].shape[1]
         self._log_posteriors(self._features())

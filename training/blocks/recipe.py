@@ -88,7 +88,7 @@ def train_blocks(
     before = load_model(start)
     if not isinstance(before, NeuralModel):
         raise UserError(f"{start} is not a neural model; give one from 'kouxing train neural'")
-    torch.set_num_threads(1)  # the same sums on every machine
+    torch.set_num_threads(1)  # reproducible sums on every machine
     torch.manual_seed(seed)
     whole = init_encoder(whisper, before.topology.num_states)
     errors = RowErrors()

@@ -1,9 +1,9 @@
-"""Batches for the small ear: disturbed speech with the targets of the clean recordings.
+"""Batches for the small ear: augmented speech with the targets of the clean recordings.
 
-An excerpt joins recordings, with pauses between some of them. Its speed is drawn, which also moves
-pitch and formants. Then it gets music, voices or noise in the background, and the disturbances of
-:mod:`kouxing.training.neural.augmentation`. Some excerpts contain only a background. Every batch
-has its own random generator, so resumed training gives the same network.
+An excerpt joins recordings, with pauses between some of them. Its random speed also shifts pitch
+and formants. Music, voices or noise are added in the background, then the augmentations of
+:mod:`kouxing.training.neural.augmentation` are applied. Some excerpts contain only a background.
+Every batch has its own random generator, so resumed training gives the same network.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ NUM_POSITIONS = 250  # of an excerpt, 5 s
 NUM_EXCERPTS = 28
 BATCH_S = NUM_EXCERPTS * NUM_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
 _MAX_SPEED = 1.3
-_MAX_PIECE = 400  # positions of a recording in an excerpt
+_MAX_PIECE = 400  # positions of one recording in an excerpt
 _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
 _LEVEL_DB = 5.0  # deviation of the levels of recordings in an excerpt
 _MIDDLE = 0.875  # of a position's frames, positions after its first sample
 _CLEAN_PROB, _ONLY_BACKGROUND_PROB, _BACKGROUND_PROB = 0.15, 0.08, 0.65
-_VOICES_PROB, _MAX_VOICES = 0.35, 6  # of a background: other people speak
+_VOICES_PROB, _MAX_VOICES = 0.35, 6  # of a background with other speakers
 _MIN_SNR_DB, _MAX_SNR_DB = 0.0, 25.0
 _TINY = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """The recordings and sounds of batches."""
+    """The recordings and background sounds that batches are drawn from."""
 
     pieces: Sequence[Piece]
     backgrounds: Sequence[Samples]  # music and noise
@@ -53,7 +53,7 @@ class Material:
 
 
 def batch_of(material: Material, seed: int, number: int) -> tuple[Tensor, Tensor]:
-    """Draw the batch with this number: inputs, (batch, positions, 160), and targets."""
+    """Draw a batch by its number: inputs, (batch, positions, 160), and targets."""
     rng = np.random.default_rng([seed, number])
     probs = np.cumsum([piece.weight for piece in material.pieces])
     excerpts = [_excerpt(material, probs, rng) for _ in range(NUM_EXCERPTS)]
@@ -91,7 +91,7 @@ def _excerpt(
 def _speech(
     material: Material, probs: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Join recordings and pauses that fill an excerpt at any speed."""
+    """Join recordings and pauses that are long enough for an excerpt at any speed."""
     sounds: list[Floats] = []
     rows: list[Floats] = []
     missing = int(NUM_POSITIONS * _MAX_SPEED)

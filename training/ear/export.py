@@ -43,7 +43,7 @@ def save_ear(path: Path, ear: Ear) -> None:
 
 
 def load_ear(path: Path) -> NDArray[np.uint8]:
-    """Read the network of a model file, or of a checkpoint of the training (.pt).
+    """Read the network of a model file, or of a training checkpoint (.pt).
 
     Raises UserError if the file cannot be read.
     """
@@ -62,13 +62,15 @@ def load_ear(path: Path) -> NDArray[np.uint8]:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except (KeyError, RuntimeError, UnpicklingError, ValueError) as error:
-        raise UserError(f"{path} is not a small ear; give a file of 'kouxing train ear'") from error
+        raise UserError(
+            f"{path} is not a small ear; give a file from 'kouxing train ear'"
+        ) from error
     return onnx_of(ear)
 
 
 def onnx_of(ear: Ear) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
-    return _EarGraph(ear).file_of_step()
+    return _EarGraph(ear).build_step_model()
 
 
 class _EarGraph(Graph):
@@ -78,8 +80,8 @@ class _EarGraph(Graph):
         self._width = len(self._parameters["entry.bias"])
         self._num_phones = ear.columns.num_phones
 
-    def file_of_step(self) -> NDArray[np.uint8]:
-        """Write all nodes; return the file."""
+    def build_step_model(self) -> NDArray[np.uint8]:
+        """Add all nodes; return the ONNX file."""
         width, features = self._width, 2 * NUM_COMPONENTS
         entered = self.node("Relu", [self.product("frames", self._parameters, "entry")])
         states = self.split("state", ["first_state", "second_state"])

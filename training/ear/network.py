@@ -13,13 +13,13 @@ y        components of the causal network at position p; at position        (out
          (logits), voicing (logit), pitch, level, effort
 ======== ================================================================== ==================
 
-The audio of a step is known until 65 ms after the middle of position p - 2.
+A step uses audio up to 65 ms after the middle of position p - 2.
 
     loss = E(causal) + E(encoder) + H(phones) / 3 + H(voice) + H(voicing) / 3
            + |pitch| + E(level) / 5 + E(effort) / 5
 
-E are mean squared errors and H cross-entropies. Errors of the pitch are in octaves. Unknown
-targets, which are NaN, are left out.
+E is a mean squared error and H a cross-entropy. Pitch errors are in octaves. Unknown targets are
+NaN and are ignored.
 
 Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder for statistical
 machine translation" (the GRU); Romero et al. 2015, "FitNets: hints for thin deep nets" (hidden
@@ -46,7 +46,7 @@ from kouxing.training.ear.targets import (
 )
 
 NUM_INPUTS = 2 * NUM_MELS
-LOOK_AHEAD = 2  # positions between the newest one and that of all outputs but the first
+LOOK_AHEAD = 2  # positions; the first output has no look-ahead
 WIDTH = 384
 NUM_OTHER_OUTPUTS = 2 * NUM_COMPONENTS + len(Voice) + 4  # all but the phones
 

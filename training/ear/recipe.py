@@ -1,8 +1,8 @@
-"""From corpora to the small ear: targets, training, export, model card.
+"""Trains the small ear from corpora: targets, training, export, model card.
 
-Training can be interrupted. The same command resumes it. Targets are kept in a folder next to the
-output, ``.targets``, and the state of the training in ``.checkpoint.pt``. Targets of further
-recordings are computed while training proceeds, so a first checkpoint exists after minutes.
+If training is interrupted, the same command resumes it. Next to the output, the folder ``.targets``
+contains the targets, and ``.checkpoint.pt`` the training state. Targets of further recordings are
+computed during training, so the first checkpoint exists after minutes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _RATE, _WARM_UP_STEPS = 1e-3, 200
 _VALIDATE_EVERY, _NUM_VALIDATED = 250, 3  # steps; batches
 _BACKGROUNDS = ("music", "noise", "babble")
 _OTHER_VOICES = {"laughter": Voice.LAUGHTER, "breath": Voice.NONE}  # by the kind of a sound
-_OTHER_VOICE_WEIGHT = 0.02  # of a recording; that of all speech is 1
+_OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,8 +55,8 @@ class Sources:
 
 
 def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
-    """Load the teachers, and the inventory of their phones."""
-    torch.set_num_threads(1)  # the same sums on every machine
+    """Load the teachers and their phone inventory."""
+    torch.set_num_threads(1)  # reproducible sums on every machine
     causal, blocks = (load_model(model_path(name)) for name in ("neural", "blocks"))
     if not (isinstance(causal, NeuralModel) and isinstance(blocks, BlockModel)):
         raise UserError("the small ear needs the shipped acoustic models; reinstall kouxing")
@@ -72,7 +72,7 @@ def train_ear(
     num_steps: int = 20_000,
     report: Report = print,
 ) -> None:
-    """Train the small ear, and write it with its card.
+    """Train the small ear, and write it with its model card.
 
     Raises UserError if there is nothing to train on, or a file cannot be read.
     """
@@ -84,7 +84,7 @@ def train_ear(
     sounds = [one for one in read_sounds(sources.sounds, sources.shipping) if not one.is_held_out]
     backgrounds = [sound.samples for sound in sounds if sound.kind in _BACKGROUNDS]
     if not backgrounds:
-        raise UserError("no music or noise to disturb the speech with; give a folder with --sounds")
+        raise UserError("no music or noise to mix with the speech; give a folder with --sounds")
     others = [
         Recording(
             sound.name,
@@ -132,7 +132,7 @@ def utterances_of(
 
 
 def _speech_of(sources: Sources, utterances: Sequence[Utterance]) -> list[Recording]:
-    """List all speech. A source's weight grows with the root of its size; their sum is 1."""
+    """List all speech. Sources are weighted by the square root of their size; the sum is 1."""
     weights = zip(utterances, weights_of(utterances), strict=True)
     of_sources = [[(one.path, weight * one.seconds) for one, weight in weights]]
     for folder in sources.untranscribed:

@@ -1,11 +1,11 @@
-"""Compare the small ear with what it may replace: Silero for voice, the causal network for lips.
+"""Compares the small ear with Silero (voice) and the causal network (lips).
 
-Voice: the share of the time in which a voice is detected. "Inside" and "outside" speech are those
-of the block network's phones in the clean recording.
+Voice: the share of time with detected voice. The block network's phones in the clean recording
+define "inside" and "outside" speech.
 
-Lips: the correlation of the opening with that of a linear map of the last 160 ms, whose audio is
-known 55 ms after the lips. The map is trained on clips of other speakers, clean and disturbed. All
-clips count that the ear did not train on.
+Lips: the correlation of the lip opening with a linear prediction from the last 160 ms. The
+prediction uses audio up to 55 ms after the lip position. It is trained on clips of other speakers,
+clean and noisy. The report uses all clips that the ear was not trained on.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from kouxing.training.lips.targets import opening_of
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Disturb = Callable[[Floats], Floats]
-Audio = tuple[Floats, Mask | None]  # samples, and the positions that count; None: all
+Audio = tuple[Floats, Mask | None]  # samples, and the positions to evaluate; None: all
 
 _PROBABLE = 0.5
 _SNR_DB, _SUNG_SNR_DB = 10.0, 5.0
@@ -99,7 +99,7 @@ def report_ear(path: Path, sources: Sources, *, whisper: Path, console: Console)
     rows = _voice_rows(speech, sounds, teachers)
     print_table(
         console,
-        "time in which a voice is detected, %",
+        "time with detected voice, %",
         ("audio", "Silero", "product", "ear", "ear: laughter", "ear: sung"),
         (
             [name, *(f"{100 * share:.0f}" for share in _voice_shares(ear, audio))]
@@ -119,7 +119,7 @@ def _held_out(sounds: Sequence[Sound], kind: str) -> list[Sound]:
 def _mix_with(sounds: Sequence[Sound], kind: str, snr_db: float) -> Disturb:
     others = [sound.samples for sound in _held_out(sounds, kind)]
     if not others:
-        raise UserError(f"no {kind} is held out for measuring; give more of it with --sounds")
+        raise UserError(f"no held-out {kind} to measure with; give more of it with --sounds")
 
     def disturb(samples: Floats) -> Floats:
         rng = np.random.default_rng(len(samples))
@@ -155,7 +155,7 @@ def _voice_rows(
         (with_music(samples), is_sung) for samples, is_sung in sung
     ]
     silence = teachers.silence
-    phones = [teachers.teach(as_integers(samples)).phones for samples in speech]
+    phones = [teachers.compute_targets(as_integers(samples)).phones for samples in speech]
     inside = [posteriors[:, silence] < _PROBABLE for posteriors in phones]
     for name, disturb in _conditions(sounds).items():
         disturbed = [disturb(samples) for samples in speech]
@@ -165,7 +165,7 @@ def _voice_rows(
 
 
 def _voice_shares(ear: EarRunner, audio: Sequence[Audio]) -> list[float]:
-    """Return the shares of Silero, the product and the ear, and two classes of the ear."""
+    """Return the voice shares of Silero, the product and the ear, and of two ear classes."""
     shares: list[Mask] = []
     for samples, counted in audio:
         voice = ear.run(samples)["voice"][LOOK_AHEAD:]
@@ -219,11 +219,11 @@ def _print_lips(
     for name in features["clean"]:
         by_condition = {condition: of[name] for condition, of in features.items()}
         rows += _lip_rows(name, used, sources, by_condition, targets)
-    print_table(console, "correlation of the opening, clips", ("input", "clips", *conditions), rows)
+    print_table(console, "correlation of lip opening, clips", ("input", "clips", *conditions), rows)
 
 
 def _opening_at_positions(clip: LipClip) -> Floats:
-    """Return the opening at each position, FAP units; NaN if it is unknown."""
+    """Return the lip opening at each position, in FAP units; NaN if unknown."""
     num_positions = len(inputs_of(clip.samples))
     known_s = (POSITION_SAMPLES * np.arange(num_positions) + _KNOWN_SAMPLES) / SAMPLE_RATE_HZ
     opening = interpolate_track(clip.time_s, opening_of(clip), known_s - _DELAY_S)
@@ -258,14 +258,16 @@ def _lip_rows(
         for values in features.values():
             for number in trained:
                 is_known = ~np.isnan(targets[number])
-                histories.append(history_of(components.of(values[number]))[is_known][::_STRIDE])
+                histories.append(
+                    history_of(components.project(values[number]))[is_known][::_STRIDE]
+                )
                 known.append(targets[number][is_known, None, None][::_STRIDE])
         weights = fit_ridge(histories, known)[:, 0, 0]
         for number in np.flatnonzero(folds == fold).tolist():
             if may_train(clips[number], sources):
                 continue
             for condition, values in features.items():
-                opening = history_of(components.of(values[number])) @ weights
+                opening = history_of(components.project(values[number])) @ weights
                 is_known = ~np.isnan(targets[number])
                 r = np.corrcoef(opening[is_known], targets[number][is_known])[0, 1]
                 scores[clips[number].source][condition].append(float(r))
@@ -277,7 +279,7 @@ def _lip_rows(
 
 
 class _Components:
-    """Principal components of features, the late ones smaller than the first."""
+    """Principal components of features; later components are scaled down."""
 
     def __init__(self, features: Floats) -> None:
         self._mean = features.mean(axis=0)
@@ -288,7 +290,7 @@ class _Components:
         scale = extent / np.sqrt(np.maximum(variances[::-1][:number], _MIN_VARIANCE))
         self._projection = (directions[:, ::-1][:, :number] * scale).astype(np.float32)
 
-    def of(self, features: Floats) -> Floats:
+    def project(self, features: Floats) -> Floats:
         """Project features, (positions, n)."""
         components: Floats = (features - self._mean) @ self._projection
         return components

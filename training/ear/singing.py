@@ -1,8 +1,8 @@
-"""Sung and held voice, made from speech with a vocoder.
+"""Sung and held voice, generated from speech with a vocoder.
 
-A vocoder splits speech into pitch, spectral envelope and aperiodicity, every 5 ms. Voiced frames
-are repeated and get the notes of a random melody, or one voiced frame is held for seconds. The
-position of the mouth stays that of the source frame.
+The vocoder splits speech into pitch, spectral envelope and aperiodicity, every 5 ms. Voiced frames
+are repeated with the pitch of a random melody, or one voiced frame is held for seconds. Each frame
+keeps the mouth position of its source frame.
 
 Source: Morise, Yokomori and Ozawa 2016, "WORLD: a vocoder-based high-quality speech synthesis
 system for real-time applications" (pyworld).
@@ -78,7 +78,7 @@ def sing(samples: Floats, num_positions: int, rng: np.random.Generator) -> SungV
 def _stretch(
     voiced: NDArray[np.bool_], envelope: Array, rng: np.random.Generator, *, is_melody: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Repeat voiced frames for a melody. Hold a loud one, of a melody only at random.
+    """Repeat voiced frames for a melody. Hold a loud frame; in a melody, only sometimes.
 
     Return the source frame of each new frame, and whether it is sung or held.
     """

@@ -1,7 +1,7 @@
 """Sounds without speech: music, noise, babble, laughter, breath.
 
 A folder of sounds has a ``manifest.tsv`` with the columns ``path``, ``kind`` and ``licence``. About
-a quarter of the files of music and noise is held out, by the CRC-32 of their names. The other kinds
+a quarter of the music and noise files are held out, by the CRC-32 of their names. The other kinds
 have few files, so the second half of each file is held out.
 """
 
@@ -51,7 +51,7 @@ def read_sounds(folders: Sequence[Path], shipping: bool) -> list[Sound]:
                 f"{folder / 'manifest.tsv'} lacks the column {error}; add path, kind and licence"
             ) from error
         except ValueError as error:
-            raise UserError(f"cannot read a sound of {folder}: {error}") from error
+            raise UserError(f"cannot read a sound in {folder}: {error}") from error
     return sounds
 
 

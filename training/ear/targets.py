@@ -1,7 +1,7 @@
 """Recordings with the targets of the small ear, computed once and kept on disk.
 
-The recordings are shuffled, so that a few of them represent all. They form chunks, which are
-computed one after the other while training proceeds. Each file of targets has these columns:
+The recordings are shuffled, so that the first ones are representative. They are split into chunks.
+The chunks are computed one after the other during training. Each target file has these columns:
 
 ========= ===================================================================== ========
 columns   meaning (:mod:`kouxing.training.ear.teachers`)                        number
@@ -15,8 +15,8 @@ causal    principal components of the causal network's values                   
 encoder   principal components of Whisper's encoder                             128
 ========= ===================================================================== ========
 
-A principal component is divided by the square root of its deviation, so that late ones count less
-than early ones. Some recordings also have a sung or held copy.
+A principal component is divided by the square root of its standard deviation, so that later
+components have less weight. Some recordings also have a sung or held copy.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from kouxing.corpora.feature_cache import as_floats, as_integers
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.shared.errors import UserError
 from kouxing.training.ear.singing import sing
-from kouxing.training.ear.teachers import POSITION_SAMPLES, Lesson, Teachers
+from kouxing.training.ear.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
 
 Floats = NDArray[np.float32]
 Samples = NDArray[np.int16]  # 16 kHz
@@ -46,7 +46,7 @@ _NUM_FITTED = 192  # recordings that the principal components are computed from
 _SUNG_PROB = 0.25
 _MAX_SUNG_SAMPLES = 64_000  # of the speech
 _MIN_SAMPLES, _MAX_SAMPLES = 8000, 320_000
-_SILENT = 0.5  # posterior of silence above which nobody speaks
+_SILENT = 0.5  # posterior of silence above which a position is not speech
 _LAUGHING_LEVEL = -2.0  # level above which laughter is audible
 _MIN_VARIANCE = 1e-6
 
@@ -66,7 +66,7 @@ class Recording:
 
     name: str
     read: Callable[[], Samples]  # ValueError if it cannot be read
-    weight: float  # how often it is drawn, relative to others
+    weight: float  # relative sampling frequency
     voice: Voice = Voice.SPEECH  # where it is audible
 
 
@@ -81,7 +81,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The columns of targets that are ranges."""
+    """The target columns that are ranges."""
 
     num_phones: int
 
@@ -112,7 +112,7 @@ class TargetStore:
         errors: RowErrors,
         seed: int,
     ) -> None:
-        """Open a folder; UserError if its targets are of other recordings, or none is usable.
+        """Open a folder; UserError if it has targets of other recordings, or no usable recording.
 
         ``errors`` receives a message for every recording that cannot be read.
         """
@@ -143,7 +143,7 @@ class TargetStore:
             path.write_text(key.hexdigest())
         elif path.read_text() != key.hexdigest():
             raise UserError(
-                f"{self._folder} contains the targets of other recordings or models; delete it"
+                f"{self._folder} contains targets of other recordings or models; delete it"
             )
 
     def _load_basis(self) -> dict[str, Floats]:
@@ -154,10 +154,10 @@ class TargetStore:
             sounds = [sound for one in speech for sound in self._cut(one)]
             if not sounds:
                 raise self._errors.no_recording_error("among the first ones")
-            lessons = [self._teachers.teach(sound) for sound in sounds]
+            all_outputs = [self._teachers.compute_targets(sound) for sound in sounds]
             basis = {}
             for name in ("causal", "encoder"):
-                values = np.concatenate([getattr(lesson, name) for lesson in lessons])
+                values = np.concatenate([getattr(outputs, name) for outputs in all_outputs])
                 basis[f"{name}_mean"] = values.mean(axis=0)
                 basis[name] = _components_of(values - basis[f"{name}_mean"])
             np.savez(path.with_suffix(".part.npz"), allow_pickle=False, **basis)
@@ -199,18 +199,18 @@ class TargetStore:
         """Compute the targets of a recording."""
         pieces = []
         for samples in self._cut(recording):
-            lesson = self._teachers.teach(samples)
-            voice = np.full(len(lesson.level), recording.voice, np.float32)
-            voice[~self._is_audible(lesson, recording.voice)] = Voice.NONE
-            scalars = [lesson.pitch, lesson.level, lesson.effort, voice]
-            components = [self._project(lesson, name) for name in ("causal", "encoder")]
-            targets = np.column_stack([*scalars, lesson.phones, *components]).astype(np.float16)
+            outputs = self._teachers.compute_targets(samples)
+            voice = np.full(len(outputs.level), recording.voice, np.float32)
+            voice[~self._is_audible(outputs, recording.voice)] = Voice.NONE
+            scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
+            components = [self._project(outputs, name) for name in ("causal", "encoder")]
+            targets = np.column_stack([*scalars, outputs.phones, *components]).astype(np.float16)
             kept = samples[: POSITION_SAMPLES * len(targets)]
             pieces.append(Piece(kept, targets, recording.weight))
         return pieces
 
     def _cut(self, recording: Recording) -> list[Samples]:
-        """Read a recording, in parts of up to 20 s; no parts if it cannot be read."""
+        """Read a recording in parts of up to 20 s; return an empty list if it cannot be read."""
         try:
             samples = recording.read()
         except ValueError as error:
@@ -220,15 +220,15 @@ class TargetStore:
         parts = [samples[start : start + _MAX_SAMPLES] for start in starts]
         return [part for part in parts if len(part) >= _MIN_SAMPLES]
 
-    def _project(self, lesson: Lesson, name: str) -> Floats:
+    def _project(self, outputs: TeacherOutputs, name: str) -> Floats:
         """Compute the components of a teacher's values, (positions, 128)."""
-        centered = getattr(lesson, name) - self._basis[f"{name}_mean"]
+        centered = getattr(outputs, name) - self._basis[f"{name}_mean"]
         return np.asarray(centered @ self._basis[name], np.float32)
 
-    def _is_audible(self, lesson: Lesson, voice: Voice) -> NDArray[np.bool_]:
+    def _is_audible(self, outputs: TeacherOutputs, voice: Voice) -> NDArray[np.bool_]:
         if voice == Voice.SPEECH:
-            return np.asarray(lesson.phones[:, self._teachers.silence] < _SILENT)
-        return np.asarray(lesson.level > _LAUGHING_LEVEL)
+            return np.asarray(outputs.phones[:, self._teachers.silence] < _SILENT)
+        return np.asarray(outputs.level > _LAUGHING_LEVEL)
 
 
 def _components_of(centered: Floats) -> Floats:
@@ -243,7 +243,7 @@ def _components_of(centered: Floats) -> Floats:
 
 
 def _sung_copy(piece: Piece, rng: np.random.Generator) -> list[Piece]:
-    """Sing the start of a recording; no piece if it has no voice."""
+    """Create a sung copy of the start of a recording; an empty list if it has no voice."""
     speech = as_floats(piece.samples[:_MAX_SUNG_SAMPLES])
     sung = sing(speech, len(speech) // POSITION_SAMPLES, rng)
     if sung is None:

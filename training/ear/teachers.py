@@ -1,8 +1,8 @@
 """The teachers of the small ear: what three trained networks compute from a clean recording.
 
-The causal network and the block network are those of the shipped models. Their ONNX files contain
-8-bit weights, which are widened here, so that PyTorch can run whole recordings. This is several
-times faster than the live networks. The third teacher is Whisper's unchanged encoder.
+The causal network and the block network come from the shipped models. Their 8-bit ONNX weights are
+converted to floats, so that PyTorch can run whole recordings. This is several times faster than the
+live networks. The third teacher is Whisper's unchanged encoder.
 
 ======== ==================================================================== =================
 symbol   meaning                                                              shape
@@ -62,8 +62,8 @@ _TINY_POWER = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
-    """What the teachers compute from a recording; arrays have the shapes above."""
+class TeacherOutputs:
+    """The outputs of the teachers for a recording; arrays have the shapes above."""
 
     causal: Floats
     encoder: Floats
@@ -107,7 +107,7 @@ class Teachers:
         self.digest = hashlib.sha256(networks).hexdigest()
 
     @torch.no_grad()
-    def teach(self, samples: NDArray[np.int16]) -> Lesson:
+    def compute_targets(self, samples: NDArray[np.int16]) -> TeacherOutputs:
         """Compute the targets of samples, (n,) at 16 kHz, up to 20 s."""
         bands = WhisperMel().accept_waveform(as_floats(samples))
         num_positions = (len(bands) - 1) // 2
@@ -115,7 +115,7 @@ class Teachers:
         power = 10 ** (4 * bands[: 2 * num_positions].reshape(num_positions, 2, -1) - 4)
         level = np.log10(power.mean(axis=(1, 2)) + _TINY_POWER)
         low, high = (power[..., part].mean(axis=(1, 2)) for part in (_LOW_BANDS, _HIGH_BANDS))
-        return Lesson(
+        return TeacherOutputs(
             causal=self.causal_values(frames),
             encoder=self._encoder.features(samples)[:num_positions].astype(np.float32),
             phones=self._phones(frames),
@@ -128,7 +128,7 @@ class Teachers:
     def causal_values(self, frames: Tensor) -> Floats:
         """Run the causal network: (1, frames, 80) to (positions, 2 width).
 
-        After 30 s it starts again with an empty past, like the live network.
+        After 30 s it restarts with an empty past, like the live network.
         """
         parts = []
         for start in range(0, frames.shape[1] - 2, 2 * MAX_POSITIONS):
@@ -144,7 +144,7 @@ class Teachers:
     def _phones(self, frames: Tensor) -> Floats:
         """Compute the phones' posteriors: (1, frames, 80) to (positions, phones)."""
         num_positions = (frames.shape[1] - 1) // 2
-        missing = -num_positions % _BLOCK_POSITIONS  # few layouts, as PyTorch keeps their masks
+        missing = -num_positions % _BLOCK_POSITIONS  # few sizes: layouts are cached
         padded = pad(frames, (0, 0, 0, 2 * missing), mode="replicate")
         laid = layout(num_positions + missing, _BLOCK_POSITIONS)
         with mixed_precision():
@@ -176,7 +176,7 @@ def load_exported(
 ) -> None:
     """Load the weights of an exported network (:mod:`kouxing.training.neural.onnx_graph`).
 
-    ``others`` are weights that the file stores in another form, by the module's names.
+    ``others`` are weights that the file stores in another form, by their module names.
     """
     tensors = _tensors_of(file)
     state = {}

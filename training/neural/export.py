@@ -47,7 +47,7 @@ class _NetworkGraph(Graph):
         self._parameters = arrays_of(network)
 
     def file_of_network(self) -> NDArray[np.uint8]:
-        """Write all nodes; return the file."""
+        """Add all nodes; return the ONNX file."""
         shape = self._shape
         size = shape.width // shape.heads
         frames = self.node(

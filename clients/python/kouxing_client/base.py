@@ -296,7 +296,7 @@ class BaseResults:
 
     @property
     def num_missed(self) -> int:
-        """Number of frames and phones that were published but did not arrive; at least this."""
+        """Minimum number of frames and phones that were published but did not arrive."""
         return self._inbox.num_missed
 
     def _has_news(self) -> bool:

@@ -60,7 +60,7 @@ class ClientCore:
         self._timeout_s = timeout_s
         self._make_signal = make_signal
         self._requests: dict[str, _Request] = {}
-        self._refused_s = math.inf  # since when control refuses this key
+        self._refused_s = math.inf  # when control started to reject this key
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
         self._asked_s: dict[str, float] = {}  # when control was asked about a silent session
         self._events: Connection | None = None
@@ -130,7 +130,7 @@ class ClientCore:
                 self._requests.pop(name).answer.set_exception(KouxingError(self._timeout_error()))
             elif now_s >= request.retry_s:
                 self._send(request)
-        if now_s > self._refused_s + self._timeout_s:  # shorter refusals are penalties
+        if now_s > self._refused_s + self._timeout_s:  # shorter rejections are temporary penalties
             for session in self.sessions:
                 session.end(KouxingError(self._timeout_error()))
         for session in list(self.sessions):

@@ -41,8 +41,8 @@ def find_key() -> Key:
     return read_key(folder / "kouxing" / _FILE)
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)  # a FIFO would wait for its writer
+def _open_nonblocking(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # opening a FIFO would block
 
 
 def read_key(path: str | Path) -> Key:
@@ -54,7 +54,7 @@ def read_key(path: str | Path) -> Key:
         If it cannot be read, or is not a key file.
     """
     try:
-        with open(path, "rb", opener=_open_at_once) as file:
+        with open(path, "rb", opener=_open_nonblocking) as file:
             fields = json.loads(file.read(_MAX_BYTES))
         key = Key(*(fields[name] for name in ("public", "secret", "control")))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Makes one sequence of the phones of successive recognizers; no I/O of its own."""
+"""Joins the phones of successive recognizers into one sequence; does no I/O."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _TOLERANCE = 160  # samples
 
 
 class PhoneTrack:
-    """Passes on each phone of a session once, even if several recognizers publish it.
+    """Returns each phone of a session once, even if several recognizers publish it.
 
-    A recognizer that takes a session over numbers its phones again, and may repeat phones. The
-    track continues the numbers and drops the repeated phones. ``num_missed`` counts final phones
-    that were published but did not arrive, by gaps in their numbers and times.
+    A recognizer that takes over a session renumbers its phones, and may repeat phones. The track
+    continues the numbering and drops repeated phones. ``num_missed`` counts final phones that were
+    published but did not arrive. It is computed from gaps in their numbers and times.
     """
 
     def __init__(self) -> None:
@@ -24,22 +24,22 @@ class PhoneTrack:
         self._epoch = 0  # of the newest phone
         self._base = 0  # added to the recognizer's indices
         self._next = 0  # after the greatest index
-        self._open: dict[int, Phone] = {}  # that are not final, by index
+        self._open: dict[int, Phone] = {}  # phones that are not final, by index
         self._next_final: int | None = None  # the recognizer's index of its next final phone
         self._end = 0  # media time at which the last final phone ends
         self._is_speaking = False
-        self._speech_time = 0  # media time of the last change of that
+        self._speech_time = 0  # media time at which `_is_speaking` last changed
 
     def add_speech(self, speech: Speech) -> list[Phone]:
-        """Note that speech starts or stops; return the phones that change for the program.
+        """Process a start or end of speech; return the phones that change.
 
-        The first message of another recognizer has the time at which it continues.
+        The first message of another recognizer has the time at which it resumes.
         """
         changed: list[Phone] = []
         if speech.sequence == 1:
             known = max(self._end, self._speech_time) + _TOLERANCE
             if self._epoch and self._is_speaking | speech.active and speech.media_time > known:
-                self.num_missed += 1  # at least
+                self.num_missed += 1  # one or more
             changed = self._restart()
         self._is_speaking, self._speech_time = speech.active, speech.media_time
         return changed
@@ -52,10 +52,10 @@ class PhoneTrack:
         return withdrawn
 
     def update(self, phone: Phone) -> list[Phone]:
-        """Add or revise a phone; return the phones that change for the program."""
+        """Add or revise a phone; return the phones that change."""
         changed: list[Phone] = []
         if phone.epoch > self._epoch and phone.index < (self._next_final or 0):
-            self.num_missed += 1  # at least: another recognizer's first messages
+            self.num_missed += 1  # one or more: the other recognizer's first messages
             changed = self._restart()
         self._epoch = phone.epoch
         if phone.final:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
 MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may take to move
-END_LIMIT_S = 5.0  # after the last face, for the last phones
+END_LIMIT_S = 5.0  # maximum wait for the last phones after the last frame
 LAST_S = 0.5  # for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
 SILENT_S = 2.0  # without results, a followed session may have moved or ended unnoticed
@@ -115,7 +115,7 @@ class Subscription:
         self.follower.start(self._session.epoch, self._session.endpoints)
 
     def tick(self) -> None:
-        """Notice deadlines that have passed; call this regularly."""
+        """Check for expired deadlines; call this regularly."""
         self.follower.tick()
         if self.follower.has_ended and self._session.sockets.now_s > self._end_limit_s:
             self._end_limit_s = math.inf

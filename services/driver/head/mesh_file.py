@@ -49,13 +49,13 @@ def read_mesh(path: Path) -> list[Primitive]:
 
 
 def _load(path: Path, suffix: str) -> list[Any]:
-    """Read the meshes of an OBJ or PLY file, with the materials and pictures that it names."""
+    """Read the meshes of an OBJ or PLY file, with the materials and images that it names."""
     content = read_file(path, MAX_MESH_BYTES)
     if content.count(b" ") + content.count(b"\n") > MAX_WORDS:  # trimesh would need minutes
         raise UserError(f"{path} has more than {MAX_WORDS} words; decimate the mesh")
     files = _NamedFiles(str(path))
     options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
-    with warnings.catch_warnings(action="ignore"):  # trimesh warns about its own guesses
+    with warnings.catch_warnings(action="ignore"):  # trimesh warns when it guesses
         scene = trimesh.load_scene(
             io.BytesIO(content), file_type=suffix[1:], resolver=files, process=False, **options
         )

@@ -65,7 +65,7 @@ class Recording:
 
     @property
     def num_queued(self) -> int:
-        """Number of frames that have arrived and are still needed."""
+        """Number of received frames that are still needed."""
         return len(self._frames)
 
     def add_frame(self, time_s: float, faps: Faps) -> None:

@@ -314,7 +314,7 @@ def remove_unfinished(folder: Path) -> None:
     """Delete the unfinished videos of processes that were killed."""
     for path in filter(_is_unfinished, folder.glob(".*.part")):
         with contextlib.suppress(OSError), path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails if a process writes the video
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while a process writes it
             path.unlink()
 
 
@@ -323,7 +323,7 @@ def _is_unfinished(path: Path) -> bool:
 
 
 def _create_unfinished(path: Path) -> tuple[Path, BinaryIO]:
-    """Create a file for an unfinished video, locked while this process writes the video."""
+    """Create a file for an unfinished video, and lock it while this process writes to it."""
     while True:
         # another process may be writing a video of the same name
         unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")

@@ -87,7 +87,7 @@ class PhoneLanguageModel:
 def _contexts(
     num_children: NDArray[np.uint8], phone: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
-    """Return each node's context, whether it is one itself, and the node of its back-off context.
+    """Return each node's context, whether the node is a context, and its back-off context's node.
 
     A node that is not a context leads to its back-off context.
     """

@@ -98,7 +98,7 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
     Raises ``UserError`` if the file cannot be read, or its contents are invalid.
     """
     data = _read(path)
-    with check_content(path or _BUILT_IN, "a file of 'kouxing train visemes'"):
+    with check_content(path or _BUILT_IN, "a file from 'kouxing train visemes'"):
         if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
             raise ValueError(f"the format is not '{FORMAT}'")
         _clips_of(data)
