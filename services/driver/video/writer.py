@@ -170,8 +170,7 @@ class VideoWriter:
             if self._path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
             remove_unfinished(self._path.parent)
-            self._unfinished, lock = _create_unfinished(self._path)
-            self._delete_unfinished = weakref.finalize(self, _delete, self._unfinished, lock)
+            self._create_unfinished()
             container = self._path.suffix.removeprefix(".") or "mp4"
             self._container = av.open(
                 str(self._unfinished), "w", format=container, options=form.options
@@ -204,6 +203,21 @@ class VideoWriter:
             self.close()
         else:
             self.discard()
+
+    def _create_unfinished(self) -> None:
+        """Create the unfinished file, locked while this process writes the video."""
+        while True:
+            # another process may be writing a video of the same name
+            name = f".{self._path.name}.{secrets.token_hex(4)}.part"
+            self._unfinished = self._path.with_name(name)
+            locks: list[BinaryIO] = []
+            # first, because Ctrl-C may interrupt any of the following lines
+            self._delete_unfinished = weakref.finalize(self, _delete, self._unfinished, locks)
+            locks.append(self._unfinished.open("xb"))
+            fcntl.flock(locks[0], fcntl.LOCK_EX)
+            if os.fstat(locks[0].fileno()).st_nlink:
+                return
+            self._delete_unfinished()  # another process deleted it before it was locked
 
     def write_image(self, image: UInt8) -> None:
         """Append a picture (H, W, 3), or (H, W, 4) if the video is transparent; sRGB."""
@@ -322,21 +336,10 @@ def _is_unfinished(path: Path) -> bool:
     return re.fullmatch(r"\..+\.[0-9a-f]{8}\.part", path.name) is not None
 
 
-def _create_unfinished(path: Path) -> tuple[Path, BinaryIO]:
-    """Create a file for an unfinished video, and lock it while this process writes to it."""
-    while True:
-        # another process may be writing a video of the same name
-        unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-        file = unfinished.open("xb")
-        fcntl.flock(file, fcntl.LOCK_EX)
-        if os.fstat(file.fileno()).st_nlink:
-            return unfinished, file
-        file.close()  # another process deleted it before it was locked
-
-
-def _delete(path: Path, lock: BinaryIO) -> None:
+def _delete(path: Path, locks: list[BinaryIO]) -> None:
     path.unlink(missing_ok=True)
-    lock.close()
+    for lock in locks:
+        lock.close()
 
 
 def _create_unique(path: Path) -> Path:
