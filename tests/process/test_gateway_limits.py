@@ -223,7 +223,7 @@ async def test_refuses_connections_while_all_places_have_complete_requests(
             while not await served.answers():
                 await asyncio.sleep(0.02)
     assert [record.getMessage() for record in caplog.records] == [
-        "refused a connection from 127.0.0.1: too many are open"
+        "rejected a connection from 127.0.0.1: too many connections are open"
     ]
 
 
@@ -364,5 +364,5 @@ def test_logs_requests_that_are_not_http_once() -> None:
             assert b" 400 " in client.recv(100)
     gateway.process.terminate()
     _, log = gateway.process.communicate()
-    assert log.count("not HTTP") == 1
+    assert log.count("invalid HTTP") == 1
     assert "Traceback" not in log

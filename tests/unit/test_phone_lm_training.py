@@ -205,7 +205,7 @@ def test_rejects_unreadable_texts_and_empty_input(tmp_path: Path) -> None:
     output = tmp_path / "lm.npz"
     foreign = tmp_path / "foreign.txt"
     foreign.write_bytes("你好".encode("gb18030"))
-    with pytest.raises(UserError, match=r"foreign\.txt: this is not text"):
+    with pytest.raises(UserError, match=r"foreign\.txt: this is not UTF-8 text"):
         train_phone_lm([], [foreign], output, MANDARIN)
     with pytest.raises(UserError, match=r"nowhere\.txt: no such file"):
         train_phone_lm([], [tmp_path / "nowhere.txt"], output, MANDARIN)
