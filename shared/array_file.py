@@ -28,10 +28,8 @@ def read_arrays(path: Path, max_bytes: int, expected: str) -> dict[str, NDArray[
     """
     with open_file(path, max_bytes) as file, check_content(path, expected):
         # ZipFile reads the whole table, so its entries are counted first
-        if (
-            sum(piece.count(_ENTRY) for piece in iter(partial(file.read, 1 << 18), b""))
-            > MAX_ARRAYS
-        ):
+        pieces = iter(partial(file.read, 1 << 18), b"")
+        if sum(piece.count(_ENTRY) for piece in pieces) > MAX_ARRAYS:
             raise ValueError(f"it has more than {MAX_ARRAYS} arrays")
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()

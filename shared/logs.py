@@ -52,6 +52,7 @@ def configure(service: str, level: str) -> None:
     A library's line is logged once per ``LIBRARY_PERIOD_S``, because clients may cause it. Lines
     about their closed connections are not logged.
     """
+    limit = RateLimit(LIBRARY_PERIOD_S)
 
     def is_logged(line: logging.LogRecord) -> bool:
         is_disconnect = line.exc_info is not None and isinstance(line.exc_info[1], OSError)
@@ -62,7 +63,6 @@ def configure(service: str, level: str) -> None:
     LOG.handlers[:] = [handler]
     LOG.setLevel(level.upper())
     LOG.propagate = False
-    limit = RateLimit(LIBRARY_PERIOD_S)
     for_libraries.setFormatter(_JsonFormatter(service))
     for_libraries.addFilter(is_logged)
     logging.basicConfig(handlers=[for_libraries], level=logging.WARNING)

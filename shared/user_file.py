@@ -70,15 +70,20 @@ def split_lines(path: Path, text: str) -> Iterator[str]:
 def parse_json(text: str | bytes) -> Any:
     """Parse JSON from an untrusted source.
 
-    Raises ``ValueError`` if it is not valid, is nested too deeply, or has too many values.
+    Raises ``ValueError`` if it is not valid, is nested too deeply, or has too many values. NaN and
+    infinity are not valid.
     """
     marks = (b",", b"[", b"{") if isinstance(text, bytes) else (",", "[", "{")
     if sum(map(text.count, marks)) > _MAX_JSON_VALUES:  # type: ignore[arg-type]
         raise ValueError(f"it has more than {_MAX_JSON_VALUES} values")
     try:
-        return json.loads(text)
+        return json.loads(text, parse_constant=_reject_constant)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def _reject_constant(word: str) -> float:
+    raise ValueError(f"{word} is not valid JSON")
 
 
 @contextlib.contextmanager

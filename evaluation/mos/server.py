@@ -9,7 +9,6 @@ judges cannot find out which condition they see.
 from __future__ import annotations
 
 import asyncio
-import json
 import signal
 import time
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
 from kouxing.services.gateway.web_server import WebServer, bind_port
+from kouxing.shared.user_file import parse_json
 
 FOLDER = Path(__file__).parent / "page"
 FILES = {name: FOLDER / name for name in ("index.html", "main.js", "style.css")}
@@ -131,11 +131,11 @@ async def _send_file(request: web.Request) -> web.StreamResponse:
 
 async def _read_answer(request: web.Request) -> dict[str, Any]:
     try:
-        answer: dict[str, Any] = json.loads(await request.read())
+        answer: dict[str, Any] = parse_json(await request.read())
         numbers = [answer[name] for name in ("place", *SCALES)]
         is_valid = all(type(number) is int for number in numbers)
         if is_valid and {*numbers[1:]} <= {1, 2, 3, 4, 5} and answer["language"] in LANGUAGES:
             return answer
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError):
         pass
     raise web.HTTPBadRequest(text="send JSON with a place, scores of 1 to 5, and a language\n")

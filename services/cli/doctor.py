@@ -120,7 +120,7 @@ def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[
         if problem := _endpoint_problem(name, endpoint, buses):
             problems.append(f"{name} at {address}: {problem}")
     endpoints = plural(len(service.endpoints), "endpoint")
-    about = f"{endpoints}, clock {round(service.clock_offset_ms, 0) + 0:+.0f} ms"
+    about = f"{endpoints}, clock {service.clock_offset_ms:+z.0f} ms"
     yield Finding(service.instance, about, "\n".join(problems))
 
 

@@ -47,8 +47,8 @@ class SessionRecord:
 
     @property
     def start_request(self) -> str:
-        """The request that services confirm when they have started it."""
-        return f"start-{self.name}-{self.epoch}"
+        """The request that services confirm; another session of this name has another one."""
+        return f"start-{self.number}-{self.epoch}"
 
     @property
     def is_settled(self) -> bool:

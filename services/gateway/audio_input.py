@@ -119,7 +119,7 @@ class RealTimeQueue:
         return not self._queued
 
     async def put(self, pcm: bytes) -> None:
-        """Queue audio, waiting until there is room for it."""
+        """Wait until the queue has room, then add audio."""
         while self._queued and len(self._queued) + len(pcm) > MAX_QUEUED_BYTES:
             await asyncio.sleep(CHUNK_S)
         self._queued += pcm

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import base64
-import json
 from dataclasses import dataclass
 
 import numpy as np
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import parse_json
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 MAX_OBJECT_BYTES = 128 * 1024  # of a JSON message
@@ -100,8 +100,8 @@ def _file_kind(pcm: bytes) -> str:
 
 def _is_json(pcm: bytes) -> bool:
     try:
-        json.loads(pcm)
-    except (ValueError, RecursionError):
+        parse_json(pcm)
+    except ValueError:
         return False
     return True
 

@@ -21,6 +21,7 @@ from kouxing.shared.face.expressions import (
     check_expressiveness,
 )
 from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
 
 _HEADER = struct.Struct("<B3xId")
@@ -149,8 +150,8 @@ def parse_object(message: str | bytes) -> dict[str, object]:
     if len(message) > MAX_OBJECT_BYTES:
         raise UserError(f"a JSON message is longer than {MAX_OBJECT_BYTES >> 10} KiB")
     try:
-        fields = json.loads(message)
-    except (ValueError, RecursionError):
+        fields = parse_json(message)
+    except ValueError:
         fields = None
     if not isinstance(fields, dict):
         raise UserError("expected a JSON object")

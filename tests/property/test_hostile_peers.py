@@ -44,7 +44,7 @@ START = replace(
 )
 
 TEXTS = st.sampled_from(
-    ["", "demo", "t", "recognizer-1", "worker", "observer", "draining", "ready", "start-demo-1",
+    ["", "demo", "t", "recognizer-1", "worker", "observer", "draining", "ready", "start-0-1",
      "learnt", "f32le", "tcp://-:1", "tcp://*:1", "tcp://127.0.0.1:1", "ipc:///tmp/x", "../x",
      "x" * 2000, "\0", "人"]
 )  # fmt: skip
@@ -173,7 +173,7 @@ def test_control_answers_after_anything(actions: list[tuple[str, Any]], as_worke
     peers.check_answer(StatusReport)
     for action in actions:
         if action[0] == "start":
-            peers.honest.send(SessionStarted(session="demo", request="start-demo-1"))
+            peers.honest.send(SessionStarted(session="demo", request="start-0-1"))
         else:
             peers.attack([action])
     assert len(peers.check_answer(StatusReport).sessions) <= MAX_SESSIONS

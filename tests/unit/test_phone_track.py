@@ -1,4 +1,4 @@
-"""Each phone of a session counts once, whichever recognizers publish it."""
+"""Each phone of a session counts once, even if several recognizers publish it."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from kouxing.training.blocks.batches import BlockBatch, block_batch
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
 from kouxing.training.neural.batches import Recording
 from kouxing.training.neural.network import MAX_DEVIATIONS, mixed_precision
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy
+from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_factor
 from kouxing.training.neural.teacher import WholeEncoder
 from kouxing.training.training_set import Report
 
@@ -71,7 +71,7 @@ def train_network(
     network.train()
     return optimizer.train(
         lambda step: _loss(network, teacher, block_batch(recordings, seed, step)),
-        lambda step: min(1.0, (step + 1) / _WARM_UP_STEPS),
+        lambda step: warm_up_factor(step, _WARM_UP_STEPS),
         num_steps=num_steps,
         seed=seed,
         report=report,

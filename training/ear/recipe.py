@@ -32,7 +32,7 @@ from kouxing.training.ear.targets import Piece, Recording, Samples, TargetStore,
 from kouxing.training.ear.teachers import Teachers
 from kouxing.training.model_card import write_card
 from kouxing.training.neural.network import mixed_precision
-from kouxing.training.neural.optimizer import Optimizer
+from kouxing.training.neural.optimizer import Optimizer, warm_up_factor
 from kouxing.training.training_set import Report, read_utterances, weights_of
 
 _FIRST_CHUNKS, _STEPS_PER_CHUNK = 8, 24  # chunks at the start; steps until the next one
@@ -191,7 +191,7 @@ def _train_network(
 
     return optimizer.train(
         loss,
-        lambda step: min(1.0, (step + 1) / _WARM_UP_STEPS),
+        lambda step: warm_up_factor(step, _WARM_UP_STEPS),
         num_steps=num_steps,
         seed=seed,
         report=report,

@@ -16,8 +16,10 @@ from pathlib import Path
 from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.corpora.speech_corpus import may_ship
 from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import read_text, split_lines
 from kouxing.training.ear.targets import Samples
 
+_MAX_BYTES = 16 << 20
 _BY_FILE = ("music", "noise")
 
 
@@ -38,17 +40,17 @@ def read_sounds(folders: Sequence[Path], shipping: bool) -> list[Sound]:
     """
     sounds = []
     for folder in folders:
+        manifest = folder / "manifest.tsv"
+        lines = split_lines(manifest, read_text(manifest, _MAX_BYTES))
         try:
-            with (folder / "manifest.tsv").open(encoding="utf-8-sig", newline="") as lines:
-                rows = list(csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE))
-            for row in rows:
+            for row in csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE):
                 if may_ship(row["licence"]) or not shipping:
                     sounds += _parts(row["kind"], folder / row["path"])
         except OSError as error:
             raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
         except KeyError as error:
             raise UserError(
-                f"{folder / 'manifest.tsv'} lacks the column {error}; add path, kind and licence"
+                f"{manifest} lacks the column {error}; add path, kind and licence"
             ) from error
         except ValueError as error:
             raise UserError(f"cannot read a sound in {folder}: {error}") from error

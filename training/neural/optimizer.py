@@ -108,11 +108,16 @@ class Optimizer(Generic[N]):
         return {"network": self._network, "averaged": self._averaged, "optimizer": self._adam}
 
 
+def warm_up_factor(step: int, num_steps: int) -> float:
+    """Learning-rate factor: a linear rise during the first steps."""
+    return min(1.0, (step + 1) / num_steps)
+
+
 def warm_up_and_decay_factor(
     step: int, num_steps: int, warm_up_steps: int, falling: float
 ) -> float:
     """Learning-rate factor: a linear rise, and a fall to 0 in the last fraction of the steps."""
-    rise = min(1.0, (step + 1) / warm_up_steps)
+    rise = warm_up_factor(step, warm_up_steps)
     return rise * min(1.0, (num_steps - step) / (falling * num_steps))
 
 

@@ -43,7 +43,7 @@ from kouxing.training.neural.export import onnx_of
 from kouxing.training.neural.initial_network import init_encoder, init_network
 from kouxing.training.neural.labels import STATES_PER_PHONE, Mix, label, statistics_of
 from kouxing.training.neural.network import Network, mixed_precision, output_frames
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy
+from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_factor
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.training_set import Report, load_examples
@@ -159,7 +159,7 @@ def train_network(
 
     return optimizer.train(
         loss,
-        lambda step: min(1.0, (step + 1) / _WARM_UP_STEPS),
+        lambda step: warm_up_factor(step, _WARM_UP_STEPS),
         num_steps=num_steps,
         seed=seed,
         report=report,

@@ -194,7 +194,7 @@ class Session(BaseSession):
     ) -> Results[Any]:
         """Return results of several classes from now on; raises as ``frames``.
 
-        For 10 s after the session has opened or moved, earlier results since then arrive first.
+        Within 10 s after the session opened or moved, this also returns the results since then.
 
         Parameters
         ----------

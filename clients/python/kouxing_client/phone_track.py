@@ -38,7 +38,8 @@ class PhoneTrack:
         changed: list[Phone] = []
         if speech.sequence == 1:
             known = max(self._end, self._speech_time) + _TOLERANCE
-            if self._epoch and self._is_speaking | speech.active and speech.media_time > known:
+            is_voiced = self._is_speaking or speech.active
+            if self._epoch and is_voiced and speech.media_time > known:
                 self.num_missed += 1  # one or more
             changed = self._restart()
         self._is_speaking, self._speech_time = speech.active, speech.media_time

@@ -16,6 +16,7 @@ from kouxing.shared.errors import UserError
 MODELS = Path(__file__).parents[1] / "models"
 SHIPPED = ("blocks", "gmm", "neural")
 DEFAULT_MODEL = "blocks"
+_ALONE = ("gmm", "neural")  # shipped models that run without another one
 NEURAL_PATH = MODELS / "neural.npz"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_model_from,
@@ -68,6 +69,8 @@ def load_live_model(
 
     A block model runs together with the shipped causal network.
     """
+    if name in _ALONE:
+        return load_model(model_path(name), look_ahead_ms=look_ahead_ms)
     with ThreadPoolExecutor(max_workers=1) as executor:  # both at the same time
         early = executor.submit(load_model, look_ahead_ms=look_ahead_ms)
         model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
