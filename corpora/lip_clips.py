@@ -154,7 +154,8 @@ def _read_clip(
 ) -> LipClip | None:
     """Read a clip; None if it is in another language."""
     with check_content(path, "a clip"):
-        about = parse_json(read_text(path, _MAX_BYTES))
+        # NaN is a statistic of a clip without enough frames; nothing here reads it
+        about = parse_json(read_text(path, _MAX_BYTES), allow_nan=True)
         clip_language = str(about.get("language", "zh"))[:2]
         if language not in (None, clip_language):
             return None

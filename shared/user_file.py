@@ -67,17 +67,17 @@ def split_lines(path: Path, text: str) -> Iterator[str]:
         yield line
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     """Parse JSON from an untrusted source.
 
     Raises ``ValueError`` if it is not valid, is nested too deeply, or has too many values. NaN and
-    infinity are not valid.
+    infinity are not valid unless ``allow_nan`` is set.
     """
     marks = (b",", b"[", b"{") if isinstance(text, bytes) else (",", "[", "{")
     if sum(map(text.count, marks)) > _MAX_JSON_VALUES:  # type: ignore[arg-type]
         raise ValueError(f"it has more than {_MAX_JSON_VALUES} values")
     try:
-        return json.loads(text, parse_constant=_reject_constant)
+        return json.loads(text, parse_constant=None if allow_nan else _reject_constant)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 

@@ -61,7 +61,13 @@ def write_clip(
 ) -> None:
     (folder / f"{name}.json").write_text(
         json.dumps(
-            {"language": language, "speaker": "one", "licence": license_name, "transcript": ""}
+            {
+                "language": language,
+                "speaker": "one",
+                "licence": license_name,
+                "transcript": "",
+                "energy_r": float("nan"),  # not used
+            }
         )
     )
     (folder / f"{name}.csv").write_text(f"{header}\n{row}\n")
