@@ -386,6 +386,37 @@ def load(
     write_json(json_file, asdict(figures) | {"summary": figures.summary})
 
 
+@bench_app.command()
+def busy(
+    audio: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings to stream. Default: the samples.")
+    ] = None,
+    programs: Annotated[
+        list[int] | None,
+        typer.Option(min=0, max=100, help="Number of busy programs; repeatable. Default: 0, 2, 6."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each load.")] = 30.0,
+    after: Annotated[float, typer.Option(min=1.0, help="Seconds of speech after it.")] = 15.0,
+    picture: Annotated[Path | None, typer.Option(help="Plot the lateness (.png).")] = None,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure how late a live face is while other programs keep the processor busy.
+
+    Also measures the processor time and the wake-ups of each service. Needs Linux.
+    """
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.system.busy import draw, measure, show
+
+    check_output(picture, json_file, force=force)
+    paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
+    figures = measure(paths, programs or (0, 2, 6), seconds, after, CONSOLE)
+    show(figures, Console())
+    if picture is not None:
+        save_figure(draw(figures), picture)
+    write_json(json_file, asdict(figures) | {"summary": [run.summary for run in figures.runs]})
+
+
 @plot_app.callback()
 def plot() -> None:
     """Draw pictures and videos of the models."""

@@ -1,0 +1,323 @@
+"""Measure how late a live face is while other programs keep the processor busy.
+
+One client speaks in a loop. Busy programs run for a while, each in a session of its own, as desktop
+programs do: Linux shares the processor among sessions first. The face's *lateness* is the time
+since the audio of the newest frame was due, beyond its median before the load. So it also grows
+while no frame arrives.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from kouxing_client import Client
+from numpy.typing import NDArray
+from rich.console import Console
+
+from kouxing.corpora.figures import new_figure
+from kouxing.evaluation.system.load import SETTLE_S, Crowd, Spoken
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.kinds import KINDS
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.control_client import connect
+from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import print_table
+
+LATE_S = 0.3  # a face that is later is behind
+RECOVERED_S = 0.05  # lateness of a face that has recovered
+STEADY_S = 1.0  # and stays so for this time
+QUIET_S = 5.0  # before the load
+STEP_S = 0.02  # between two values of the lateness
+_PROC = Path("/proc")
+_COLUMNS = 10  # seconds in a row of the table
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What a service used per second."""
+
+    cpu_cores: float
+    wake_ups: float  # of all threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """Lateness of the face with a number of busy programs."""
+
+    num_programs: int
+    quiet_median_s: float  # from the audio of a frame to its arrival, before the load
+    late_s: list[float]  # beyond that, every STEP_S from the start of the load
+    load_s: float  # duration of the load
+    missing: float  # fraction of the frames that never arrived
+
+    @property
+    def worst_s(self) -> float:
+        """The largest lateness."""
+        return max(self.late_s)
+
+    @property
+    def longest_s(self) -> float:
+        """Duration of the longest time in which the face was behind."""
+        longest = current = 0
+        for late_s in self.late_s:
+            current = current + 1 if late_s > LATE_S else 0
+            longest = max(longest, current)
+        return longest * STEP_S
+
+    @property
+    def recovery_s(self) -> float | None:
+        """Time from the end of the load until the face has recovered; None if it does not."""
+        num_steady = round(STEADY_S / STEP_S)
+        after = self.late_s[round(self.load_s / STEP_S) :]
+        for start in range(len(after) - num_steady + 1):
+            if max(after[start : start + num_steady]) <= RECOVERED_S:
+                return start * STEP_S
+        return None
+
+    @property
+    def worst_by_second_s(self) -> list[float]:
+        """The largest lateness of each second."""
+        size = round(1.0 / STEP_S)
+        return [max(self.late_s[at : at + size]) for at in range(0, len(self.late_s), size)]
+
+    @property
+    def summary(self) -> dict[str, float | None]:
+        """The figures of the run."""
+        return {
+            "worst_s": self.worst_s,
+            "longest_s": self.longest_s,
+            "recovery_s": self.recovery_s,
+            "missing": self.missing,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Busy:
+    """All figures."""
+
+    runs: list[Run]
+    idle: dict[str, Usage]  # by service, while nobody speaks
+    speaking: dict[str, Usage]  # by service, before the load
+    machine_load: float  # load average of the minute before
+
+
+def measure(
+    paths: Sequence[Path],
+    programs: Sequence[int],
+    load_s: float,
+    after_s: float,
+    console: Console,
+) -> Busy:
+    """Start all services, and speak while busy programs run; once for each number of programs.
+
+    Raises ``UserError`` if a file is not audio, or the services cannot start.
+    """
+    text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
+    machine_load = os.getloadavg()[0]
+    runs: list[Run] = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        LocalSystem(Path(folder), console) as system,
+        connect(system.control) as client,
+    ):
+        processes = {name: system.supervisor.process(name).pid for name in KINDS}
+        time.sleep(SETTLE_S)
+        idle = _usage(processes, lambda: time.sleep(QUIET_S))
+        with _speaker(client, text) as (crowd, quiet_s):
+            speaking = _usage(processes, lambda: crowd.speak_until(quiet_s + QUIET_S))
+        for num in programs:
+            console.print(f"speaking with {num} busy programs")
+            runs.append(_run(client, text, num, load_s, after_s))
+    return Busy(runs=runs, idle=idle, speaking=speaking, machine_load=machine_load)
+
+
+@contextlib.contextmanager
+def _speaker(client: Client, text: NDArray[np.float32]) -> Iterator[tuple[Crowd, float]]:
+    """Open a session and speak for a moment; yield the speaker, and the time."""
+    crowd = Crowd(client, text, 1)
+    if not crowd.spoken:
+        raise UserError(f"control rejects the session: {', '.join(crowd.refusals)}")
+    crowd.start()
+    quiet_s = time.perf_counter() + SETTLE_S
+    crowd.speak_until(quiet_s)
+    yield crowd, quiet_s
+    crowd.close()
+
+
+def _run(
+    client: Client, text: NDArray[np.float32], num_programs: int, load_s: float, after_s: float
+) -> Run:
+    with _speaker(client, text) as (crowd, quiet_s):
+        start_s = quiet_s + QUIET_S
+        crowd.speak_until(start_s)
+        with _busy_programs(num_programs):
+            crowd.speak_until(start_s + load_s)
+        end_s = start_s + load_s + after_s
+        crowd.speak_until(end_s)
+        (spoken,) = crowd.spoken
+        frames = _frames(spoken)
+        num_due = round((end_s - start_s) * spoken.session.info["facts"]["frame_rate_hz"])
+    median_s = float(np.median(_ages_s(frames, quiet_s, start_s)))
+    num_shown = sum(start_s <= due_s < end_s for due_s, _ in frames)
+    return Run(
+        num_programs=num_programs,
+        quiet_median_s=median_s,
+        late_s=[float(age_s) for age_s in _ages_s(frames, start_s, end_s) - median_s],
+        load_s=load_s,
+        missing=max(0.0, 1.0 - num_shown / num_due),
+    )
+
+
+def _frames(spoken: Spoken) -> list[tuple[float, float]]:
+    """Return when the audio of each frame was due and when the frame arrived, in order."""
+    arrived_s = spoken.arrived_s.copy()  # another thread adds frames
+    return sorted(
+        (spoken.start_s + to_seconds(media_time), at_s) for media_time, at_s in arrived_s.items()
+    )
+
+
+def _ages_s(
+    frames: Sequence[tuple[float, float]], from_s: float, until_s: float
+) -> NDArray[np.float64]:
+    """Return the age of the newest frame every ``STEP_S``: the time since its audio was due."""
+    due_s, arrived_s = np.array(frames).T
+    order = np.argsort(arrived_s)
+    newest_s = np.maximum.accumulate(due_s[order])
+    times_s = np.arange(from_s, until_s, STEP_S)
+    known = np.searchsorted(arrived_s[order], times_s, side="right") - 1
+    ages_s: NDArray[np.float64] = times_s - newest_s[np.maximum(known, 0)]
+    return ages_s
+
+
+@contextlib.contextmanager
+def _busy_programs(num: int) -> Iterator[None]:
+    programs = [
+        subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"], start_new_session=True)
+        for _ in range(num)
+    ]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+        for program in programs:
+            program.wait()
+
+
+def _usage(processes: Mapping[str, int], action: Callable[[], None]) -> dict[str, Usage]:
+    """Return what each service uses while an action runs."""
+    started_s = time.monotonic()
+    before = {name: _used(process) for name, process in processes.items()}
+    action()
+    passed_s = time.monotonic() - started_s
+    return {
+        name: Usage(
+            *(
+                (now - then) / passed_s
+                for now, then in zip(_used(process), before[name], strict=True)
+            )
+        )
+        for name, process in processes.items()
+    }
+
+
+def _used(process_id: int) -> tuple[float, int]:
+    """Return the CPU seconds of a process, and how often its threads woke up.
+
+    Raises ``UserError`` if the system has no /proc, or the process has ended.
+    """
+    try:
+        ticks = (_PROC / str(process_id) / "stat").read_text("utf-8").rpartition(")")[2].split()
+        states = [
+            (thread / "status").read_text("utf-8")
+            for thread in (_PROC / str(process_id) / "task").iterdir()
+        ]
+    except OSError as error:
+        text = f"cannot read the processor time of a service: {error}; this needs Linux"
+        raise UserError(text) from None
+    wake_ups = sum(
+        int(line.split()[1])
+        for state in states
+        for line in state.splitlines()
+        if line.startswith("voluntary_ctxt_switches")
+    )
+    return (int(ticks[11]) + int(ticks[12])) / os.sysconf("SC_CLK_TCK"), wake_ups
+
+
+def show(busy: Busy, console: Console) -> None:
+    """Print the lateness by second, the summary, and what the services use."""
+    for run in busy.runs:
+        rows = run.worst_by_second_s
+        print_table(
+            console,
+            f"{run.num_programs} busy programs for {run.load_s:g} s: "
+            "largest lateness of each second, ms",
+            ("from s", *(f"+{second}" for second in range(_COLUMNS))),
+            (
+                [str(at), *(f"{1e3 * late_s:.0f}" for late_s in rows[at : at + _COLUMNS])]
+                for at in range(0, len(rows), _COLUMNS)
+            ),
+        )
+    print_table(
+        console,
+        "",
+        (
+            "busy programs",
+            "worst s",
+            f"longest over {LATE_S:g} s",
+            "recovered after s",
+            "frames missing",
+            "quiet median ms",
+        ),
+        (
+            [
+                str(run.num_programs),
+                f"{run.worst_s:.2f}",
+                f"{run.longest_s:.2f}",
+                "never" if run.recovery_s is None else f"{run.recovery_s:.2f}",
+                f"{run.missing:.0%}",
+                f"{1e3 * run.quiet_median_s:.0f}",
+            ]
+            for run in busy.runs
+        ),
+    )
+    names = [*busy.idle, "all"]
+    print_table(
+        console,
+        "",
+        ("per second", "nobody speaks: cores", "wake-ups", "one session: cores", "wake-ups"),
+        ([name, *_cells(busy.idle, name), *_cells(busy.speaking, name)] for name in names),
+    )
+    console.print(f"load average before: {busy.machine_load:.1f}")
+
+
+def _cells(usage: Mapping[str, Usage], name: str) -> tuple[str, str]:
+    services = [usage[name]] if name in usage else usage.values()
+    cpu_cores = sum(service.cpu_cores for service in services)
+    return f"{cpu_cores:.3f}", f"{sum(service.wake_ups for service in services):.0f}"
+
+
+def draw(busy: Busy) -> Any:
+    """Plot the lateness over time, one line for each number of busy programs."""
+    figure = new_figure(9.0, 4.0)
+    axes = figure.subplots()
+    for run in busy.runs:
+        times_s = np.arange(len(run.late_s)) * STEP_S
+        axes.plot(times_s, run.late_s, label=f"{run.num_programs} busy programs", linewidth=1)
+    axes.axvspan(0.0, busy.runs[0].load_s, color="grey", alpha=0.15, label="load")
+    axes.axhline(LATE_S, color="grey", linestyle=":", label=f"{LATE_S:g} s")
+    axes.set(xlabel="time, s", ylabel="lateness of the face, s", ylim=(0, None))
+    axes.legend(fontsize=8)
+    return figure

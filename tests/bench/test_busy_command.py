@@ -1,0 +1,50 @@
+"""The busy command measures lateness, and prints, writes and plots its figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from kouxing.evaluation.commands import bench_app
+from kouxing.evaluation.system import busy
+from kouxing.evaluation.system.busy import STEP_S, Run
+from tests.system import VOWELS_FILE
+
+
+def _run(late_s: list[tuple[float, float]], load_s: float) -> Run:
+    """Make a run from durations and the lateness in each of them."""
+    values = [late for lasts_s, late in late_s for _ in range(round(lasts_s / STEP_S))]
+    return Run(num_programs=1, quiet_median_s=0.1, late_s=values, load_s=load_s, missing=0.0)
+
+
+def test_summarizes_the_lateness() -> None:
+    run = _run([(1.0, 0.0), (0.5, 0.4), (0.1, 0.2), (0.7, 0.6), (0.7, 0.1), (2.0, 0.04)], 2.0)
+    assert run.worst_s == 0.6
+    assert run.longest_s == pytest.approx(0.7)
+    assert run.recovery_s == pytest.approx(1.0)
+    assert run.worst_by_second_s == [0.0, 0.6, 0.6, 0.04, 0.04]
+    assert _run([(5.0, 0.1)], 2.0).recovery_s is None
+
+
+def test_prints_writes_and_plots_the_same_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(busy, "SETTLE_S", 1.0)
+    monkeypatch.setattr(busy, "QUIET_S", 1.0)
+    figures, picture = tmp_path / "busy.json", tmp_path / "busy.png"
+    arguments = ["busy", str(VOWELS_FILE), "--programs", "1", "--seconds", "1", "--after", "1"]
+    result = CliRunner().invoke(
+        bench_app, [*arguments, "--json", str(figures), "--picture", str(picture)]
+    )
+    assert result.exit_code == 0, result.output
+    written = json.loads(figures.read_text(encoding="utf-8"))
+    (run,) = written["runs"]
+    assert len(run["late_s"]) == 100
+    assert max(run["late_s"]) == written["summary"][0]["worst_s"]
+    assert f"{max(run['late_s']):.2f}" in result.stdout
+    assert 0 < written["speaking"]["recognizer"]["cpu_cores"] < 2
+    assert written["idle"]["control"]["wake_ups"] > 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
