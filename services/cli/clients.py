@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -28,6 +28,9 @@ from kouxing.shared.terminal import (
     print_table,
     write_json,
 )
+
+if TYPE_CHECKING:
+    from kouxing_client import Lateness
 
 SHOWN_METRICS = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
@@ -247,14 +250,15 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
         sessions = [
             (
                 session.session,
-                session.state,
+                "speaking" if session.speaking else session.state,
                 f"{session.age_s:.0f} s",
-                "yes" if session.speaking else "no",
+                _lateness_text(session.lateness),
                 ", ".join(sorted({*session.workers.values()})),
             )
             for session in report.sessions
         ]
-        print_table(out, "", ("session", "state", "open for", "speaking", "workers"), sessions)
+        columns = ("session", "state", "open for", "late: p50, p95, worst", "workers")
+        print_table(out, "", columns, sessions)
     write_json(json_file, asdict(report))
 
 
@@ -281,6 +285,10 @@ def _session_name(name: str) -> str:
             f"{name!r} is not a session name; use up to 64 letters, digits, '-' and '_'"
         )
     return name
+
+
+def _lateness_text(late: Lateness | None) -> str:
+    return "" if late is None else f"{late.p50_ms:.0f}, {late.p95_ms:.0f}, {late.worst_ms:.0f} ms"
 
 
 def _is_drop_counter(name: str) -> bool:

@@ -9,6 +9,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.session import (
+    Lateness,
     OpenSession,
     SessionFacts,
     SessionMoved,
@@ -44,6 +45,7 @@ class SessionRecord:
     next_sequence: int = 1  # first audio message that a new recognizer would need
     resume_sequence: int | None = None  # first one to resend; None: the recognizer stays
     media_time: int = 0  # its phones are final up to here
+    lateness: Lateness | None = None  # of its frames in the last 10 s
 
     @property
     def start_request(self) -> str:
@@ -124,4 +126,5 @@ class SessionRecord:
             endpoints=self.endpoints,
             workers=self.workers,
             facts=self.facts,
+            lateness=self.lateness,
         )

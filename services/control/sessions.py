@@ -196,6 +196,8 @@ class Sessions:
         """Record how far a service has processed a session's input; return its idle time."""
         state = heartbeat.sessions[record.name]
         record.media_time = max(record.media_time, state.media_time)
+        if heartbeat.instance == record.workers["faps"]:
+            record.lateness = state.lateness
         if heartbeat.instance != record.workers["audio"]:
             return 0.0
         record.next_sequence = max(record.next_sequence, state.sequence + 1)

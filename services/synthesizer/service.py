@@ -16,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from kouxing.services.lip_models import lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
+from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
@@ -46,7 +48,7 @@ from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of, is_report
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import ErrorCode, SessionFacts
+from kouxing.shared.wire.session import ErrorCode, Lateness, SessionFacts
 from kouxing.shared.wire.speech import (
     Acknowledge,
     AudioState,
@@ -81,6 +83,7 @@ class _SynthesizerSession:
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
         self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
         self.finished = False
+        self.lateness = LatenessMeter()
         self.shapes: list[str] = []  # shape sets to publish
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
@@ -226,10 +229,27 @@ class SynthesizerService(Service):
             self._make_frames(busy[self._turn % len(busy)])
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Return the time up to which the phones of each session are final."""
+        """Return how far each session's phones are final, and how late its frames are."""
+        now_s = time.monotonic()
+        inputs = {}
+        for name, session in self._sessions.items():
+            lateness = None
+            if percentiles := session.lateness.percentiles_ms(now_s):
+                p50_ms, p95_ms, worst_ms = percentiles
+                lateness = Lateness(p50_ms=p50_ms, p95_ms=p95_ms, worst_ms=worst_ms)
+            media_time = to_samples(session.final.time_s)
+            inputs[name] = SessionInput(media_time=media_time, lateness=lateness)
+        return inputs
+
+    def gauges(self) -> dict[str, float]:
+        """Return the lateness of the session that is latest."""
+        now_s = time.monotonic()
+        measured = [session.lateness.percentiles_ms(now_s) for session in self._sessions.values()]
+        latest = max(filter(None, measured), key=itemgetter(-1), default=(0.0, 0.0, 0.0))
+        names = ("p50", "p95", "worst")
         return {
-            name: SessionInput(media_time=to_samples(session.final.time_s))
-            for name, session in self._sessions.items()
+            f"lateness_{name}_seconds": late_ms / 1e3
+            for name, late_ms in zip(names, latest, strict=True)
         }
 
     def on_drain(self) -> bool:
@@ -250,6 +270,7 @@ class SynthesizerService(Service):
             session.relax_at_s += num_frames / self.frame_rate_hz
             # media time stands still with the audio; the sequence number continues
             self._publish(session, session.face.relax(num_frames))
+            session.lateness.pause()
             session.receiver.acknowledge()
 
     # --- from the recognizer ---------------------------------------------------------------------
@@ -322,6 +343,8 @@ class SynthesizerService(Service):
             started_s = time.perf_counter()
             frames = list(itertools.islice(session.frames, num_left))
             self._publish(session, frames)
+            if session.start.paced and not isinstance(event, EndOfSound):
+                session.lateness.add((time_s for time_s, _ in frames), time.monotonic())
             if isinstance(event, events.Progress):
                 self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
             num_left -= len(frames)

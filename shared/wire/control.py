@@ -23,6 +23,7 @@ from kouxing.shared.wire.message import (
 )
 from kouxing.shared.wire.session import (
     Encoding,
+    Lateness,
     MetricMap,
     MouthProfile,
     NumChannels,
@@ -55,6 +56,7 @@ class SessionInput:
     idle_s: Seconds = 0.0  # since its last input
     sequence: Count = 0  # newest audio message that a recognizer in its place would not need
     media_time: Samples = 0  # the session's phones are final up to here
+    lateness: Lateness | None = None  # of a synthesizer's frames; None: no live frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,6 +29,7 @@ Text = Annotated[str, Meta(max_length=2000)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Samples = Annotated[int, Meta(ge=0, le=2**53)]  # at 16 kHz
 Seconds = Annotated[float, Meta(ge=0)]
+Milliseconds = Annotated[float, Meta(ge=0)]
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Endpoint = Annotated[str, Meta(max_length=256)]
 EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]

@@ -15,6 +15,7 @@ from kouxing.shared.wire.message import (
     Endpoint,
     EndpointMap,
     Message,
+    Milliseconds,
     Name,
     Seconds,
     SessionName,
@@ -60,6 +61,15 @@ class SessionFacts:
     frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # of the FAP frames
     delay_ms: Annotated[float, Meta(ge=0, le=1000)] | None = None  # from audio to its FAP frame
     lip_model: Name | None = None  # of a face without a chosen one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lateness:
+    """How late the frames of the last 10 s left the synthesizer of a live session."""
+
+    p50_ms: Milliseconds
+    p95_ms: Milliseconds
+    worst_ms: Milliseconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,6 +168,7 @@ class SessionState:
     endpoints: EndpointMap  # of the session's workers: audio, phones, faps, ...
     workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
     facts: SessionFacts
+    lateness: Lateness | None = None  # None: not live, or no frames in the last 10 s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

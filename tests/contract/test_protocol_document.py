@@ -26,6 +26,7 @@ from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERS
 from kouxing.shared.wire.schema import schema
 from kouxing.shared.wire.session import (
     ErrorCode,
+    Lateness,
     ServiceState,
     SessionFacts,
     SessionMoved,
@@ -50,6 +51,7 @@ STRUCTURES: dict[str, type[Any]] = {
     "face-settings": FaceSettings,
     "newest-frame": NewestFrame,
     "session-facts": SessionFacts,
+    "lateness": Lateness,
 }
 WIRE_NAME = {cls: name for name, cls in STRUCTURES.items()}
 

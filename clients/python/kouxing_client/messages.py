@@ -195,6 +195,15 @@ class SessionFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lateness:
+    """How late the frames of the last 10 s of a live session were."""
+
+    p50_ms: float
+    p95_ms: float
+    worst_ms: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class SessionState:
     """One session, as control knows it."""
 
@@ -208,6 +217,8 @@ class SessionState:
     workers: dict[str, str]
     """instance at each endpoint"""
     facts: SessionFacts
+    lateness: Lateness | None = None
+    """None: not live, or no frames in the last 10 s"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,72 @@
+"""How late the frames of a live session are; the time is injected."""
+
+from __future__ import annotations
+
+import pytest
+
+from kouxing.services.synthesizer.lateness import LatenessMeter
+
+STEP_S = 0.02
+
+
+class Stream:
+    """Frames of live audio that starts at a time of the clock."""
+
+    def __init__(self, now_s: float = 1000.0, speed: float = 1.0) -> None:
+        self.meter = LatenessMeter()
+        self.now_s = now_s
+        self._time_s = 0.0
+        self._speed = speed  # of the client's clock
+
+    def run(self, duration_s: float, late_s: float = 0.0) -> None:
+        """Send frames, each late by the same time."""
+        for _ in range(round(duration_s / STEP_S)):
+            self.now_s += STEP_S
+            self._time_s += STEP_S * self._speed
+            self.meter.add([self._time_s], self.now_s + late_s)
+
+    def late_ms(self) -> tuple[float, float, float]:
+        """Return p50, p95 and the worst lateness, ms."""
+        percentiles_ms = self.meter.percentiles_ms(self.now_s)
+        assert percentiles_ms is not None
+        return percentiles_ms
+
+
+def test_frames_are_late_by_what_they_exceed_the_earliest_frame() -> None:
+    stream = Stream()
+    assert stream.meter.percentiles_ms(stream.now_s) is None, "no frames"
+    stream.run(9.0)
+    stream.run(0.9, late_s=0.1)
+    stream.run(0.1, late_s=2.0)
+    assert stream.late_ms() == pytest.approx((0.0, 100.0, 2000.0), abs=40.0)
+
+
+def test_only_the_last_ten_seconds_count() -> None:
+    stream = Stream()
+    stream.run(5.0, late_s=0.5)
+    stream.run(10.5)
+    assert max(stream.late_ms()) < 1.0
+    assert stream.meter.percentiles_ms(stream.now_s + 20.0) is None
+
+
+@pytest.mark.parametrize("speed", [0.991, 1.0, 1.009])
+def test_the_drift_of_a_clients_clock_is_no_lateness(speed: float) -> None:
+    stream = Stream(speed=speed)
+    stream.run(120.0)
+    assert max(stream.late_ms()) < 1.0
+
+
+def test_a_long_overload_stays_visible() -> None:
+    stream = Stream()
+    stream.run(1.0)
+    stream.run(60.0, late_s=2.0)
+    assert stream.late_ms()[0] > 1000.0
+
+
+def test_a_pause_of_the_audio_is_no_lateness() -> None:
+    stream = Stream()
+    stream.run(1.0)
+    stream.now_s += 30.0
+    stream.meter.pause()
+    stream.run(1.0)
+    assert max(stream.late_ms()) < 1.0
