@@ -20,6 +20,7 @@ from kouxing.shared.connections import KIB, ConnectionLimiter, Limits
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.sockets import Socket
+from kouxing.shared.waker import Waker
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 from kouxing.shared.zap import Zap, answer_handshakes
 
@@ -121,6 +122,10 @@ class Bus:
             return Reach.ACCEPTED
         is_refused = {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
         return Reach.REFUSED if is_refused else Reach.UNREACHABLE
+
+    def wake_on_connections(self, waker: Waker) -> None:
+        """Wake the caller's loop when a connection has ended, or a message does not."""
+        self._limiter.waker = waker
 
     def drop(self, socket: Socket, *, linger_s: float = 1.0) -> None:
         """Close one socket (see ``Socket.close``)."""

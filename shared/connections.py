@@ -2,15 +2,17 @@
 
 libzmq limits the size of a message part and the length of a queue. It does not limit the number
 of connections, the number of parts of a message (it keeps all of them until the last one arrives),
-or how fast a peer sends. So a thread looks at every connection 20 times a second. It compares the
-bytes that the kernel received (Linux only) with the messages that were delivered. It disconnects a
-peer that exceeds a limit; libzmq then frees the peer's memory. An honest client is never
-disconnected, however fast or slow: its queue fills up, libzmq stops reading, and the client waits.
+or how fast a peer sends. So a thread looks at every connection within 50 ms after data arrives,
+and at least once a second. It compares the bytes that the kernel received (Linux only) with the
+messages that were delivered. While some are not, it looks 20 times a second. It disconnects a peer
+that exceeds a limit; libzmq then frees the peer's memory. An honest client is never disconnected,
+however fast or slow: its queue fills up, libzmq stops reading, and the client waits.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import resource
 import struct
 import threading
@@ -22,12 +24,15 @@ from dataclasses import dataclass
 import zmq
 
 from kouxing.shared import kernel_sockets
+from kouxing.shared.arrivals import Arrivals
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
+from kouxing.shared.waker import Waker
 
 KIB, MIB = 1024, 1024 * 1024
-CHECK_INTERVAL_S = 0.05  # between two looks at all connections
+CHECK_INTERVAL_S = 0.05  # between two looks at all connections, while data arrives
+MAX_INTERVAL_S = 1.0  # the same without data
 RECEIVE_BUFFER = 256 * KIB  # of the kernel, which doubles it
 MAX_UNDELIVERED = 24 * MIB  # of all connections
 MAX_INCOMPLETE = MIB  # of all connections: 16 audio messages on slow links
@@ -49,6 +54,7 @@ PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
+_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # that a monitor reports
 _EVENT = struct.Struct("=HI")  # of a monitor: event and descriptor
 _WARNINGS = RateLimit()
 
@@ -119,6 +125,7 @@ class Connection:
         self._sent_before = socket.num_sent  # when nothing waited for the peer
         self._acknowledged = 0
         self._stalled_since_s = 0.0
+        self._had_unsent = False
 
     @property
     def owner(self) -> str:
@@ -150,9 +157,10 @@ class Connection:
         if not traffic.unsent:
             self._sent_before = self.socket.num_sent
         self.unread = min(MAX_QUEUED, self.socket.num_sent - self._sent_before)
-        if not traffic.unsent or traffic.acknowledged != self._acknowledged:
+        is_waiting = traffic.unsent > 0 and traffic.acknowledged == self._acknowledged
+        if not (is_waiting and self._had_unsent):
             self._stalled_since_s = now_s
-        self._acknowledged = traffic.acknowledged
+        self._acknowledged, self._had_unsent = traffic.acknowledged, traffic.unsent > 0
         limits = self.socket.limits
         if self.incomplete > limits.message_bytes or self.undelivered > limits.undelivered_bytes:
             self.disconnect("its message does not end", LONG_PENALTY_S)
@@ -233,8 +241,10 @@ class LimitedSocket:
         """Yield the descriptors of new connections."""
         with contextlib.suppress(zmq.Again):
             while True:
-                event, _endpoint = self._monitor.recv_multipart(zmq.DONTWAIT)
-                yield _EVENT.unpack(event)[1]
+                data, _endpoint = self._monitor.recv_multipart(zmq.DONTWAIT)
+                event, descriptor = _EVENT.unpack(data)
+                if event == zmq.EVENT_ACCEPTED:
+                    yield descriptor
 
     def close(self) -> None:
         """Stop watching the socket."""
@@ -259,9 +269,12 @@ class ConnectionLimiter:
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
+        self._has_undelivered = False
         self._topic_bytes = 0  # at most; the socket's thread only
         self._trims_s: list[float] = []  # when to give memory back
         self._num_ended = 0  # connections that ended since memory was last freed
+        self._arrivals = Arrivals()
+        self.waker: Waker | None = None  # of the loop that receives the messages
         self._stops = threading.Event()
         self._thread = threading.Thread(target=self._run, name="connections", daemon=True)
 
@@ -273,7 +286,9 @@ class ConnectionLimiter:
         raw.setsockopt(zmq.MAXMSGSIZE, limits.part_bytes)
         raw.setsockopt(zmq.RCVHWM, limits.queue_length)
         raw.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
-        socket = LimitedSocket(self, limits, raw.get_monitor_socket(zmq.EVENT_ACCEPTED))
+        monitor = raw.get_monitor_socket(_EVENTS)
+        self._arrivals.add(int(monitor.getsockopt(zmq.FD)))
+        socket = LimitedSocket(self, limits, monitor)
         self._sockets.append(socket)
         if not self._thread.is_alive():
             max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -290,7 +305,9 @@ class ConnectionLimiter:
             return known
         if kernel_sockets.port_of(descriptor) != socket.port:
             return None
-        return self._connections.setdefault(inode, Connection(descriptor, inode, socket))
+        connection = self._connections.setdefault(inode, Connection(descriptor, inode, socket))
+        self._arrivals.add(descriptor)
+        return connection
 
     def is_open(self, inode: int) -> bool:
         """Return whether a connection has not ended."""
@@ -338,6 +355,7 @@ class ConnectionLimiter:
     def close(self) -> None:
         """Stop watching."""
         self._stops.set()
+        self._arrivals.close()
         if self._thread.is_alive():
             self._thread.join()
         for socket in self._sockets:
@@ -345,14 +363,18 @@ class ConnectionLimiter:
 
     def _run(self) -> None:
         while not self._stops.wait(CHECK_INTERVAL_S):
-            self.enforce_limits(time.monotonic())
+            now_s = time.monotonic()
+            self.enforce_limits(now_s)
+            if not self._has_undelivered:
+                due_s = self._trims_s[0] if self._trims_s else math.inf
+                self._arrivals.wait(min(due_s - now_s, MAX_INTERVAL_S))
 
     def enforce_limits(self, now_s: float) -> None:
         """Enforce all limits."""
         for socket in self._sockets:
             for descriptor in socket.accepted():
                 self.find(descriptor, socket)
-        self._forget_ended(now_s)
+        has_ended = self._forget_ended(now_s)
         connections = [c for c in list(self._connections.values()) if not c.is_cut]
         self._limit_number(connections)
         for connection in connections:
@@ -365,6 +387,9 @@ class ConnectionLimiter:
             connections, lambda c: c.incomplete, max_incomplete, "too many incomplete messages"
         )
         _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
+        self._has_undelivered = any(connection.undelivered for connection in connections)
+        if self.waker is not None and (has_ended or self._has_undelivered):
+            self.waker.wake()  # the loop receives what is complete, and learns what has ended
         if self._trims_s and now_s >= self._trims_s[0]:
             del self._trims_s[0]
             self._num_ended = 0
@@ -405,8 +430,10 @@ class ConnectionLimiter:
                     connection.disconnect(f"its {owner} has too many connections")
                 num_excess -= connection.is_cut
 
-    def _forget_ended(self, now_s: float) -> None:
-        for connection in [c for c in list(self._connections.values()) if not _exists(c)]:
+    def _forget_ended(self, now_s: float) -> bool:
+        """Forget the connections that have ended; return whether there are any."""
+        ended = [c for c in list(self._connections.values()) if not _exists(c)]
+        for connection in ended:
             del self._connections[connection.inode]
             connection.socket.ended.append(connection.inode)
             self._num_ended += 1
@@ -415,6 +442,7 @@ class ConnectionLimiter:
             self.save_budget(connection)
         for owner in [owner for owner, kept in self._budgets.items() if kept.left >= BUDGET]:
             del self._budgets[owner]
+        return bool(ended)
 
 
 def _exists(connection: Connection) -> bool:

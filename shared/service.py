@@ -1,14 +1,15 @@
 """The loop that every service runs: startup, main loop, shutdown.
 
-A service reads its sockets with one poller and calls ``on_tick`` about every 10 ms. SIGTERM or
-SIGINT ends the main loop; then the service finishes its work within a deadline. A second signal
-exits at once. Heartbeats are sent from the loop, so that control detects a loop that hangs.
+A service sleeps until a message arrives or periodic work is due (``on_tick``). SIGTERM or SIGINT
+ends the main loop; then the service finishes its work within a deadline. A second signal exits at
+once. Heartbeats are sent from the loop, so that control detects a loop that hangs.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import os
 import secrets
 import signal
@@ -47,7 +48,7 @@ from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSes
 if TYPE_CHECKING:
     from kouxing.shared.prometheus import MetricsServer
 
-TICK_S = 0.01
+TICK_S = 0.01  # between ticks, at least
 HEARTBEAT_S = 0.25
 SESSIONS_PER_HEARTBEAT = 16  # of a worker, so that a heartbeat's cost does not grow
 RESYNC_AFTER_S = 0.8  # without a heartbeat; control may have moved the sessions
@@ -57,8 +58,8 @@ FIRST_REPLY_S = 3.0  # the same at startup
 LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0
 HAND_OVER_S = 3.0  # time for control to move the sessions of a stopping worker
-MAX_TICK_GAP_S = 5.0  # without a tick, the service is not healthy
-EXIT_AFTER_S = 15.0  # without a tick, a health check ends the process
+MAX_LATE_S = 5.0  # of a heartbeat; a later service is not healthy
+EXIT_AFTER_S = 15.0  # if a heartbeat is later, a health check ends the process
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id; the underscore: not a setting
 _BUILD = version("kouxing")
 PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
@@ -89,10 +90,10 @@ class Service(MessageLoop):
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # that it provides, by name
         self.facts = SessionFacts()  # about the sessions that it serves
-        self.tick_callbacks: set[Callable[[], None]] = set()
+        self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
         self._hand_over_end_s = 0.0
-        self._tick_due_s = 0.0
+        self._ticked_s = self._tick_due_s = 0.0
         self._heartbeat_due_s = 0.0
         self._heartbeat_s = time.monotonic()  # when the newest heartbeat was sent
         self._num_reported = 0  # sessions in earlier heartbeats
@@ -108,8 +109,12 @@ class Service(MessageLoop):
     def on_startup(self) -> None:
         """Prepare the main loop; called once, before the service registers."""
 
-    def on_tick(self, now_s: float) -> None:
-        """Do periodic work; called about every 10 ms."""
+    def on_tick(self, now_s: float) -> float:
+        """Do the work that is due; return when more is due, unless a message arrives before.
+
+        This is called after messages and other events, but at most every ``TICK_S``.
+        """
+        return math.inf
 
     def on_drain(self) -> bool:
         """Finish the work in progress; called until it returns True or the time is up."""
@@ -193,7 +198,7 @@ class Service(MessageLoop):
         if self.config.metrics_port:
             from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
 
-            self._tick_due_s = time.monotonic()
+            self._heartbeat_due_s = time.monotonic()
             self._metrics_server = MetricsServer(
                 self.config.metrics_host,
                 self.config.metrics_port,
@@ -211,7 +216,7 @@ class Service(MessageLoop):
     def main_loop(self) -> None:
         """Handle messages until the service should exit."""
         while not self.should_exit:
-            self.step(TICK_S)
+            self.step(HEARTBEAT_S)
 
     def shutdown(self) -> None:
         """Finish the work in progress within the deadline, and close all sockets."""
@@ -237,6 +242,8 @@ class Service(MessageLoop):
     def step(self, timeout_s: float) -> None:
         """Wait up to the timeout for messages, handle them, then tick."""
         start_s = time.monotonic()
+        due_s = min(self._tick_due_s, self._heartbeat_due_s)
+        timeout_s = max(0.0, min(timeout_s, due_s - start_s))
         self._busy.start_waiting(start_s)
         self.stall.restart(start_s)
         sockets = self.wait(timeout_s)
@@ -248,11 +255,12 @@ class Service(MessageLoop):
             self.handle_messages(socket)
         self.resync_with_control()
         now_s = time.monotonic()
+        if sockets or self.waker.clear():
+            self._tick_due_s = min(self._tick_due_s, self._ticked_s + TICK_S)
         if now_s >= self._tick_due_s:
-            self._tick_due_s = now_s + TICK_S
-            for callback in tuple(self.tick_callbacks):
-                callback()
-            self.on_tick(now_s)
+            self._ticked_s = now_s
+            due_s = min((callback() for callback in tuple(self.tick_callbacks)), default=math.inf)
+            self._tick_due_s = max(now_s + TICK_S, min(due_s, self.on_tick(now_s)))
         self.send_heartbeat_if_due()
 
     def check_health(self) -> bool:
@@ -260,17 +268,18 @@ class Service(MessageLoop):
 
         The program that checks the health may not be able to restart this process.
         """
-        gap_s = time.monotonic() - self._tick_due_s
-        if gap_s > EXIT_AFTER_S:
+        late_s = time.monotonic() - self._heartbeat_due_s
+        if late_s > EXIT_AFTER_S:
             LOG.critical("the loop hangs")
             os._exit(1)
-        return gap_s < MAX_TICK_GAP_S
+        return late_s < MAX_LATE_S
 
     def _install_signal_handlers(self) -> None:
         def on_signal(number: int, _frame: object) -> None:
             if self._exit_requested:
                 os._exit(128 + number)
             self._exit_requested = True
+            self.waker.wake()
 
         signal.signal(signal.SIGTERM, on_signal)
         signal.signal(signal.SIGINT, on_signal)

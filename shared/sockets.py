@@ -5,6 +5,7 @@ Undecodable messages are returned as ``BadMessage``.
 
 from __future__ import annotations
 
+import math
 import re
 import secrets
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -18,6 +19,7 @@ from kouxing.shared.connections import KIB, LONG_PENALTY_S, PENALTY_S, Connectio
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Grant, Peer, may_follow
+from kouxing.shared.waker import Waker
 from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, Joined
@@ -273,6 +275,8 @@ class Poller:
     def __init__(self) -> None:
         self._poller = zmq.Poller()
         self._sockets: dict[zmq.Socket[bytes], Socket] = {}
+        self.waker = Waker()  # ends each `wait` until it is cleared
+        self._poller.register(self.waker.descriptor, zmq.POLLIN)
 
     def add(self, socket: Socket) -> None:
         """Watch a socket."""
@@ -286,7 +290,7 @@ class Poller:
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Return the readable sockets in the order in which they were added."""
-        ready = dict(self._poller.poll(max(0, int(timeout_s * 1000))))
+        ready = dict(self._poller.poll(max(0, math.ceil(timeout_s * 1000))))
         for raw, socket in self._sockets.items():
             if raw not in ready:
                 socket.note_empty()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterator
 
 from kouxing.shared.wire.session import SessionMoved
@@ -20,6 +21,11 @@ class MoveRepeats:
         """Repeat a message several times from now on."""
         for delay_s in REPEAT_AFTER_S:
             heapq.heappush(self._heap, (now_s + delay_s, moved.session, moved))
+
+    @property
+    def due_s(self) -> float:
+        """When the next message must be repeated."""
+        return self._heap[0][0] if self._heap else math.inf
 
     def due(self, now_s: float) -> Iterator[SessionMoved]:
         """Remove and yield the messages to repeat now."""

@@ -259,6 +259,11 @@ class Registry:
         """Return the age of a service's newest heartbeat, without control's own pauses."""
         return now_s - self._paused_s - self._services[instance].heartbeat_s
 
+    def overdue_s(self) -> float:
+        """Return when the oldest heartbeat will be too old."""
+        oldest = next(iter(self._services.values()), None)
+        return math.inf if oldest is None else oldest.heartbeat_s + self._paused_s + self._limit_s
+
     def overdue(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
         if now_s > self._late_at_s + TIMEOUT_RESET_S:

@@ -56,7 +56,8 @@ from kouxing.shared.wire.speech import Speech
 STOPPED = "stopped"  # reason for a service that shut down
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # after which a session without a worker is closed
-MAX_PAUSE_S = 0.1  # between ticks; anything longer is control's own delay
+CHECK_S = 0.25  # between looks at waiting sessions and the list of keys
+MAX_PAUSE_S = 0.1  # of a tick after it was due; anything longer is control's own delay
 SERVICE_EVENTS = (EventName.ERROR, EventName.RECORDED)  # events that a service may publish
 
 
@@ -78,6 +79,7 @@ class ControlService(Service):
         self._idle_limit_s = config.idle_limit_s
         self._num_events = 0
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
+        self._sleep_s = 0.0  # planned time until the next tick
         self._move_repeats = MoveRepeats()
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
@@ -113,9 +115,10 @@ class ControlService(Service):
         """Return the number of sessions and services."""
         return {"sessions": len(self._sessions), "services": len(self._registry)}
 
-    def on_tick(self, now_s: float) -> None:
+    def on_tick(self, now_s: float) -> float:
         """Find lost services, sessions that wait too long, and keys that changed."""
-        self._registry.exclude_pause(self._tick_stall.check(now_s) - MAX_PAUSE_S)
+        pause_s = self._tick_stall.check(now_s, expected_s=self._sleep_s)
+        self._registry.exclude_pause(pause_s - MAX_PAUSE_S)
         if self.bus.zap is not None:
             self.bus.zap.refresh()
             self._end_revoked_sessions()
@@ -136,6 +139,9 @@ class ControlService(Service):
                 self._commands.send(moved, to=record.client)
         for record in self._sessions.pending():
             self._check_timeout(record, now_s)
+        due_s = min(now_s + CHECK_S, self._registry.overdue_s(), self._move_repeats.due_s)
+        self._sleep_s = max(0.0, due_s - now_s)
+        return due_s
 
     def on_drain(self) -> bool:
         """Close all sessions."""

@@ -19,6 +19,7 @@ from kouxing.services.driver.video.writer import remove_unfinished
 MAX_KEY_SHARE = 0.75  # of the videos, for one key
 MAX_QUEUED = 100_000  # unread commands
 IDLE_S = 10.0  # without a video, after which the process ends and frees its memory
+REPORT_S = 0.02  # between two looks at the reports of the process
 HANG_S = 600.0  # without a report; completing a long video may take minutes
 MAX_TICK_S = 0.1  # anything longer is the driver's own delay
 CLOSE_LIMIT_S = 3.0
@@ -127,10 +128,13 @@ class Recordings:
         self._send(session, "end")
         self._open.pop(session, None)
 
-    def tick(self, now_s: float) -> None:
-        """Handle the reports of the process, and end it after ``IDLE_S`` without a video."""
+    def tick(self, now_s: float) -> float:
+        """Handle the reports of the process, and end it after ``IDLE_S`` without a video.
+
+        Return when to call this again.
+        """
         if self._recorder is None:
-            return
+            return math.inf
         self._silent_s += min(now_s - self._ticked_s, MAX_TICK_S)
         self._ticked_s = now_s
         self._receive(timeout_s=0.0)
@@ -138,8 +142,10 @@ class Recordings:
             self._fail_all(HANGS)
         elif self._unfinished:
             self._busy_s = now_s
-        elif now_s > self._busy_s + IDLE_S:
+        elif now_s >= self._busy_s + IDLE_S:
             self._kill()
+            return math.inf
+        return now_s + REPORT_S if self._unfinished else self._busy_s + IDLE_S
 
     def close(self) -> None:
         """Save the finished part of every video."""

@@ -115,15 +115,19 @@ class DriverService(Service):
         """Delete the unfinished videos of a killed driver."""
         remove_unfinished(Path(self._config.out))
 
-    def on_tick(self, now_s: float) -> None:
+    def on_tick(self, now_s: float) -> float:
         """Draw what is due."""
+        due_s = self.recordings.tick(now_s)
         for session in list(self._sessions.values()):
-            if session.leave_by_s is not None and now_s > session.leave_by_s:
+            if session.leave_by_s is not None and now_s >= session.leave_by_s:
                 self._leave(session)
+            elif session.leave_by_s is not None:
+                due_s = min(due_s, session.leave_by_s)
         if self.view.is_live:
             self._warn_if_stalled(now_s)
             self.view.show(self.poses.faps(now_s), self.poses.caption(now_s), now_s)
-        self.recordings.tick(now_s)
+            due_s = now_s
+        return due_s
 
     def on_drain(self) -> bool:
         """Finish the open videos."""

@@ -94,6 +94,7 @@ class GatewayService(Service):
             self._play_sample,
             self._choose_sample_lip_model,
             self._set_face,
+            self.waker.wake,
         )
         self._audio_sessions = AudioSessions(self.control_endpoint, self.key, self.warn)
         self._microphones = Microphones(self._web_sockets, share, self._audio_sessions)
@@ -139,11 +140,12 @@ class GatewayService(Service):
         """Start serving HTTP."""
         unlimited = {route.path for route in self._routes}
         self._loop.run_until_complete(self._server.start(self._application, unlimited))
+        self._loop.add_reader(self.waker.descriptor, self._on_input)
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Run HTTP until messages arrive or the time has passed."""
-        # The descriptors are edge-triggered: messages beyond a full batch wait for the next tick.
-        timer = self._loop.call_later(timeout_s, self._loop.stop)
+        # The descriptors are edge-triggered: they do not show messages beyond a full batch.
+        timer = self._loop.call_later(0.0 if super().wait(0) else timeout_s, self._loop.stop)
         self._is_waiting = True
         self._loop.run_forever()
         self._is_waiting = False
@@ -180,6 +182,11 @@ class GatewayService(Service):
         self._loop.run_until_complete(self._server.stop())
         self._loop.run_until_complete(self._audio_sessions.close())
         self._runner.close()
+
+    def send_to_control(self, message: Message) -> None:
+        """Send a message to control; this may hide that another one has arrived."""
+        super().send_to_control(message)
+        self._on_input()
 
     def _on_input(self) -> None:
         if self._is_waiting:
@@ -236,17 +243,19 @@ class GatewayService(Service):
         """Name the subscribed sessions, so that control can report which have ended."""
         return dict.fromkeys(self._sessions, SessionInput())
 
-    def on_tick(self, now_s: float) -> None:
+    def on_tick(self, now_s: float) -> float:
         """Move the face at rest, and request the status of the services."""
         if self._viewers.has_viewers and now_s >= self._rest_due_s:
             self._rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
             self._viewers.show_rest(self._resting_face.faps(now_s).astype("<f4").tobytes())
         is_answered = self._report_s >= self._request_s
-        if now_s - self._request_s > (STATUS_INTERVAL_S if is_answered else STATUS_TIMEOUT_S):
-            self._request_s = now_s
+        due_s = self._request_s + (STATUS_INTERVAL_S if is_answered else STATUS_TIMEOUT_S)
+        if now_s >= due_s:
+            self._request_s, due_s = now_s, now_s + STATUS_TIMEOUT_S
             self.send_to_control(StatusRequest(request=secrets.token_hex(8)))
         if now_s - self._report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
+        return min(due_s, self._rest_due_s) if self._viewers.has_viewers else due_s
 
     def _on_status(self, report: StatusReport, _sender: Peer) -> None:
         """Announce missing services to the viewers."""

@@ -46,7 +46,8 @@ class Viewers:
 
     ``play_sample`` starts the sample sentence with a lip model, unless it is playing, and returns
     its session. This session counts as the newest only if there is no other. ``set_face`` sends
-    control the settings of a session's face, or of the face at rest ("").
+    control the settings of a session's face, or of the face at rest (""). ``on_connected`` is
+    called for each new viewer.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Viewers:
         play_sample: Callable[[str], str],
         choose_sample_lips: Callable[[str], None],
         set_face: Callable[[str, FaceSettings], None],
+        on_connected: Callable[[], None],
     ) -> None:
         self._web_sockets = web_sockets
         self._quota = ConnectionQuota(MAX_VIEWERS, "viewers", address_share)
@@ -64,6 +66,7 @@ class Viewers:
         self._play_sample = play_sample
         self._choose_sample_lip_model = choose_sample_lips
         self._set_face = set_face
+        self._on_connected = on_connected
         self._viewers: set[Viewer] = set()
         self._sessions: dict[str, _ShownSession] = {}  # in the order in which they were opened
         self._sample = ""  # session of the sample sentence while it is playing
@@ -161,6 +164,7 @@ class Viewers:
         """Add a viewer while the context is open. The caller sends the messages of its queue."""
         viewer = Viewer(session, shape_encoder)
         self._viewers.add(viewer)
+        self._on_connected()
         try:
             self._put(viewer, MessageKind.TEXT, self._status())
             if shape_encoder is not None:

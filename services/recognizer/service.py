@@ -44,6 +44,7 @@ from kouxing.shared.wire.speech import Acknowledge
 MAX_BATCH_S = 0.3  # of audio that is decoded together
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
+SESSION_TICK_S = 0.02  # between ticks while a session is open
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
@@ -166,7 +167,7 @@ class RecognizerService(Service):
             flushed.stream.flush()
             self._send_results(flushed)
 
-    def on_tick(self, now_s: float) -> None:
+    def on_tick(self, now_s: float) -> float:
         """Acknowledge audio, report stalled clients, and resend to the synthesizers.
 
         Clients must wait while a synthesizer's acknowledgements are overdue.
@@ -190,6 +191,7 @@ class RecognizerService(Service):
         self._is_live_blocked, self._is_unpaced_blocked = True in blocked, False in blocked
         self.pause(self._audio, paused=self._is_live_blocked)
         self._limit_unpaced()
+        return now_s + SESSION_TICK_S if self._sessions else self._free_memory_at_s
 
     def _report_stalled(self, now_s: float) -> None:
         """Report live clients that send no audio to their synthesizers."""

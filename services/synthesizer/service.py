@@ -12,6 +12,7 @@ to rest.
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -59,6 +60,7 @@ from kouxing.shared.wire.speech import (
 RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
 MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
+DROP_INTERVAL_S = 1.0  # between removals of frames for stopped subscribers
 MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
 EXPRESSIONS = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
@@ -213,20 +215,26 @@ class SynthesizerService(Service):
             shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
         )
 
-    def on_tick(self, now_s: float) -> None:
+    def on_tick(self, now_s: float) -> float:
         """Acknowledge, lead faces of stalled live streams to rest, drop old frames."""
-        if now_s > self._dropped_s + 1.0:
+        if not self._sessions:
+            return math.inf
+        if now_s >= self._dropped_s + DROP_INTERVAL_S:
             self._dropped_s = now_s
             live = [name for name, session in self._sessions.items() if session.start.paced]
             self._faps.disconnect_stalled((FapFrame,), live)
+        due_s = self._dropped_s + DROP_INTERVAL_S
         for session in self._sessions.values():
             session.receiver.tick()
             if session.start.paced and not session.finished and not session.queue:
                 self._relax(session, now_s)
+                due_s = min(due_s, session.relax_at_s + 1.0 / self.frame_rate_hz)
         busy = [session for session in self._sessions.values() if session.queue]
         if busy:
             self._turn += 1
             self._make_frames(busy[self._turn % len(busy)])
+            due_s = now_s
+        return due_s
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return how far each session's phones are final, and how late its frames are."""

@@ -118,7 +118,8 @@ def test_stops_unknown_sessions_only_after_the_deadline(stage: Stage) -> None:
     (seen,) = answers(stage, recognizer)
     assert not isinstance(seen, CloseSession)
     stage.control._takeover.end_s = 0.0
-    stage.control.step(0.02)
+    while stage.control._takeover.is_active:
+        stage.control.step(0.02)
     recognizer.send(serving)
     assert CloseSession(session="mine") in answers(stage, recognizer, 2)
 

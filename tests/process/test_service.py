@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,13 @@ from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.keys import Peer, key_folder, revoke_key
-from kouxing.shared.service import RESYNC_AFTER_S, SESSIONS_PER_HEARTBEAT, Service
+from kouxing.shared.service import (
+    EXIT_AFTER_S,
+    MAX_LATE_S,
+    RESYNC_AFTER_S,
+    SESSIONS_PER_HEARTBEAT,
+    Service,
+)
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.session import SessionFacts
@@ -33,11 +40,13 @@ class Slow(Service):
     def __init__(self) -> None:
         super().__init__(ServiceConfig(insecure=True), has_control=False)
         self.num_ticks = self.num_beats = self.num_handled = 0
+        self.tick_due_s = math.inf
         self.input = self.bus.bind_router("tcp://127.0.0.1:*", "slow.input")
         self.register(self.input, {Progress: self._on_progress})
 
-    def on_tick(self, now_s: float) -> None:
+    def on_tick(self, now_s: float) -> float:
         self.num_ticks += 1
+        return self.tick_due_s
 
     def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:
         self.num_beats += 1
@@ -70,6 +79,23 @@ def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: Slow) -> N
         handle(slow, 300)
     assert slow.num_ticks > 10, "1.5 s of work"
     assert slow.num_beats >= 2
+
+
+def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: Slow) -> None:
+    waits: list[float] = []
+    slow.wait = lambda timeout_s: waits.append(timeout_s) or []  # type: ignore[method-assign]
+    slow.step(60.0)
+    assert waits == [0.0], "the first tick and heartbeat are due"
+    slow._heartbeat_due_s = time.monotonic() + 30.0
+    slow.step(60.0)
+    assert 20.0 < waits[-1] <= 30.0
+    assert slow.num_ticks == 1, "nothing is due"
+    slow._ticked_s, slow.tick_due_s = 0.0, time.monotonic() + 20.0
+    slow.waker.wake()
+    slow.step(60.0)
+    slow.step(60.0)
+    assert slow.num_ticks == 2
+    assert 10.0 < waits[-1] <= 20.0
 
 
 def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
@@ -168,7 +194,9 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
         worker.happened.append("input")
 
     worker._handlers[worker.input][Progress] = stall
-    monkeypatch.setattr(worker, "on_tick", lambda _now_s: worker.happened.append("tick"))
+    monkeypatch.setattr(
+        worker, "on_tick", lambda _now_s: worker.happened.append("tick") or math.inf
+    )
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
         run_until(worker, lambda: "input" in worker.happened)
@@ -269,10 +297,9 @@ def test_a_health_check_ends_a_process_whose_loop_hangs(
     monkeypatch.setattr("kouxing.shared.service.os._exit", ends.append)
     slow.step(0.0)
     assert slow.check_health()
-    monkeypatch.setattr("kouxing.shared.service.MAX_TICK_GAP_S", 0.0)
-    time.sleep(0.02)
+    slow._heartbeat_due_s -= MAX_LATE_S + 1.0
     assert not slow.check_health()
     assert ends == []
-    monkeypatch.setattr("kouxing.shared.service.EXIT_AFTER_S", 0.0)
+    slow._heartbeat_due_s -= EXIT_AFTER_S
     slow.check_health()
     assert ends == [1]

@@ -41,7 +41,8 @@ class Scene:
         patch.setattr(connections, "MAX_CONNECTIONS", 10)
         patch.setattr("threading.Thread.start", lambda _thread: None)
         self.limiter = ConnectionLimiter(is_service=lambda key: key == "service")
-        raw = SimpleNamespace(setsockopt=lambda *_: None, get_monitor_socket=lambda *_: None)
+        monitor = SimpleNamespace(getsockopt=lambda _option: 10**6)
+        raw = SimpleNamespace(setsockopt=lambda *_: None, get_monitor_socket=lambda *_: monitor)
         self.socket = self.limiter.limit(raw, AUDIO)  # type: ignore[arg-type]
         self.socket.port = 5560
         self.socket.accepted = lambda: iter(())  # type: ignore[method-assign]

@@ -146,14 +146,18 @@ class Follower:
         self.epoch = self.epoch or epoch
         self._subscribe()
 
-    def tick(self) -> None:
-        """Subscribe again, or close the old connection, if it is time; call this regularly."""
+    def tick(self) -> float:
+        """Subscribe again, or close the old connection, if it is time; return when to call again.
+
+        Call this also after every message.
+        """
         now_s = self._transport.now_s
         if now_s >= self._close_old_due_s:
             self._close_old_connection()
         if self._connection is not None and now_s >= self._retry_s:
             self._transport.close_connection(self._connection)
             self._subscribe()
+        return min(self._close_old_due_s, self._retry_s)
 
     def drain(self) -> None:
         """Pass on all messages that have arrived."""

@@ -1,0 +1,50 @@
+"""Waits until data arrives at connections that libzmq owns."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import sys
+
+from kouxing.shared.waker import Waker
+
+if sys.platform == "linux":
+
+    class Arrivals:
+        """Ends a wait when data arrives at one of the added descriptors.
+
+        Only new data counts, whether libzmq has read it or not. The kernel removes a descriptor
+        that is closed.
+        """
+
+        def __init__(self) -> None:
+            self._waker = Waker()
+            self._epoll = select.epoll()
+            self.add(self._waker.descriptor)
+
+        def add(self, descriptor: int) -> None:
+            """Wait also for this descriptor. Any thread may call this."""
+            with contextlib.suppress(OSError):  # closed, or added before
+                self._epoll.register(descriptor, select.EPOLLIN | select.EPOLLET)
+
+        def wait(self, timeout_s: float) -> None:
+            """Wait until data arrives, up to the timeout."""
+            self._epoll.poll(max(0.0, timeout_s))
+
+        def close(self) -> None:
+            """End the wait of another thread."""
+            self._waker.wake()
+
+else:
+
+    class Arrivals:
+        """Other systems do not report arrivals, so no wait takes any time."""
+
+        def add(self, descriptor: int) -> None:
+            """Do nothing."""
+
+        def wait(self, timeout_s: float) -> None:
+            """Do nothing."""
+
+        def close(self) -> None:
+            """Do nothing."""
