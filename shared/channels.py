@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
 
 _LOST_SHARE = 0.01  # of the loudest channel's energy; a mix with less has lost it
+_LOST_SHARE_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one voice
 _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 
 
 class CancellationGuard:
-    """Replaces the mix by the loudest channel while the channels cancel each other.
+    """Replaces the mix by the loudest channel while the mix has too little of it.
 
-    This happens if a microphone's cable inverts one channel of two, or if the mix of a film leaves
-    out a channel. The mix of other recordings is returned unchanged. ``name`` is the sound's, for
-    the remark that is added to ``remarks``.
+    This happens if a microphone's cable inverts one channel of two, if the mix of a film leaves out
+    a channel, or if one channel of nine has the only voice. The mix of other recordings is returned
+    unchanged. ``name`` is the sound's, for the remark that is added to ``remarks``.
     """
 
     def __init__(self, name: str, num_channels: int, remarks: list[str]) -> None:
@@ -29,7 +30,9 @@ class CancellationGuard:
 
     def mix(self, channels: Samples, mixed: Samples) -> Samples:
         """Return ``mixed`` or the loudest of ``channels``, with ``num_channels`` columns."""
-        if mixed.shape[1] != self._num_channels:  # the sound changed
+        lost_share = _LOST_SHARE
+        if mixed.shape[1] != self._num_channels:  # not mixed yet, or the sound changed
+            lost_share = _LOST_SHARE_OF_AVERAGE
             mixed = mixed.mean(axis=1, keepdims=True).repeat(self._num_channels, axis=1)
         if channels.shape[1] == 1 or len(channels) == 0:
             return mixed
@@ -42,15 +45,15 @@ class CancellationGuard:
         loudest = int(energy.argmax())
         is_lost = (
             energy[loudest] > _SILENT_POWER * len(channels)
-            and mixed_energy < _LOST_SHARE * energy[loudest]
-            and self._mixed_energy < _LOST_SHARE * self._energy.max()
+            and mixed_energy < lost_share * energy[loudest]
+            and self._mixed_energy < lost_share * self._energy.max()
         )
         if not is_lost:
             return mixed
         if not self._has_remarked:
             self._has_remarked = True
             self._remarks.append(
-                f"{self._name}: the channels cancel out when mixed;"
+                f"{self._name}: the mix of all channels loses the sound of one;"
                 f" only channel {loudest + 1} is used"
             )
         return channels[:, [loudest] * self._num_channels]

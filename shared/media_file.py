@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_formats import MIN_UNKNOWN_BYTES, is_sound, why_unreadable
+from kouxing.shared.sound_formats import (
+    MIN_UNKNOWN_BYTES,
+    is_sound,
+    unprobed_format,
+    why_unreadable,
+)
 
 _MAX_STREAMS = 64
 _MAX_RATE_HZ = 1_000_000
@@ -29,7 +34,8 @@ _MIN_MISSING_S = 0.1  # of a track that is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
 _TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
-_HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|avi|flv|caf|ape|tta|wv|au|w64")
+# Without avi: its duration includes gaps that its packets leave out.
+_HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|flv|caf|ape|tta|wv|au|w64")
 
 
 class RawFormat(NamedTuple):
@@ -73,6 +79,7 @@ class MediaSound:
             self._container: Any = av.open(
                 self._file,
                 mode="r",
+                format=unprobed_format(begin),
                 options=_PIPE_OPTIONS if is_pipe else OPTIONS,
                 buffer_size=4096 if is_pipe else 65536,
                 metadata_errors="replace",

@@ -14,7 +14,12 @@ _SOUND = (
     (0, b".snd"), (0, b"\x1a\x45\xdf\xa3"), (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"),
     (0, b"wvpk"), (0, b"TTA1"), (0, b"MAC "), (0, b"\0\0\1\xba"), (4, b"ftyp"), (4, b"moov"),
     (4, b"mdat"), (4, b"wide"), (0, b".RMF"), (0, b".ra\xfd"), (0, b"Creative Voi"),
-    (0, b"nut/multimed"),
+    (0, b"nut/multimed"), (0, b"\0\0\0\0\1\xbc"), (0, b"\6\x0e\x2b\x34"), (0, b"NIST_1A"),
+    (0, b"\xb7\xd8\0\x20\x37\x49\xda\x11"), (0, b".SoX"), (0, b"XoS."), (0, b"MMMD"),
+    (0, b"STRM\0"), (0, b"DSD "), (0, b"FRM8"), (0, b"tBaK"), (0, b"MPCK"), (0, b"#!iLBC"),
+    (0, b"\2dss"), (0, b"\3ds2"), (0, b"\x7f\xfe\x80\1"), (0, b"\x72\xf8\x1f\x4e"),
+    *((0, bytes([0x64, 0xA3, kind, 0])) for kind in (1, 2, 3, 4)),  # IRCAM
+    *((0, bytes([0, kind, 0xA3, 0x64])) for kind in (1, 2, 3, 4)),
 )  # fmt: skip
 # Codecs whose frames need no container, with the bits of a frame's first two bytes.
 _FRAMED = (
@@ -22,6 +27,8 @@ _FRAMED = (
     ("mp2", 0xFFE6, 0xFFE4),
     ("aac", 0xFFF6, 0xFFF0),
     ("ac3", 0xFFFF, 0x0B77),
+    ("aac_latm", 0xFFE0, 0x56E0),
+    ("sbc", 0xFF00, 0x9C00),
 )
 _TS_SYNC = 0x47
 _TS_PACKETS = ((0, 188), (4, 192))  # the place of the first byte, and the packet's size
@@ -56,11 +63,16 @@ def is_sound(begin: bytes) -> bool:
     )
 
 
+def unprobed_format(begin: bytes) -> str | None:
+    """Return FFmpeg's name of a format that FFmpeg recognizes only by the file's name."""
+    return "sbc" if begin.startswith(b"\x9c") and is_sound(begin) else None
+
+
 def needs_more(begin: bytes) -> bool:
     """Return whether more bytes are needed, up to ``NUM_BEGIN_BYTES``, to recognize a format."""
     if len(begin) < 12 or begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
         return True
-    may_be = begin[0] in (0xFF, 0x0B, _TS_SYNC) or begin[4] == _TS_SYNC
+    may_be = begin[0] in (0xFF, 0x0B, 0x56, 0x9C, _TS_SYNC) or begin[4] == _TS_SYNC
     return may_be and not is_sound(begin)
 
 
@@ -100,7 +112,7 @@ def stated_bytes(begin: bytes) -> int | None:
 
 def needs_whole_file(begin: bytes) -> bool:
     """Return whether a file can be decoded only once its end is there."""
-    if begin.startswith((b"caff", b"wvpk")):
+    if begin.startswith((b"caff", b"wvpk", b"\xb7\xd8\0\x20")):
         return True
     return begin[4:8] in (b"ftyp", b"mdat", b"wide") and not _has_index_first(begin)
 
@@ -132,8 +144,9 @@ def _consists_of_frames(begin: bytes, codec: str, mask: int, sync: int) -> bool:
     packets = [bytes(packet) for packet in av.CodecContext.create(codec, "r").parse(begin)]
     return (
         len(packets) >= 3
+        and len(set(begin)) > 2  # not constant samples
         and begin.startswith(b"".join(packets))
-        and all(packet[:2] == begin[:2] for packet in packets)
+        and all(int.from_bytes(packet[:2], "big") & mask == sync for packet in packets)
     )
 
 

@@ -44,7 +44,12 @@ def write_tracks(
             assert isinstance(video, av.VideoStream)
             video.width = video.height = 32
             video.pix_fmt = "yuv420p"
-        streams = [container.add_stream(codec, rate=rate_hz, layout="mono") for _ in tracks]
+        # FFmpeg's encoder of SBC has no default bit rate.
+        encoding = {"b": "128k"} if codec == "sbc" else {}
+        streams = [
+            container.add_stream(codec, rate=rate_hz, layout="mono", options=encoding)
+            for _ in tracks
+        ]
         for stream, title in zip(streams, titles, strict=False):
             stream.metadata["title"] = title
         if video_s:

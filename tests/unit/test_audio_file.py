@@ -93,7 +93,7 @@ def test_reads_a_wav_file_whose_header_states_no_length(
         ("WAV", 6, 3, 1.0),  # has no place in FFmpeg's mix, so it is used alone
         ("FLAC", 3, 2, 0.707),
         ("WAV", 16, 15, 1.0),
-        ("WAV", 9, 8, 1 / 9),  # FFmpeg has no mix for this number
+        ("WAV", 9, 8, 1.0),  # FFmpeg has no mix for this number
         ("WAV", 32, 31, 1.0),
     ],
 )

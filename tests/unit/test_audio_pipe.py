@@ -145,13 +145,22 @@ def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
         ("voc", "pcm_s16le"),
         ("nut", "mp2"),
         ("wv", "wavpack"),
+        ("latm", "aac"),
+        ("sbc", "sbc"),
+        ("sf", "pcm_s16le"),  # IRCAM
+        ("wtv", "mp2"),
+        ("sox", "pcm_s32le"),
+        ("mmf", "adpcm_yamaha"),
+        ("ast", "pcm_s16be_planar"),
+        ("amr", "libopencore_amrnb"),
     ],
 )
 def test_recognizes_rare_formats(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, suffix: str, codec: str
 ) -> None:
     path = tmp_path / f"a.{suffix}"
-    write_media(path, codec, SPEECH.repeat(3), 48_000)
+    rate_hz = {"amr": 8_000, "mmf": 8_000, "sbc": 16_000}.get(suffix, 48_000)
+    write_media(path, codec, SPEECH.repeat(3), rate_hz)
     source = _open(monkeypatch, path.read_bytes())
     expected, _ = read_audio(path)
     np.testing.assert_array_equal(np.concatenate([*source.blocks]), expected)
@@ -183,6 +192,7 @@ def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
     pieces = [rng.integers(-low, low + 1, 2048) for low in (1, 2, 9, 300, 3000) for _ in range(99)]
     assert not any(is_sound(b"\xff\xfb" + piece.astype("<i2").tobytes()) for piece in pieces)
     assert not any(is_sound(b"\xff\xff" + piece.astype("<i2").tobytes()) for piece in pieces)
+    assert not is_sound(b"\x9c\0" * 2048)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def _spans(samples: np.ndarray) -> list[tuple[float, float]]:
 @pytest.mark.parametrize(
     ("name", "codec"),
     [("a.webm", "libopus"), ("a.mkv", "pcm_s16le"), ("a.mkv", "aac"), ("a.mp4", "aac"),
-     ("a.ts", "aac"), ("a.ogg", "libopus"), ("a.mka", "libmp3lame")],
+     ("a.ts", "aac"), ("a.ogg", "libopus"), ("a.mka", "libmp3lame"), ("a.asf", "libmp3lame")],
 )  # fmt: skip
 def test_honors_gaps_in_timestamps(tmp_path: Path, name: str, codec: str) -> None:
     write_tracks(tmp_path / name, codec, [[(0.0, TONE), (5.0, TONE)]], RATE_HZ)
@@ -41,6 +41,13 @@ def test_honors_gaps_in_timestamps(tmp_path: Path, name: str, codec: str) -> Non
     (first, second) = _spans(samples[: len(samples) // 480 * 480])
     assert first == pytest.approx((0.0, 1.0), abs=0.06)
     assert second == pytest.approx((5.0, 6.0), abs=0.06)
+    assert source.remarks == []
+
+
+def test_an_avi_file_with_a_gap_is_not_cut_off(tmp_path: Path) -> None:
+    write_tracks(tmp_path / "a.avi", "libmp3lame", [[(0.0, TONE), (5.0, TONE)]], RATE_HZ)
+    source = open_audio(tmp_path / "a.avi")
+    assert len(_read(source)) == pytest.approx(2 * RATE_HZ, abs=3000)
     assert source.remarks == []
 
 
@@ -135,12 +142,12 @@ def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["a.wav", "a.rf64", "a.w64", "a.aiff", "a.flac", "a.mp3", "a.mkv", "a.mp4"]
+    "name", ["a.wav", "a.rf64", "a.w64", "a.aiff", "a.flac", "a.mp3", "a.mkv", "a.mp4", "a.avi"]
 )
 def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     path, samples = tmp_path / name, np.tile(TONE, 3)
-    if path.suffix in (".mkv", ".mp4"):
-        codec = {".mkv": "pcm_s16le", ".mp4": "aac"}[path.suffix]
+    codecs = {".mkv": "pcm_s16le", ".mp4": "aac", ".avi": "pcm_s16le"}
+    if codec := codecs.get(path.suffix):
         write_media(path, codec, samples, RATE_HZ, options={"movflags": "faststart"})
     else:
         soundfile.write(path, samples, RATE_HZ)
