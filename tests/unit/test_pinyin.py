@@ -96,6 +96,12 @@ def test_pronounces_text() -> None:
         ("3 2 1\n10", "三二一十"),
         ("138 1234 5678", "幺三八幺二三四五六七八"),
         ("COVID-19病毒", "十九病毒"),
+        ("12-25岁，第3-5章，共12-25", "十二到二十五岁第三到五章共十二到二十五"),
+        ("比分12-25，21-15，1-1", "比分十二比二十五二十一比十五一比一"),
+        ("以1-2落后，5 - 3", "以一比二落后五减三"),
+        ("增长12.25，3.14", "增长十二点二五三点一四"),
+        ("2024-12-25，02-05，12月25日", "二零二四年十二月二十五日二月五日十二月二十五日"),
+        ("0571-1234567，10-3=7", "零五七一一二三四五六七十减三等于七"),
     ],
 )
 def test_reads_numbers(text: str, read: str) -> None:
@@ -113,6 +119,11 @@ def test_reads_numbers(text: str, read: str) -> None:
         ("ni3hao3 hua1r5 hui4 r5", "ni3 hao3 hua1 r5 hui4 r5"),
         ("nĭ hɑ̌o ɡuó", "ni3 hao3 guo2"),
         ("pāris café résumé banana mp3", ""),
+        ("nihao, hello", ""),
+        ("Nihao Zhongguo! Tom", "ni hao zhong guo"),
+        ("tiananmen fangan yidianr lüxing", "tian an men fan gan yi dian r lv xing"),
+        ("ㄋㄧˇㄏㄠˇ ㄓㄨㄥㄍㄨㄛˊ˙ㄇㄚ ㄇㄚ˙", "ni3 hao3 zhong1 guo2 ma5 ma5"),
+        ("ㄕˋ ㄗˋ ㄩㄢˊ ㄌㄩˋ ㄨㄥ ㄑㄩㄥˊ ㄦˊ ㄇ", "shi4 zi4 yuan2 lü4 weng1 qiong2 er2"),
     ],
 )
 def test_reads_traditional_characters_and_pinyin_words(text: str, spellings: str) -> None:

@@ -23,6 +23,8 @@ import unicodedata
 from functools import lru_cache
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.mandarin.bopomofo import read_bopomofo
+from kouxing.shared.phones.mandarin.numbers import numbers_as_words, unambiguous_numbers
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
 # Longest first, so that zh is not read as z + h.
@@ -68,31 +70,6 @@ _MAX_WORD_LETTERS = 500
 _MAX_LETTERS = 10  # of a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
 _SPACE_BESIDE_CHARACTER = re.compile(f"(?<![{_LATIN}]) | (?![{_LATIN}])")
-# Numbers are read sentence by sentence: time and memory grow with the square of the length.
-_SENTENCE = re.compile(
-    r"[^。！？]{1,500}(?![^。！？])[。！？]*|.{1,500}(?<!\d)|.{1,500}", re.DOTALL
-)
-_HALF_WIDTH = str.maketrans("０１２３４５６７８９．％￥", "0123456789.%¥")
-_PHONE_NUMBER = re.compile(r"(?<!\d)(1\d\d) (\d{4}) (\d{4})(?!\d)")
-# Rewritten before wetext 0.1 reads numbers, because it reads these wrongly.
-_NUMBER_SPELLINGS = tuple(
-    (re.compile(pattern), replacement)
-    for pattern, replacement in (
-        (r"(?<=\d)：(?=\d)", ":"),
-        (r"(?<![\d.,])(\d{1,3}(?:,\d{3})+)(?![\d,])", lambda match: match[1].replace(",", "")),
-        (r"(?<=[%℃度])[-−–—－~～](?=\d)", "到"),
-        (r"(?<=\d)[–—－～](?=\d)", "~"),
-        (r"(\.\d+)-(?=\d)|(?<![\d-])(\d+)-(?=\d+(?:\.\d+)?%)", r"\1\2~"),
-        (r"(?<!\d)[−－](?=\d)", "-"),
-        (r"(?<=[A-Za-z])-(?=\d)", " "),
-        (r"(\d[\d.]*)‰", r"千分之\1"),
-        (r"[¥$€£](?=[\d.]+[万亿萬億]?[元块塊])", ""),
-        (r"¥([\d.]+[万亿萬億])", r"\1元"),
-        (r"(?<!\d)0(?=[1-9][月日号號])", ""),
-        (r"(?<![\d.])2(?=[月日号號楼樓])", "二"),
-        (r"(?<![\d.第])2(?=[個張隻條種歲塊點雙間顆輛])", "兩"),
-    )
-)
 # Traditional characters with two simplified ones, where the reading differs from the usual one.
 _READ_AS = (
     (re.compile("(?<![名顯显原編编論论卓土昭])著(?![名作者稱称書书述])"), "着"),
@@ -190,10 +167,12 @@ def write(spelling: str) -> str:
 
 
 def transcribe(text: str) -> Transcript:
-    """Convert a text to syllables: characters with numbers and dates, or else pinyin.
+    """Convert a text to syllables: characters with numbers and dates, or else pinyin or bopomofo.
 
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
-    dropped: letters among characters, and unknown syllables of pinyin.
+    dropped: letters among characters, and unknown syllables of pinyin. Joined syllables without
+    tones (``nihao``) are split only if most letters are pinyin, because words of other languages
+    may look the same.
 
     Examples
     --------
@@ -205,15 +184,22 @@ def transcribe(text: str) -> Transcript:
     text = _KEYCAP.sub(" ", text)
     if _CHINESE.search(text) or not any(letter.isalpha() for letter in text):
         return _read_characters(text)
-    syllables, dropped = [], []
-    for word in _PINYIN_WORD.findall(unicodedata.normalize("NFKC", text)):
-        spellings = _split_word(word)
-        if not spellings:
-            dropped.append(word)
-        for spelling in spellings:
-            phones = phones_of_syllable(spelling)
-            syllables.append(SpokenSyllable(spelling, _with_tone_digit(spelling), phones))
-    return Transcript(tuple(syllables), tuple(dropped))
+    text = read_bopomofo(text, spell)
+    words = _PINYIN_WORD.findall(unicodedata.normalize("NFKC", text))
+    spellings = [_split_word(word) for word in words]
+    without_tones = [
+        split or _split_toneless(word) for split, word in zip(spellings, words, strict=True)
+    ]
+    num_readable = sum(len(word) for word, split in zip(words, without_tones, strict=True) if split)
+    if num_readable > sum(map(len, words)) / 2:
+        spellings = without_tones
+    syllables = tuple(
+        SpokenSyllable(spelling, _with_tone_digit(spelling), phones_of_syllable(spelling))
+        for split in spellings
+        for spelling in split
+    )
+    dropped = tuple(word for word, split in zip(words, spellings, strict=True) if not split)
+    return Transcript(syllables, dropped)
 
 
 def _split_word(word: str) -> list[str]:
@@ -226,13 +212,45 @@ def _split_word(word: str) -> list[str]:
     if _is_syllable(word):
         return [word]
     for end in range(min(len(word) - 1, _MAX_LETTERS), 0, -1):
-        # Without a tone, words of other languages may look like syllables.
         has_tone = re.search(r"\d$", _with_tone_digit(word[:end]))
         if has_tone and _plain(word[end:])[:1] not in "aoeê" and _is_syllable(word[:end]):
             rest = _split_word(word[end:])
             if rest:
                 return [word[:end], *rest]
     return []
+
+
+def _split_toneless(word: str) -> list[str]:
+    """Split a pinyin word without tones (``nihao``, ``tiananmen``); empty: impossible.
+
+    A split in which no later syllable starts with a, o or e is better.
+    """
+    word = _plain(word)
+    for later_starts in ("", "aoeê"):
+        splits: dict[int, list[str]] = {len(word): []}  # of the rest from a place
+        for place in range(min(len(word), _MAX_WORD_LETTERS) - 1, -1, -1):
+            if place and word[place] in "aoeê" and not later_starts:
+                continue
+            for end in range(min(place + _MAX_LETTERS, len(word)), place, -1):
+                syllable = word[place:end]
+                is_known = syllable in _syllables_of_characters() or (
+                    syllable == "r" and 0 < place == len(word) - 1
+                )
+                if is_known and end in splits:
+                    splits[place] = [syllable, *splits[end]]
+                    break
+        if 0 in splits:
+            return splits[0]
+    return []
+
+
+@lru_cache(maxsize=1)
+def _syllables_of_characters() -> frozenset[str]:
+    """Return the syllables of all characters, without tones."""
+    from pypinyin.constants import PINYIN_DICT  # noqa: PLC0415 (few callers need it)
+
+    readings = {reading for line in PINYIN_DICT.values() for reading in line.split(",")}
+    return frozenset(plain for plain in map(_plain, readings) if re.search("[aeêiouv]", plain))
 
 
 def _is_syllable(word: str) -> bool:
@@ -244,12 +262,9 @@ def _is_syllable(word: str) -> bool:
 
 
 def _read_characters(text: str) -> Transcript:
-    text = _PHONE_NUMBER.sub(r"\1\2\3", text.translate(_HALF_WIDTH))
-    text = re.sub(r"(?<=\d)\s+(?=\d)", "、", text)  # different numbers
-    for pattern, replacement in _NUMBER_SPELLINGS:
-        text = pattern.sub(replacement, text)
+    text = unambiguous_numbers(text)
     without_spaces = _SPACE_BESIDE_CHARACTER.sub("", " ".join(text.split()))
-    characters = "".join(map(_read_numbers, _SENTENCE.findall(without_spaces)))
+    characters = numbers_as_words(without_spaces)
     syllables = tuple(
         SpokenSyllable(character, spelling.replace("v", "ü"), phones_of_syllable(spelling))
         for character, spelling in zip(characters, _pinyin_of(characters), strict=True)
@@ -294,16 +309,6 @@ def _simplified(character: str) -> str:
         character
     )
     return simplified if len(simplified) == 1 else character
-
-
-def _read_numbers(text: str) -> str:
-    """Replace numbers, dates, times and units by their reading: 3.5% -> 百分之三点五."""
-    if not re.search(r"\d", text):
-        return text
-    from wetext import Normalizer  # noqa: PLC0415 (takes 0.3 s)
-
-    read: str = Normalizer(lang="zh", operator="tn").normalize(text)
-    return read.replace("第两", "第二")  # ordinals: wetext 0.1 reads every 2 before a measure as 两
 
 
 def _is_spoken(letter: str) -> bool:
