@@ -15,7 +15,7 @@ from rich.progress import Progress
 from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.inputs import read_mono_16k
-from kouxing.services.cli.spoken_text import mismatch_message, read_text
+from kouxing.services.cli.spoken_text import read_text, report_mismatch
 from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch
 from kouxing.services.live_chain import LiveChain
@@ -32,7 +32,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.phones.transcript import TimedSyllable
-from kouxing.shared.terminal import print_message
 
 T = TypeVar("T", Phone, TimedSyllable)
 _IMAGE_RATE_HZ = 25.0  # of a video, if the source is sound
@@ -127,8 +126,7 @@ def animate(
             alignment = align_syllables(
                 model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress
             )
-            if not alignment.fits:
-                print_message(mismatch_message(source, alignment))
+            report_mismatch(source, alignment)
             phones = alignment.phones
         with_progress = partial(progress.track, description="recognizing")
         recording = analyze_recording(model, samples, predictor, phones, with_progress)

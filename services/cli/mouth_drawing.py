@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import DrawnLips, Timing
-from kouxing.services.cli.spoken_text import mismatch_message, read_text
+from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
@@ -42,7 +42,13 @@ from kouxing.services.synthesizer.lips.ferguson.key_frames import (
     key_frames_of,
 )
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
-from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
+from kouxing.services.synthesizer.lips.ferguson.timing import (
+    MAX_SPEECH_RATIO,
+    MAX_SYLLABLES,
+    MIN_SPEECH_RATIO,
+    speech_ratio,
+    time_text,
+)
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
@@ -169,13 +175,17 @@ def _time_phones(
         is_long = len(transcript.syllables) > MAX_SYLLABLES
         timing = Timing.ALIGN if is_long else Timing.ENDPOINTS
     if transcript is not None and timing is Timing.ENDPOINTS:
-        return time_text(progress_of(samples), transcript.phones, load_table(load_inventory()))
+        recording = progress_of(samples), transcript.phones, load_table(load_inventory())
+        phones = time_text(*recording)
+        ratio = speech_ratio(*recording)
+        if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
+            print_mismatch(source, f"the speech has {ratio:.1f} times the text's usual duration")
+        return phones
     model = load_live_model()
     if transcript is None:
         return recognize_recording(model, samples, with_progress)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
-    if not alignment.fits:
-        print_message(mismatch_message(source, alignment))
+    report_mismatch(source, alignment)
     return alignment.phones
 
 

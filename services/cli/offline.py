@@ -255,7 +255,7 @@ def align(
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import read_mono_16k
-    from kouxing.services.cli.spoken_text import mismatch_message, read_text
+    from kouxing.services.cli.spoken_text import read_text, report_mismatch
     from kouxing.services.recognizer.acoustic.load import load_model, model_path
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -272,8 +272,8 @@ def align(
     duration_s = len(samples) / MEDIA_RATE_HZ
     syllables = timed_syllables(alignment.phones, transcript, model.inventory)
     write_output(format_phones(alignment.phones, style, duration_s, syllables), output)
+    report_mismatch(audio, alignment)
     if not alignment.fits:
-        print_message(mismatch_message(audio, alignment))
         raise typer.Exit(1)
 
 

@@ -55,11 +55,17 @@ def read_text(text: str, inventory: PhoneInventory) -> Transcript:
     return transcript
 
 
-def mismatch_message(audio: Path, alignment: Alignment) -> str:
-    """Return the message that a text does not fit a recording."""
-    return (
-        f"{audio}: the text does not fit the sound (fit {alignment.fit:.2f}, normally at least"
-        f" {MIN_FIT}); check that the text is complete and is what was said"
+def report_mismatch(audio: Path, alignment: Alignment) -> None:
+    """Print a message if a text does not fit a recording."""
+    if not alignment.fits:
+        print_mismatch(audio, f"fit {alignment.fit:.2f}, normally at least {MIN_FIT}")
+
+
+def print_mismatch(audio: Path, reason: str) -> None:
+    """Print the message that a text does not fit a recording."""
+    print_message(
+        f"{audio}: the text does not fit the sound ({reason}); check that the text is complete and"
+        " is what was said"
     )
 
 

@@ -82,6 +82,14 @@ def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
     assert max(gap) > 20
 
 
+@pytest.mark.parametrize(("text", "fits"), [(TEXT, True), ("四是四", False), (5 * TEXT, False)])
+def test_reports_a_text_that_does_not_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, fits: bool
+) -> None:
+    draw_mouth(SOUND, text, tmp_path / "mouth.csv", num_points=2, lips=DrawnLips.FERGUSON)
+    assert ("the text does not fit the sound" not in capsys.readouterr().err) == fits
+
+
 @pytest.mark.parametrize(
     ("text", "output", "timing", "message"),
     [

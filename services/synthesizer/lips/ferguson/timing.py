@@ -40,6 +40,9 @@ _NOISE_COST_S = 0.1  # noise duration that costs 1 more
 _MAX_MERGED = 4
 _ONSET_SLICES = 7  # duration of a hissing consonant
 MAX_SYLLABLES = 5000
+# Of read and synthesized speech, 0.5 to 1.25. Outside these limits, the text is not what was said.
+MIN_SPEECH_RATIO = 0.4
+MAX_SPEECH_RATIO = 2.0
 
 
 def time_text(
@@ -77,6 +80,13 @@ def time_text(
     return phones
 
 
+def speech_ratio(
+    slices: Sequence[Progress], syllables: Sequence[Syllable], table: PhoneTable
+) -> float:
+    """Return the duration of the speech in a recording, relative to that of its text."""
+    return _speech_ratio(segment_speech(slices), _typical_durations(syllables, table).sum())
+
+
 def phone_onsets(
     syllable: Syllable, start_s: float, end_s: float, table: PhoneTable
 ) -> list[float]:
@@ -107,9 +117,7 @@ def syllable_times(
     if not segments:
         raise UserError("no speech was found; check that the text matches the recording")
     text = _Text(
-        duration_s=np.array(
-            [sum(table.duration_s[phone] for phone in phones) for phones in syllables]
-        ),
+        duration_s=_typical_durations(syllables, table),
         crossings=np.array([table.crossings[phones[0]] for phones in syllables]),
     )
     times_s = np.zeros((len(syllables), 2))
@@ -160,7 +168,7 @@ def _cheapest_assignment(segments: Sequence[Segment], text: _Text, hiss: Hiss) -
     """Assign every syllable; total_cost[n, s] is for the first n segments and s syllables."""
     num_segments, num_syllables = len(segments), len(text.duration_s)
     until_s = np.concatenate([[0.0], np.cumsum(text.duration_s)])
-    rate = sum(segment.end_s - segment.start_s for segment in segments) / until_s[-1]
+    rate = _speech_ratio(segments, until_s[-1])
     max_split = min(num_syllables, 4 + 2 * -(-num_syllables // num_segments))
     total_cost = np.full((num_segments + 1, num_syllables + 1), np.inf)
     total_cost[0, 0] = 0.0
@@ -198,6 +206,14 @@ def _cheapest_assignment(segments: Sequence[Segment], text: _Text, hiss: Hiss) -
             cost += hiss_cost(np.full(num_syllables, group[0].start_s), 0, 1)
             consider(row, merged, 1, cost + pause_s / _PAUSE_COST_S)
     return _trace_back(best)
+
+
+def _speech_ratio(segments: Sequence[Segment], typical_s: float) -> float:
+    return sum(segment.end_s - segment.start_s for segment in segments) / typical_s
+
+
+def _typical_durations(syllables: Sequence[Syllable], table: PhoneTable) -> Array:
+    return np.array([sum(table.duration_s[phone] for phone in phones) for phones in syllables])
 
 
 def _misfit(ratio: Array) -> Array:
