@@ -171,6 +171,12 @@ class Service(MessageLoop):
         """Let control publish an event about a session."""
         self.send_to_control(Event(session=session, name=name, detail=detail[:2000]))
 
+    def report_skipped(self, session: str, skipped_s: float) -> None:
+        """Count and report audio that a live session skipped; do nothing if there is none."""
+        if skipped_s > 0.0:
+            self.metrics.count("skipped_audio_ms", round(1e3 * skipped_s))
+            self.publish_event(EventName.AUDIO_SKIPPED, session, f"{skipped_s:.2f} s")
+
     def send_to_control(self, message: Message) -> None:
         """Send a message to control; do nothing in control itself."""
         if self.control is not None:

@@ -29,6 +29,10 @@ VOWELS_FILE = ROOT / "tests" / "sounds" / "vowels-male.wav"  # a o e i u ü, wit
 CHAIN = ("control", "recognizer", "synthesizer")
 NODE = Path(sys.executable).with_name("node")
 LIMIT_S = 60.0  # for anything that takes no time on an idle machine
+NOTHING_SKIPPED = {  # on a busy machine
+    "KOUXING_RECOGNIZER_MAX_BEHIND_S": "3600",
+    "KOUXING_SYNTHESIZER_MAX_BEHIND_S": "3600",
+}
 PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
 CHEAP = {"KOUXING_RECOGNIZER_ACOUSTIC": "neural"}  # half the work of the default
@@ -68,7 +72,7 @@ def _keep(host: str, port: int) -> int:
 
 def own_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which ``kouxing run`` uses free ports and has no window."""
-    own = {"XDG_RUNTIME_DIR": str(folder)}  # commands find the running system there
+    own = {"XDG_RUNTIME_DIR": str(folder), **NOTHING_SKIPPED}  # commands find the system there
     return {**os.environ, **ONE_THREAD, **headless(folder), **ANY_LOAD, **own_addresses(), **own}
 
 
@@ -163,6 +167,7 @@ class System(LocalSystem):
             settings={
                 **headless(folder),
                 **PATIENT,
+                **NOTHING_SKIPPED,
                 **ANY_LOAD,
                 **addresses,
                 **{variable(name, "instance"): name for name in named},

@@ -46,6 +46,7 @@ class SessionRecord:
     resume_sequence: int | None = None  # first one to resend; None: the recognizer stays
     media_time: int = 0  # its phones are final up to here
     lateness: Lateness | None = None  # of its frames in the last 10 s
+    skipped_s: dict[str, float] = field(default_factory=dict)  # by instance
 
     @property
     def start_request(self) -> str:
@@ -127,4 +128,5 @@ class SessionRecord:
             workers=self.workers,
             facts=self.facts,
             lateness=self.lateness,
+            skipped_s=sum(self.skipped_s.values()),
         )

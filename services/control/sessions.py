@@ -196,6 +196,8 @@ class Sessions:
         """Record how far a service has processed a session's input; return its idle time."""
         state = heartbeat.sessions[record.name]
         record.media_time = max(record.media_time, state.media_time)
+        if state.skipped_s:
+            record.skipped_s[heartbeat.instance] = state.skipped_s
         if heartbeat.instance == record.workers["faps"]:
             record.lateness = state.lateness
         if heartbeat.instance != record.workers["audio"]:

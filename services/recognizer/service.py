@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -22,10 +22,9 @@ from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
-from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
+from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
@@ -41,7 +40,10 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge
 
-MAX_BATCH_S = 0.3  # of audio that is decoded together
+MAX_BATCH_S = 0.3  # of unpaced audio that is decoded together
+MAX_PART_S = 0.1  # of live audio of each session that is decoded together
+MAX_QUEUED_S = 60.0  # of live audio, above which it waits at the clients
+READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # for further audio of a session that is late, in total
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.02  # between ticks while a session is open
@@ -58,10 +60,9 @@ class RecognizerService(Service):
     ) -> None:
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
-        self._batch: dict[str, RecognizerSession] = {}  # with audio that is not decoded yet
-        self._batch_s = 0.0  # duration of that audio
         self._unpaced = UnpacedAudio()
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
+        self._max_behind_s = config.max_behind_s
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
         self._ticked_s = time.monotonic()
@@ -96,15 +97,18 @@ class RecognizerService(Service):
         self.register(self._phones, {})
 
     def step(self, timeout_s: float) -> None:
-        """Read what has arrived, then decode the audio of all live sessions together.
+        """Read what has arrived, then decode a part of the audio of all live sessions together.
 
         If no live audio is left, decode some unpaced audio. More unpaced audio waits in its socket,
         and then at the sender.
         """
         has_unpaced = bool(self._unpaced) and not self._is_unpaced_blocked
-        super().step(0.0 if has_unpaced else timeout_s)
-        self._decode_batch()
-        is_live_waiting = not self._is_live_blocked and self._audio.wait(0.0)
+        super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
+        self._read_late_audio()
+        self._decode_live()
+        is_live_waiting = self._has_live_audio or (
+            not self._is_live_blocked and self._audio.wait(0.0)
+        )
         if not self._is_unpaced_blocked and not is_live_waiting:
             self._decode_unpaced()
 
@@ -127,7 +131,7 @@ class RecognizerService(Service):
 
     def start_session(self, start: StartSession) -> bool:
         """Create a session, or connect an existing one to another synthesizer."""
-        self._decode_batch()
+        self._decode_all_live()
         session = self._sessions.get(start.session)
         is_new = session is None or session.start.token != start.token
         if session is None or is_new:
@@ -135,7 +139,13 @@ class RecognizerService(Service):
                 self._unpaced.drop(session, keep_end=False)
             socket = self._audio if start.paced else self._unpaced_audio
             session = RecognizerSession(
-                start, self._recognizer, self._lip_predictor, socket, self._phones, time.monotonic()
+                start,
+                self._recognizer,
+                self._lip_predictor,
+                socket,
+                self._phones,
+                time.monotonic(),
+                self._max_behind_s,
             )
             self._sessions[start.session] = session
         if is_new or session.start.epoch != start.epoch:
@@ -149,7 +159,7 @@ class RecognizerService(Service):
 
     def stop_session(self, session: str) -> None:
         """Forget a session."""
-        self._decode_batch()
+        self._decode_all_live()
         stopped = self._sessions.pop(session, None)
         if stopped is not None:
             self._unpaced.drop(stopped, keep_end=False)
@@ -158,7 +168,7 @@ class RecognizerService(Service):
 
     def flush_session(self, session: str) -> None:
         """Drop the current speech; the next audio starts again."""
-        self._decode_batch()
+        self._decode_all_live()
         flushed = self._sessions.get(session)
         if flushed is not None:
             self._unpaced.drop(flushed, keep_end=True)
@@ -186,9 +196,11 @@ class RecognizerService(Service):
                 text = "the synthesizer is too slow, so the face misses part of the speech"
                 self.warn(ErrorCode.NO_LINK, text, session.name)
                 self.publish_event(EventName.ERROR, session.name, f"{ErrorCode.NO_LINK}: {text}")
+            self.report_skipped(session.name, session.audio.overload.take_report_s(now_s))
             if session.link.is_full:
                 blocked.add(session.start.paced)
-        self._is_live_blocked, self._is_unpaced_blocked = True in blocked, False in blocked
+        self._is_live_blocked = True in blocked or self._live_audio_s > MAX_QUEUED_S
+        self._is_unpaced_blocked = False in blocked
         self.pause(self._audio, paused=self._is_live_blocked)
         self._limit_unpaced()
         return now_s + SESSION_TICK_S if self._sessions else self._free_memory_at_s
@@ -196,14 +208,14 @@ class RecognizerService(Service):
     def _report_stalled(self, now_s: float) -> None:
         """Report live clients that send no audio to their synthesizers."""
         tick_s, self._ticked_s = min(now_s - self._ticked_s, MAX_TICK_S), now_s
-        if self._batch or self._audio.wait(0.0):
+        if self._has_live_audio or self._audio.wait(0.0):
             return
         for session in self._sessions.values():
             session.check_stalled(tick_s, now_s)
 
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
-        self._decode_batch()
+        self._decode_all_live()
         sessions = self._sessions.values()
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
@@ -221,6 +233,7 @@ class RecognizerService(Service):
                 idle_s=max(0.0, read_s[session.start.paced] - session.last_audio_s),
                 sequence=session.replay_window.last_droppable_sequence,
                 media_time=to_samples(session.replay_window.final_time_s),
+                skipped_s=session.audio.overload.skipped_s,
             )
             for name, session in self._sessions.items()
         }
@@ -229,7 +242,7 @@ class RecognizerService(Service):
         """Return the duration of queued audio and the number of unacknowledged messages."""
         backlogs = [session.link.backlog for session in self._sessions.values()]
         return {
-            "queued_audio_seconds": self._batch_s + self._unpaced.duration_s,
+            "queued_audio_seconds": self._live_audio_s + self._unpaced.duration_s,
             "unacknowledged_messages": max(backlogs, default=0),
         }
 
@@ -276,7 +289,7 @@ class RecognizerService(Service):
             if message.last:
                 session.end = message
                 if session.start.paced:
-                    self._decode_batch()
+                    self._decode_all_live()
                     self._finish(session)
                 else:
                     self._unpaced.append(session, None)
@@ -297,29 +310,48 @@ class RecognizerService(Service):
             self._unpaced.append(session, chunk)
             self._limit_unpaced()
             return
-        media_time, samples = chunk
-        rate_hz = session.start.sample_rate_hz
-        size = round(MAX_BATCH_S * rate_hz)
-        for begin in range(0, max(1, len(samples)), size):  # other sessions do not wait for all
-            part_time = media_time + begin * MEDIA_RATE_HZ // rate_hz
-            self._add_to_batch(session, (part_time, samples[begin : begin + size]))
-            if self._batch_s >= MAX_BATCH_S:
-                self._decode_batch()
-                self.send_heartbeat_if_due()
+        session.audio.append(chunk, time.monotonic())
 
-    def _add_to_batch(self, session: RecognizerSession, chunk: Chunk) -> None:
-        media_time, samples = chunk
-        session.stream.accept_waveform(samples, media_time)
-        self._batch[session.name] = session
-        self._batch_s += len(samples) / session.start.sample_rate_hz
+    @property
+    def _has_live_audio(self) -> bool:
+        return any(session.audio for session in self._sessions.values())
 
-    def _decode_batch(self) -> None:
-        """Decode the audio of all sessions in the batch; the network scores it together."""
-        if not self._batch:
+    @property
+    def _live_audio_s(self) -> float:
+        """Duration of the live audio that is not decoded yet."""
+        return sum(session.audio.duration_s for session in self._sessions.values())
+
+    def _read_late_audio(self) -> None:
+        """If a session is late, read all audio that has arrived, so that one cut is enough."""
+        end_s = time.monotonic() + MAX_READ_S
+        while not self._is_live_blocked and (now_s := time.monotonic()) < end_s:
+            late = [one.audio for one in self._sessions.values() if one.audio.is_late(now_s)]
+            if not late:
+                return
+            if not self._audio.wait(READ_WAIT_S):
+                for audio in late:
+                    audio.overload.adapt(now_s)
+                return
+            self.handle_messages(self._audio)
+
+    def _decode_all_live(self) -> None:
+        while self._has_live_audio:
+            self._decode_live()
+
+    def _decode_live(self) -> None:
+        """Decode a part of the queued audio of all live sessions; skip audio that is too old."""
+        sessions = [session for session in self._sessions.values() if session.audio]
+        if not sessions:
             return
+        now_s = time.monotonic()
+        for session in sessions:
+            session.accept_waveform(MAX_PART_S, now_s)
+        self._decode(sessions)
+        self.send_heartbeat_if_due()
+
+    def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
+        """Decode the accepted audio of some sessions; the network scores it together."""
         started_s = time.perf_counter()
-        sessions = list(self._batch.values())
-        self._batch, self._batch_s = {}, 0.0
         self._recognizer.decode_streams([session.stream for session in sessions])
         self.resync_with_control()  # after a stall, other recognizers may serve the sessions
         for session in sessions:
@@ -346,15 +378,20 @@ class RecognizerService(Service):
 
     def _decode_unpaced(self) -> None:
         """Decode some unpaced audio, and finish the sessions whose audio ends."""
+        batch: dict[str, RecognizerSession] = {}
         for session, chunk in self._unpaced.take(self._max_unpaced_s):
             if chunk is not None:
-                self._add_to_batch(session, chunk)
+                media_time, samples = chunk
+                session.stream.accept_waveform(samples, media_time)
+                batch[session.name] = session
                 continue
-            self._decode_batch()
+            self._decode([*batch.values()])
+            batch.clear()
             self._finish(session)
             if session.end is not None and session.end.acknowledge:
                 session.request_acknowledgement(time.monotonic(), at_once=True)
-        self._decode_batch()
+        if batch:
+            self._decode([*batch.values()])
         self._limit_unpaced()
 
     def _finish(self, session: RecognizerSession) -> None:

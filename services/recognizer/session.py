@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from dataclasses import replace
 
 from kouxing.services.recognizer.audio_order import AudioOrder
 from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
 from kouxing.services.recognizer.lip_frames import LipFrameModel
+from kouxing.services.recognizer.live_audio import LiveAudio
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
@@ -15,6 +17,7 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
+from kouxing.shared.overload import CATCH_UP_S, Overload, Relief
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange, Waveform
 from kouxing.shared.replay import Replay
 from kouxing.shared.sockets import Socket
@@ -53,6 +56,7 @@ class RecognizerSession:
         socket: Socket,
         publisher: Socket,
         now_s: float,
+        max_behind_s: float = math.inf,
     ) -> None:
         self.start = start
         self.replay = Replay(publisher, now_s)
@@ -78,6 +82,8 @@ class RecognizerSession:
         if start.media_time:
             silence = recognizer.model.inventory.silence
             self.resumption = Resumption(to_seconds(start.media_time), silence)
+        overload = Overload(max_behind_s, now_s + CATCH_UP_S if start.epoch > 1 else now_s)
+        self.audio = LiveAudio(start.sample_rate_hz, overload)  # not decoded yet
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.order = AudioOrder()
@@ -151,6 +157,15 @@ class RecognizerSession:
         aligned = self.resumption.align((media_time, samples), rate_hz)
         return aligned if len(aligned[1]) else None
 
+    def accept_waveform(self, max_s: float, now_s: float) -> None:
+        """Pass queued audio to the stream, up to a duration. Skip audio that is too old."""
+        has_skipped = self.audio.relieve(now_s) is Relief.AUDIO
+        for media_time, samples in self.audio.take(max_s):
+            if has_skipped:
+                self.stream.skip_to(media_time)
+                has_skipped = False
+            self.stream.accept_waveform(samples, media_time)
+
     def check_stalled(self, tick_s: float, now_s: float) -> None:
         """Count time in which no audio arrived; report a live client that has now stalled."""
         before_s, self.without_audio_s = self.without_audio_s, self.without_audio_s + tick_s
@@ -162,6 +177,7 @@ class RecognizerSession:
         """Record that audio arrived; the face must not return to rest until it is processed."""
         if self.start.paced and self.without_audio_s > STALLED_AFTER_S:
             self._report(AudioState.RESUMED, now_s)
+            self.audio.overload.resume()
         self.last_audio_s, self.without_audio_s = now_s, 0.0
 
     def _report(self, state: AudioState, now_s: float) -> None:

@@ -22,7 +22,13 @@ from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from kouxing.services.recognizer.lip_frames import LipFrameStream
-from kouxing.shared.phones.events import EndOfSound, LipPositions, Progress, Waveform
+from kouxing.shared.phones.events import (
+    AudioSkipped,
+    EndOfSound,
+    LipPositions,
+    Progress,
+    Waveform,
+)
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
 _FIRST_NEWEST_FRAME = 2  # the newest frame that the network's first position sees
@@ -56,7 +62,14 @@ class FrameScores:
 
 WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, or a progress bar
 ScoreEvent: TypeAlias = (
-    SpeechStart | SpeechEnd | FrameScores | LipPositions | Progress | EndOfSound | Waveform
+    SpeechStart
+    | SpeechEnd
+    | FrameScores
+    | LipPositions
+    | Progress
+    | AudioSkipped
+    | EndOfSound
+    | Waveform
 )
 
 

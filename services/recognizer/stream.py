@@ -22,6 +22,7 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import SpeechScorer, frame_at
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones.events import (
+    AudioSkipped,
     EndOfSound,
     LipPositions,
     Phone,
@@ -102,6 +103,12 @@ class SpeechStream:
             self._start_at(media_time)
         self._num_in += len(samples)
         self._segments[-1].accept_waveform(samples)
+
+    def skip_to(self, media_time: int) -> None:
+        """Continue with the audio at a media time, as after a gap that gets no frames."""
+        self._segments[-1].input_finished()
+        self._start_at(media_time)
+        self._segments[-1].scorer.add_event(AudioSkipped(time_s=to_seconds(media_time)))
 
     def input_finished(self) -> None:
         """End the audio."""

@@ -33,7 +33,14 @@ from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expression_motion import JAW, mix
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import (
+    AudioSkipped,
+    EndOfSound,
+    Phone,
+    Progress,
+    SoundEvent,
+    SpeechChange,
+)
 
 Faps: TypeAlias = NDArray[np.float64]  # (68,)
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
@@ -92,7 +99,7 @@ class FaceAnimator:
         self._goal: Faps | None = None  # the last frame without its transition
         self._shown: Faps | None = None  # the last shown frame
         self._previously_shown: Faps = _ZERO  # the shown frame before that
-        self._is_resuming = False  # only the replaced face has been shown so far
+        self._is_resuming = False  # the next shown frame starts a transition from the last one
         self._transition, self._transition_s = _NO_TRANSITION, 0.0  # and its age
         self._event_s = 0.0  # time of the last event
         self._start_at(0)
@@ -127,9 +134,12 @@ class FaceAnimator:
     def iter_frames(self, event: SoundEvent) -> Iterator[Frame]:
         """Yield the frames of ``process`` one by one; exhaust this before the next event."""
         time_s = _time_of(event)
-        if time_s - self._event_s > MAX_GAP_S:
+        if time_s - self._event_s > MAX_GAP_S and not isinstance(event, AudioSkipped):
             self._start_at(self._frame_number(max(0.0, time_s - self._delay_s)))
         self._event_s = time_s
+        if isinstance(event, AudioSkipped):
+            self.skip_to(time_s)
+            return
         if isinstance(event, EndOfSound):
             self._add_event(SpeechChange(active=False, time_s=time_s))
             yield from self._frames_until(time_s + self._delay_s + REST_S)
@@ -137,6 +147,14 @@ class FaceAnimator:
         self._add_event(event)
         if isinstance(event, Progress):
             yield from self._frames_until(time_s)
+
+    def skip_to(self, time_s: float) -> None:
+        """Make no frames of the audio before a media time; the face moves there continuously."""
+        self._event_s = max(self._event_s, time_s)
+        number = self._frame_number(time_s - self._delay_s)
+        if number > self._next_frame:
+            self._next_frame = number
+            self._goal, self._is_resuming = None, True
 
     def change_recognizer(self) -> None:
         """Continue with the events of another recognizer; phones that were not final are void.

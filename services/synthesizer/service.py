@@ -36,9 +36,10 @@ from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
-from kouxing.shared.message_loop import Handler
+from kouxing.shared.message_loop import MAX_TURN_S, Handler
+from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S, Overload, Relief
 from kouxing.shared.phones import events
-from kouxing.shared.phones.events import EndOfSound, LipPositions, Phone, SoundEvent
+from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SoundEvent
 from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.reliable import ReliableReceiver
@@ -71,7 +72,12 @@ class _SynthesizerSession:
     """A session: its face, and its position in the streams of messages."""
 
     def __init__(
-        self, start: StartSession, face: FaceAnimator, input_socket: Socket, publisher: Socket
+        self,
+        start: StartSession,
+        face: FaceAnimator,
+        input_socket: Socket,
+        publisher: Socket,
+        max_behind_s: float,
     ) -> None:
         self.start = start
         self.replay = Replay(publisher, time.monotonic())
@@ -84,9 +90,18 @@ class _SynthesizerSession:
         self.final = FinalTime()
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
         self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
+        self.overload = Overload(max_behind_s)
+        self.newest_s = 0.0  # media time up to which audio is known
         self.finished = False
         self.lateness = LatenessMeter()
         self.shapes: list[str] = []  # shape sets to publish
+
+    def skip_if_behind(self, now_s: float) -> None:
+        """Make no frames but the newest, if the session is too far behind."""
+        times_s = (event.time_s for event in self.queue if isinstance(event, events.Progress))
+        waiting_s = self.newest_s - next(times_s, self.newest_s)
+        if self.overload.update(waiting_s, now_s) is Relief.AUDIO:
+            self.face.skip_to(self.newest_s)
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
         """Continue after the newest frame of another synthesizer."""
@@ -144,7 +159,9 @@ class SynthesizerService(Service):
         if session is None or session.start.token != start.token:
             settings = self._known_settings(start.session, start.face)
             face = self._new_face(start, settings)
-            session = _SynthesizerSession(start, face, self._input, self._faps)
+            session = _SynthesizerSession(
+                start, face, self._input, self._faps, self._config.max_behind_s
+            )
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
@@ -224,17 +241,20 @@ class SynthesizerService(Service):
             live = [name for name, session in self._sessions.items() if session.start.paced]
             self._faps.disconnect_stalled((FapFrame,), live)
         due_s = self._dropped_s + DROP_INTERVAL_S
-        for session in self._sessions.values():
+        for name, session in self._sessions.items():
             session.receiver.tick()
+            self.report_skipped(name, session.overload.take_report_s(now_s))
             if session.start.paced and not session.finished and not session.queue:
                 self._relax(session, now_s)
                 due_s = min(due_s, session.relax_at_s + 1.0 / self.frame_rate_hz)
         busy = [session for session in self._sessions.values() if session.queue]
-        if busy:
+        end_s = time.monotonic() + MAX_TURN_S
+        for _ in busy:
             self._turn += 1
             self._make_frames(busy[self._turn % len(busy)])
-            due_s = now_s
-        return due_s
+            if time.monotonic() > end_s:
+                break
+        return now_s if busy else due_s
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return how far each session's phones are final, and how late its frames are."""
@@ -246,7 +266,9 @@ class SynthesizerService(Service):
                 p50_ms, p95_ms, worst_ms = percentiles
                 lateness = Lateness(p50_ms=p50_ms, p95_ms=p95_ms, worst_ms=worst_ms)
             media_time = to_samples(session.final.time_s)
-            inputs[name] = SessionInput(media_time=media_time, lateness=lateness)
+            inputs[name] = SessionInput(
+                media_time=media_time, lateness=lateness, skipped_s=session.overload.skipped_s
+            )
         return inputs
 
     def gauges(self) -> dict[str, float]:
@@ -292,6 +314,8 @@ class SynthesizerService(Service):
         if isinstance(message, Progress):
             state, newest_frame = message.state, message.newest_frame
         has_stalled = state == AudioState.STALLED
+        if is_report(message):
+            session.overload.resume()
         session.relax_at_s = now_s if has_stalled else now_s + RECOGNIZER_TIMEOUT_S
         if message.epoch != session.epoch_in:
             self._enter_epoch(session, message, newest_frame)
@@ -310,6 +334,8 @@ class SynthesizerService(Service):
         elif message.epoch > 1:  # both workers were lost, so the other face's frame is unknown
             time_s = to_seconds(message.media_time)
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
+        if message.epoch > 1:
+            session.overload.restart(time.monotonic() + CATCH_UP_S)
         session.epoch_in = message.epoch
 
     def _admit(self, message: SpeechMessage, sender: Peer) -> _SynthesizerSession | None:
@@ -338,12 +364,20 @@ class SynthesizerService(Service):
             return
         session.final.update(event)
         session.queue.append(event)
+        now_s = time.monotonic()
+        if isinstance(event, events.Progress | AudioSkipped):
+            session.overload.add(max(0.0, event.time_s - session.newest_s), now_s)
+            session.newest_s = max(session.newest_s, event.time_s)
+        if session.start.paced and session.overload.is_late(0.0, now_s, for_s=MAX_LATE_FOR_S):
+            return  # newer events may have arrived
         if len(session.queue) == 1:
             self._make_frames(session)
 
     def _make_frames(self, session: _SynthesizerSession) -> None:
         """Publish the frames of queued events, up to ``MAX_BURST_S``."""
         num_left = max(1, round(MAX_BURST_S * self.frame_rate_hz))
+        if session.start.paced:
+            session.skip_if_behind(time.monotonic())
         while session.queue:
             event = session.queue[0]
             if session.frames is None:

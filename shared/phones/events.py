@@ -70,6 +70,13 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AudioSkipped:
+    """The recognizer was too slow; it has skipped the audio before ``time_s``."""
+
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EndOfSound:
     """The audio has ended."""
 
@@ -84,4 +91,4 @@ class Waveform:
     samples: NDArray[np.float32]  # (n,) 16 kHz mono
 
 
-SoundEvent = Phone | LipPositions | SpeechChange | Progress | EndOfSound
+SoundEvent = Phone | LipPositions | SpeechChange | Progress | AudioSkipped | EndOfSound

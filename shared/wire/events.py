@@ -53,6 +53,8 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 zero_crossing_rate=event.zero_crossing_rate,
                 pitch_hz=event.pitch_hz or None,
             )
+        case events.AudioSkipped():
+            return Progress(media_time=to_samples(event.time_s), state=AudioState.SKIPPED)
         case events.EndOfSound():
             return Progress(media_time=to_samples(event.time_s), state=AudioState.ENDED)
 
@@ -85,6 +87,8 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
             )
         case Speech():
             return events.SpeechChange(active=message.active, time_s=time_s)
+        case Progress(state=AudioState.SKIPPED):
+            return events.AudioSkipped(time_s=time_s)
         case Progress(state=AudioState.ENDED):
             return events.EndOfSound(time_s=time_s)
         case Progress():

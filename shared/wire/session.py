@@ -169,6 +169,7 @@ class SessionState:
     workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
     facts: SessionFacts
     lateness: Lateness | None = None  # None: not live, or no frames in the last 10 s
+    skipped_s: Seconds = 0.0  # audio that was too old on a busy machine, in total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

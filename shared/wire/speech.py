@@ -28,6 +28,7 @@ class AudioState(StrEnum):
     RUNNING = "running"
     STALLED = "stalled"  # the client sends no audio: media time stands still
     RESUMED = "resumed"  # it sends audio again; that audio is not processed yet
+    SKIPPED = "skipped"  # the audio before was too old: the face continues here
     ENDED = "ended"  # no more results follow
 
 

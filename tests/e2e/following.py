@@ -34,6 +34,7 @@ class Stream:
 
     def __init__(self, session: Session) -> None:
         self.session = session
+        self.num_sent = 0  # samples
         self.frames: list[FapFrame] = []
         self.phones: list[Phone] = []
         self.lips: list[LipPositions] = []
@@ -60,6 +61,7 @@ class Stream:
         begin_s = time.monotonic()
         for begin in range(0, len(samples), chunk):
             self.session.push(samples[begin : begin + chunk])
+            self.num_sent += len(samples[begin : begin + chunk])
             due_s = begin_s + (begin + chunk) / rate_hz if paced else 0.0
             self.collect()
             while (left_s := due_s - time.monotonic()) > 0:

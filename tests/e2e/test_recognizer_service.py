@@ -48,6 +48,7 @@ class Recognizer(RecognizerService):
         self._on_audio(self._sessions[message.session].socket, message, Peer())
 
     def decode_all(self) -> None:
+        self._decode_all_live()
         while self._unpaced:
             self._decode_unpaced()
             self.send_heartbeat_if_due()

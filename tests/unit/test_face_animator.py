@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.shared.face.idle_motion import IdleMotion, State
-from kouxing.shared.phones.events import EndOfSound, SpeechChange
+from kouxing.shared.phones.events import AudioSkipped, EndOfSound, SpeechChange
 from tests.lips import DELAY_S, LIPS, advance, make_face, phone
 
 JAW = 2
@@ -48,6 +48,19 @@ def test_relaxes_and_returns_without_a_jump() -> None:
     faps = values(spoken[-2:] + rest + advance(face, 1.2))
     assert faps[-1, JAW] > 100.0
     assert np.abs(np.diff(faps[:, JAW])).max() < 200.0
+
+
+def test_skips_to_newer_audio_without_a_jump() -> None:
+    face = make_face(idle_motion_seed=3)
+    spoken = speak(face)
+    assert face.process(AudioSkipped(time_s=31.0)) == []
+    after = advance(face, 31.5)
+    assert after[0][0] == pytest.approx(31.0 - DELAY_S, abs=FRAME_S)
+    assert len(after) == pytest.approx(0.5 / FRAME_S, abs=1)
+    faps = values(spoken[-1:] + after)
+    assert faps[0, JAW] > 100.0
+    assert faps[-1, JAW] < 1.0
+    assert np.abs(np.diff(faps[:, JAW])).max() < faps[0, JAW] / 3
 
 
 def test_end_of_sound_completes_the_frames_and_leads_to_rest() -> None:

@@ -14,6 +14,7 @@ from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.stream import MAX_JITTER
 from kouxing.shared.phones.events import (
+    AudioSkipped,
     EndOfSound,
     LipPositions,
     Phone,
@@ -75,6 +76,19 @@ def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
     for first, second in zip(lips[:middle], lips[middle:], strict=True):
         assert second.time_s - first.time_s == pytest.approx(gap / RATE_HZ)
         np.testing.assert_array_equal(first.faps, second.faps)
+
+
+def test_skips_to_newer_audio() -> None:
+    stream = LiveStream(MODEL, **FACE)
+    outputs = stream.feed(SAMPLES[:8000])
+    stream.stream.skip_to(40_000)
+    outputs += stream.feed(SAMPLES, 40_000) + stream.finish()
+    skips = [number for number, event in enumerate(outputs) if isinstance(event, AudioSkipped)]
+    assert [outputs[number].time_s for number in skips] == [2.5]
+    before, after = outputs[: skips[0]], outputs[skips[0] :]
+    assert all(phone.final for phone in {p.index: p for p in of_kind(Phone, before)}.values())
+    assert min(phone.onset_s for phone in of_kind(Phone, after)) >= 2.5
+    assert stream.stream.num_gaps == 0
 
 
 def test_jitter_is_not_a_gap() -> None:

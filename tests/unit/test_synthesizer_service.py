@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, cast
@@ -100,3 +101,18 @@ def test_rejects_messages_beyond_the_queue(service: Watched) -> None:
         5.0 + (MAX_QUEUED + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
     )
     assert not service._sessions["gap"].queue
+
+
+def test_a_slow_synthesizer_skips_frames(service: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    service.take("gap", 1, 0.08)
+    now_s = 10.0  # it was stopped
+    for sequence in range(2, 150):
+        service.take("gap", sequence, 0.1 * sequence)
+    before = len(service.frames("gap"))
+    service.on_tick(now_s)
+    assert not service._sessions["gap"].queue
+    first, newest = service.frames("gap")[before], service.frames("gap")[-1]
+    assert first.media_time == newest.media_time == to_samples(14.9 - service.facts.delay_ms / 1e3)
+    assert service.session_inputs()["gap"].skipped_s == pytest.approx(14.7)

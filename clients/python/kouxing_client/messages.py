@@ -219,6 +219,8 @@ class SessionState:
     facts: SessionFacts
     lateness: Lateness | None = None
     """None: not live, or no frames in the last 10 s"""
+    skipped_s: float = 0.0
+    """duration of the audio that was skipped on a busy machine"""
 
 
 @dataclass(frozen=True, kw_only=True)

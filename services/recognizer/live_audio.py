@@ -1,0 +1,69 @@
+"""The audio of one live session that waits to be decoded."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+from kouxing.services.recognizer.resumption import Chunk
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
+from kouxing.shared.overload import Overload, Relief
+
+
+class LiveAudio:
+    """A queue of chunks that drops old audio. Times are in seconds, on any monotonic clock."""
+
+    def __init__(self, sample_rate_hz: int, overload: Overload) -> None:
+        self.overload = overload
+        self._rate_hz = sample_rate_hz
+        self._chunks: deque[Chunk] = deque()
+        self._num_samples = 0  # in the queue
+        self._end = 0  # media time of the end of the newest chunk
+
+    def __bool__(self) -> bool:
+        return bool(self._chunks)
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the queued audio."""
+        return self._num_samples / self._rate_hz
+
+    def append(self, chunk: Chunk, now_s: float) -> None:
+        """Add a chunk that has arrived."""
+        media_time, samples = chunk
+        end = media_time + len(samples) * MEDIA_RATE_HZ // self._rate_hz
+        self.overload.add(to_seconds(max(0, end - self._end)), now_s)
+        self._end = end
+        self._chunks.append(chunk)
+        self._num_samples += len(samples)
+
+    def is_late(self, now_s: float) -> bool:
+        """Return whether the oldest chunk is too late."""
+        return self.overload.is_late(self._waiting_s, now_s) if self._chunks else False
+
+    def relieve(self, now_s: float) -> Relief:
+        """Return what the session gives up; drop audio that is too old."""
+        relief = self.overload.update(self._waiting_s, now_s)
+        if relief is Relief.AUDIO:
+            self._num_samples = len(self._chunks[-1][1])
+            while len(self._chunks) > 1:
+                self._chunks.popleft()
+        return relief
+
+    def take(self, max_s: float) -> Iterator[Chunk]:
+        """Yield chunks from the front, up to a total duration."""
+        num_left = max(1, round(max_s * self._rate_hz))
+        while self._chunks and num_left > 0:
+            media_time, samples = self._chunks.popleft()
+            taken, rest = samples[:num_left], samples[num_left:]
+            if len(rest):
+                rest_time = media_time + num_left * MEDIA_RATE_HZ // self._rate_hz
+                self._chunks.appendleft((rest_time, rest))
+            num_left -= len(taken)
+            self._num_samples -= len(taken)
+            yield media_time, taken
+
+    @property
+    def _waiting_s(self) -> float:
+        """Duration of the audio that arrived before the newest chunk."""
+        return (self._num_samples - len(self._chunks[-1][1])) / self._rate_hz

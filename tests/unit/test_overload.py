@@ -1,0 +1,151 @@
+"""A live session that falls behind gives up phones, then audio; recorded audio is complete."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from kouxing.services.recognizer.live_audio import LiveAudio
+from kouxing.shared.overload import (
+    CATCH_UP_S,
+    MAX_LATE_FOR_S,
+    RESTORE_AFTER_S,
+    Overload,
+    Relief,
+)
+
+MAX_BEHIND_S = 0.2
+CHUNK_S = 0.02
+RATE_HZ = 16_000
+
+
+class Session:
+    """A session of a service that processes audio at a speed, in steps of 20 ms."""
+
+    def __init__(self, **options: float) -> None:
+        self.overload = Overload(MAX_BEHIND_S, **options)
+        self.now_s = 100.0
+        self.waiting_s = -CHUNK_S  # after the oldest chunk
+        self.reliefs: list[Relief] = []
+
+    def run(self, duration_s: float, speed: float, sent: float = 1.0) -> list[Relief]:
+        """Receive audio at a rate and process it at another; return what is given up."""
+        reliefs = []
+        for _ in range(round(duration_s / CHUNK_S)):
+            self.now_s += CHUNK_S
+            if sent:
+                self.receive(sent * CHUNK_S)
+            relief = self.overload.update(max(0.0, self.waiting_s), self.now_s)
+            reliefs.append(relief)
+            is_cut = relief is Relief.AUDIO
+            self.waiting_s = 0.0 if is_cut else max(-CHUNK_S, self.waiting_s - speed * CHUNK_S)
+        return reliefs
+
+    def receive(self, duration_s: float) -> None:
+        self.overload.add(duration_s, self.now_s)
+        self.waiting_s += duration_s
+
+
+def test_a_fast_service_gives_up_nothing() -> None:
+    session = Session()
+    assert set(session.run(60.0, speed=3.0)) == {Relief.NOTHING}
+    assert session.overload.skipped_s == 0.0
+
+
+def test_a_slow_service_gives_up_phones_and_then_audio() -> None:
+    session = Session()
+    reliefs = session.run(30.0, speed=0.5)
+    assert sorted(set(reliefs)) == [*Relief]
+    assert reliefs.index(Relief.PHONES) < reliefs.index(Relief.AUDIO)
+    assert session.overload.skipped_s == pytest.approx(0.5 * 30.0, abs=1.0)
+    assert session.run(RESTORE_AFTER_S + 1.0, speed=3.0)[-1] is Relief.NOTHING
+
+
+def test_is_never_far_behind_for_long() -> None:
+    session = Session()
+    behind_s = []
+    for _ in range(2000):
+        session.run(CHUNK_S, speed=0.3)
+        behind_s.append(session.waiting_s)
+    assert max(behind_s) < MAX_BEHIND_S + MAX_LATE_FOR_S
+
+
+def test_skips_what_arrived_while_the_process_was_stopped() -> None:
+    session = Session()
+    session.run(2.0, speed=3.0)
+    session.now_s += 10.0
+    for _ in range(500):
+        session.receive(CHUNK_S)
+    assert session.overload.is_late(session.waiting_s, session.now_s)
+    assert session.run(CHUNK_S, speed=3.0) == [Relief.AUDIO]
+    assert session.overload.skipped_s == pytest.approx(10.0, abs=0.1)
+
+
+def _send_ahead(session: Session) -> None:
+    for _ in range(200):
+        session.receive(CHUNK_S)
+
+
+def _send_after_a_pause(session: Session) -> None:
+    session.run(2.0, speed=3.0)
+    session.now_s += 10.0
+    session.overload.resume()
+    _send_ahead(session)
+
+
+def _send_a_long_chunk(session: Session) -> None:
+    session.run(2.0, speed=3.0)
+    session.now_s += 2.0
+    session.overload.add(2.0, session.now_s)
+
+
+@pytest.mark.parametrize("send", [_send_ahead, _send_after_a_pause, _send_a_long_chunk])
+def test_keeps_audio_that_is_not_late(send: Callable[[Session], None]) -> None:
+    session = Session()
+    send(session)
+    assert set(session.run(4.0, speed=1.3, sent=0.0)) <= {Relief.NOTHING, Relief.PHONES}
+
+
+def test_a_session_that_moved_may_catch_up_first() -> None:
+    session = Session(start_s=100.0 + CATCH_UP_S)
+    _send_ahead(session)
+    assert set(session.run(CATCH_UP_S - 0.1, speed=0.5)) == {Relief.NOTHING}
+    assert Relief.AUDIO in session.run(1.0, speed=0.5)
+
+
+def test_a_slower_network_is_not_overload() -> None:
+    session = Session()
+    session.run(2.0, speed=3.0)
+    session.now_s += 1.0  # from now on, all audio arrives later
+    for _ in range(100):
+        session.overload.adapt(session.now_s)
+    assert not session.overload.is_late(0.0, session.now_s)
+
+
+def test_reports_skipped_audio_at_most_once_a_second() -> None:
+    session = Session()
+    reports_s = []
+    for _ in range(500):
+        session.run(CHUNK_S, speed=0.1)
+        reports_s.append(session.overload.take_report_s(session.now_s))
+    assert 8 <= np.count_nonzero(reports_s) <= 10
+    assert sum(reports_s) == pytest.approx(session.overload.skipped_s, abs=1.0)
+
+
+def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
+    audio = LiveAudio(2 * RATE_HZ, Overload(MAX_BEHIND_S))
+    chunk = np.zeros((3200, 1), np.float32)  # 0.1 s
+    audio.append((0, chunk), 0.0)
+    audio.append((1600, chunk), 0.1)
+    taken = list(audio.take(0.15))
+    assert [(at, len(samples)) for at, samples in taken] == [(0, 3200), (1600, 1600)]
+    assert audio.duration_s == pytest.approx(0.05)
+    assert audio.relieve(0.1) is Relief.NOTHING
+    for number in range(2, 20):
+        audio.append((1600 * number, chunk), 2.0)
+    assert audio.is_late(2.0)
+    assert audio.relieve(2.0) is Relief.AUDIO
+    assert [at for at, _ in audio.take(1.0)] == [1600 * 19]
+    assert not audio
