@@ -1,9 +1,9 @@
-"""What a live session gives up when the machine is busy, so that its face stays live.
+"""The overload policy: on a busy machine, a live session gives up results to stay live.
 
 A session is *behind* if late audio waits to be processed. Then it gives up, in this order:
 
-1. the phones of the audio that waits, because the lips do not need them;
-2. the audio itself, in one cut: the session continues with the newest audio.
+1. Phones of the audio that waits. The lips do not need them.
+2. The audio itself, in one cut. The session continues with the newest audio.
 
 A recorded session gives up nothing: it takes longer instead.
 

@@ -172,7 +172,7 @@ class Service(MessageLoop):
         self.send_to_control(Event(session=session, name=name, detail=detail[:2000]))
 
     def report_skipped(self, session: str, skipped_s: float) -> None:
-        """Count and report audio that a live session skipped; do nothing if there is none."""
+        """Count and report the duration of skipped audio of a live session, unless it is 0."""
         if skipped_s > 0.0:
             self.metrics.count("skipped_audio_ms", round(1e3 * skipped_s))
             self.publish_event(EventName.AUDIO_SKIPPED, session, f"{skipped_s:.2f} s")
