@@ -24,10 +24,15 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
     Raises ``UserError`` if the configuration is invalid.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during startup prints no traceback
+    from kouxing.shared.priority import raise_priority, use_one_thread
+
+    use_one_thread()
     from kouxing.services.kinds import KINDS, read_settings
     from kouxing.shared.config import parse_assignments
 
     kind = KINDS[name]
+    if kind.role != "observer":  # observers draw pictures or start other programs
+        raise_priority()
     config = read_settings(file).load(kind.config_type, parse_assignments(assignments))
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a closed connection is not fatal
     return run_service(lambda: kind.service_type(config), name, config.log_level)

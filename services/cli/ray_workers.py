@@ -20,7 +20,6 @@ from typing import Self
 import ray
 
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
-from kouxing.services.cli.supervisor import ONE_THREAD
 from kouxing.services.kinds import KINDS
 from kouxing.shared.config import BindAddress, Settings, bound_keys, variable
 from kouxing.shared.errors import UserError
@@ -48,7 +47,7 @@ class Worker:
         self._draining = False
         self._process = ServiceProcess(
             kind,
-            environment={**os.environ, **ONE_THREAD, **environment, **folders},
+            environment={**os.environ, **environment, **folders},
             stdin=subprocess.DEVNULL,
         )
         threading.Thread(target=self._watch_process, daemon=True).start()

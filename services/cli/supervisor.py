@@ -28,7 +28,6 @@ MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice i
 STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
 USER_ERROR = 2  # exit status of a service with a wrong configuration
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 class Supervisor:
@@ -55,7 +54,7 @@ class Supervisor:
         self._arguments = arguments
         self._log_folder = log_folder
         self._console = console
-        self._environment = {**os.environ, **ONE_THREAD, **(environment or {})}
+        self._environment = {**os.environ, **(environment or {})}
         self._processes: dict[str, ServiceProcess] = {}
         self._started_s: dict[str, float] = {}
         self._backoff_s = dict.fromkeys(self._names, 0.0)
