@@ -49,9 +49,10 @@ if TYPE_CHECKING:
     from kouxing.shared.prometheus import MetricsServer
 
 TICK_S = 0.01  # between ticks, at least
-HEARTBEAT_S = 0.25
+HEARTBEAT_S = 0.25  # between heartbeats with sessions
+IDLE_HEARTBEAT_S = 1.0  # after a heartbeat without sessions
 SESSIONS_PER_HEARTBEAT = 16  # of a worker, so that a heartbeat's cost does not grow
-RESYNC_AFTER_S = 0.8  # without a heartbeat; control may have moved the sessions
+RESYNC_AFTER_S = 0.55  # after a heartbeat was due; control may have moved the sessions
 REPLY_TIMEOUT_S = 0.5
 NO_REPLY_S = 10.0  # without a reply from control, until the service looks for the reason
 FIRST_REPLY_S = 3.0  # the same at startup
@@ -63,6 +64,7 @@ EXIT_AFTER_S = 15.0  # if a heartbeat is later, a health check ends the process
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id; the underscore: not a setting
 _BUILD = version("kouxing")
 PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
+IDLE_PULSE = b"-"  # such a byte, for a heartbeat without sessions
 
 
 class Service(MessageLoop):
@@ -94,8 +96,7 @@ class Service(MessageLoop):
         self._exit_requested = False
         self._hand_over_end_s = 0.0
         self._ticked_s = self._tick_due_s = 0.0
-        self._heartbeat_due_s = 0.0
-        self._heartbeat_s = time.monotonic()  # when the newest heartbeat was sent
+        self._heartbeat_due_s = time.monotonic()
         self._num_reported = 0  # sessions in earlier heartbeats
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
         self._reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S
@@ -222,7 +223,7 @@ class Service(MessageLoop):
     def main_loop(self) -> None:
         """Handle messages until the service should exit."""
         while not self.should_exit:
-            self.step(HEARTBEAT_S)
+            self.step(IDLE_HEARTBEAT_S)
 
     def shutdown(self) -> None:
         """Finish the work in progress within the deadline, and close all sockets."""
@@ -307,6 +308,8 @@ class Service(MessageLoop):
         if self._exit_requested:
             return
         try:
+            heartbeat_due_s = time.monotonic() + HEARTBEAT_S
+            self._heartbeat_due_s = min(self._heartbeat_due_s, heartbeat_due_s)
             if self.start_session(start):
                 self.session_started(start)
         except UserError as error:
@@ -317,13 +320,12 @@ class Service(MessageLoop):
         """Send a heartbeat if it is time; long work calls this in between."""
         now_s = time.monotonic()
         if now_s >= self._heartbeat_due_s:
-            self._heartbeat_due_s = now_s + HEARTBEAT_S
             self._send_heartbeat()
             self._check_replies(now_s)
 
     def resync_with_control(self) -> None:
         """After a stall, wait for control's decisions before anything more is published."""
-        if time.monotonic() - self._heartbeat_s <= RESYNC_AFTER_S:
+        if time.monotonic() <= self._heartbeat_due_s + RESYNC_AFTER_S:
             return
         self._send_heartbeat(all_sessions=True)
         if self.control is None:
@@ -343,10 +345,11 @@ class Service(MessageLoop):
         return socket
 
     def _send_heartbeat(self, *, all_sessions: bool = False) -> None:
-        now_s = self._heartbeat_s = time.monotonic()
+        now_s = time.monotonic()
         self._sent_ns = now_ns()
-        _pulse_supervisor()
         sessions, load = self.session_inputs(), self._busy.share(now_s)
+        self._heartbeat_due_s = now_s + (HEARTBEAT_S if sessions else IDLE_HEARTBEAT_S)
+        _pulse_supervisor(is_idle=not sessions)
         for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
             self.metrics.set(name, value)
         self.deliver_heartbeat(
@@ -433,8 +436,8 @@ class Service(MessageLoop):
             self.bus.zap.allow(grants)
 
 
-def _pulse_supervisor() -> None:
+def _pulse_supervisor(*, is_idle: bool) -> None:
     """Write a heartbeat byte to the supervisor's pipe, if the pipe exists."""
     if pulse := os.environ.get(PULSE_VARIABLE):
         with contextlib.suppress(OSError):  # the pipe is full, or the supervisor is gone
-            os.write(int(pulse), b".")
+            os.write(int(pulse), IDLE_PULSE if is_idle else b".")

@@ -12,9 +12,15 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from kouxing.shared.clock import StallDetector
-from kouxing.shared.service import PARENT_VARIABLE, PULSE_VARIABLE
+from kouxing.shared.service import (
+    HEARTBEAT_S,
+    IDLE_HEARTBEAT_S,
+    IDLE_PULSE,
+    PARENT_VARIABLE,
+    PULSE_VARIABLE,
+)
 
-POLL_S = 0.2  # between two checks of a process
+POLL_S = 0.5  # between two checks of a process
 HANG_S = 5.0  # a loop that sends no heartbeat for longer hangs
 
 
@@ -22,7 +28,8 @@ class ServiceProcess(subprocess.Popen[bytes]):
     """Runs ``python -m kouxing.services.<kind>``. It ends when this process ends.
 
     ``environment`` is complete but for two variables. A loop that sends no heartbeat for
-    ``hang_limit_s`` hangs. Other options are those of ``subprocess.Popen``.
+    ``hang_limit_s`` hangs; without sessions, for 0.75 s longer. Other options are those of
+    ``subprocess.Popen``.
     """
 
     def __init__(
@@ -51,12 +58,15 @@ class ServiceProcess(subprocess.Popen[bytes]):
         self._hang_limit_s = hang_limit_s
         self._stall = StallDetector(time.monotonic(), limit_s=2 * POLL_S)
         self._silent_s = 0.0
+        self._idle_s = 0.0  # by which the next heartbeat may be later
         self.is_ready = False  # it has sent a heartbeat
 
     def hangs(self) -> bool:
         """Return whether the service's loop hangs. Call this about every ``POLL_S``."""
         self._silent_s += self._stall.elapsed_s(time.monotonic())
         with contextlib.suppress(BlockingIOError):
-            if os.read(self._pulse, 65536):
+            if pulses := os.read(self._pulse, 65536):
                 self._silent_s, self.is_ready = 0.0, True
-        return self.is_ready and self._silent_s > self._hang_limit_s
+                is_idle = pulses.endswith(IDLE_PULSE)
+                self._idle_s = IDLE_HEARTBEAT_S - HEARTBEAT_S if is_idle else 0.0
+        return self.is_ready and self._silent_s > self._hang_limit_s + self._idle_s

@@ -116,9 +116,9 @@ class Supervisor:
 
         Raises ``UserError`` if a service reports a wrong configuration.
         """
-        while not self._stopping.wait(POLL_S):
-            if self._failure is not None:
-                raise self._failure
+        self._stopping.wait()
+        if self._failure is not None:
+            raise self._failure
 
     def check(self) -> None:
         """Kill services that hang, and restart those that have ended.
@@ -175,7 +175,7 @@ class Supervisor:
                 self.check()
             except UserError as error:
                 self._failure = error
-                return
+                self._stopping.set()
 
     def _schedule_restart(self, name: str, status: int, now_s: float) -> None:
         del self._processes[name]

@@ -32,7 +32,8 @@ class ControlConfig(ServiceConfig):
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which control closes a session."""
     lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9
-    """Seconds without a heartbeat after which control declares a service lost."""
+    """Seconds without a heartbeat after which control declares a service lost, and 0.75 s more if
+    the service has no session."""
 
     @property
     def bound_control(self) -> str:

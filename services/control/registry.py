@@ -9,7 +9,6 @@ import math
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from itertools import takewhile
 from operator import itemgetter
 
 from kouxing.services.control.load import WorkerLoad
@@ -18,6 +17,7 @@ from kouxing.services.kinds import PROVIDERS
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Peer
+from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
@@ -48,7 +48,10 @@ class Registry:
     """
 
     def __init__(self, lost_after_s: float) -> None:
-        self._services: OrderedDict[str, ServiceRecord] = OrderedDict()  # by newest heartbeat
+        self._services: dict[str, ServiceRecord] = {}
+        # the others by their newest heartbeat, oldest first, with and without sessions
+        self._busy: OrderedDict[str, ServiceRecord] = OrderedDict()
+        self._idle: OrderedDict[str, ServiceRecord] = OrderedDict()
         self._usual_limit_s = self._limit_s = lost_after_s
         self._late_at_s = -math.inf
         self._paused_s = 0.0  # total time in which control itself did not run
@@ -115,7 +118,10 @@ class Registry:
             self._by_connection[peer.connection] = instance
         record.peer, record.heartbeat_s = peer, now_s - self._paused_s
         record.state, record.metrics = heartbeat.state, heartbeat.metrics
-        self._services.move_to_end(instance)
+        self._busy.pop(instance, None)
+        self._idle.pop(instance, None)
+        if record.peer != NO_PEER:  # this is not control itself
+            (self._busy if heartbeat.sessions else self._idle)[instance] = record
         if heartbeat.role == "worker":
             self.load(instance).measure(heartbeat.load, now_s)
 
@@ -139,6 +145,8 @@ class Registry:
         record = self._services.pop(instance, None)
         if record is None:
             return
+        self._busy.pop(instance, None)
+        self._idle.pop(instance, None)
         self._num_per_key[record.peer.key] -= 1
         self._observers.discard(instance)
         if self._by_peer.get(record.peer) == instance:
@@ -261,17 +269,32 @@ class Registry:
 
     def overdue_s(self) -> float:
         """Return when the oldest heartbeat will be too old."""
-        oldest = next(iter(self._services.values()), None)
-        return math.inf if oldest is None else oldest.heartbeat_s + self._paused_s + self._limit_s
+        oldest = (
+            (next(iter(services.values())), max_age_s)
+            for services, max_age_s in self._max_ages_s()
+            if services
+        )
+        dues_s = (record.heartbeat_s + max_age_s for record, max_age_s in oldest)
+        return self._paused_s + min(dues_s, default=math.inf)
 
     def overdue(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
         if now_s > self._late_at_s + TIMEOUT_RESET_S:
             self._limit_s = self._usual_limit_s
-        oldest = takewhile(
-            lambda item: self.age_s(item[0], now_s) > self._limit_s, self._services.items()
+        overdue = []
+        for services, max_age_s in self._max_ages_s():
+            for instance in services:
+                if self.age_s(instance, now_s) <= max_age_s:
+                    break
+                overdue.append(instance)
+        return overdue
+
+    def _max_ages_s(self) -> Iterable[tuple[Mapping[str, ServiceRecord], float]]:
+        """Return services, oldest heartbeat first, and the maximum age of their heartbeats."""
+        return (
+            (self._busy, self._limit_s),
+            (self._idle, self._limit_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),
         )
-        return [instance for instance, record in oldest if record.peer != NO_PEER]
 
 
 def _with_keys(heartbeat: Heartbeat, peer: Peer) -> dict[str, str]:

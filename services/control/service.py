@@ -56,7 +56,7 @@ from kouxing.shared.wire.speech import Speech
 STOPPED = "stopped"  # reason for a service that shut down
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # after which a session without a worker is closed
-CHECK_S = 0.25  # between looks at waiting sessions and the list of keys
+CHECK_S = 0.5  # between looks at waiting sessions and the list of keys
 MAX_PAUSE_S = 0.1  # of a tick after it was due; anything longer is control's own delay
 # Events that a service may publish
 SERVICE_EVENTS = (EventName.AUDIO_SKIPPED, EventName.ERROR, EventName.RECORDED)

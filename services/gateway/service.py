@@ -52,8 +52,8 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Phone, Speech
 
-STATUS_INTERVAL_S = 1.0
-STATUS_TIMEOUT_S = 3.0  # without an answer, until the status is requested again
+STATUS_INTERVAL_S = 1.0  # between requests of the status
+STATUS_TIMEOUT_S = 3.0  # the same without an answer, or without viewers
 MISSING_S = 3.0  # until a missing service is reported; after a restart control waits for services
 CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes less
 
@@ -249,7 +249,8 @@ class GatewayService(Service):
             self._rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
             self._viewers.show_rest(self._resting_face.faps(now_s).astype("<f4").tobytes())
         is_answered = self._report_s >= self._request_s
-        due_s = self._request_s + (STATUS_INTERVAL_S if is_answered else STATUS_TIMEOUT_S)
+        interval_s = STATUS_INTERVAL_S if self._viewers.has_viewers else STATUS_TIMEOUT_S
+        due_s = self._request_s + (interval_s if is_answered else STATUS_TIMEOUT_S)
         if now_s >= due_s:
             self._request_s, due_s = now_s, now_s + STATUS_TIMEOUT_S
             self.send_to_control(StatusRequest(request=secrets.token_hex(8)))

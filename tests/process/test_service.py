@@ -18,6 +18,7 @@ from kouxing.shared.config import ServiceConfig
 from kouxing.shared.keys import Peer, key_folder, revoke_key
 from kouxing.shared.service import (
     EXIT_AFTER_S,
+    HEARTBEAT_S,
     MAX_LATE_S,
     RESYNC_AFTER_S,
     SESSIONS_PER_HEARTBEAT,
@@ -177,7 +178,7 @@ def test_resyncs_with_control_after_a_stall(control: FakeControl, worker: Worker
     with Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
         sender.send(Progress(level_db=0.0))
-        time.sleep(RESYNC_AFTER_S + 0.1)
+        time.sleep(HEARTBEAT_S + RESYNC_AFTER_S + 0.1)
         control.stops = ["s0"]
         run_until(worker, lambda: "input" in worker.happened)
     assert worker.happened[:2] == ["stop s0", "input"]
@@ -190,7 +191,7 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     control.stops = ["s0"]
 
     def stall(*_: object) -> None:
-        time.sleep(RESYNC_AFTER_S + 0.1)
+        time.sleep(HEARTBEAT_S + RESYNC_AFTER_S + 0.1)
         worker.happened.append("input")
 
     worker._handlers[worker.input][Progress] = stall

@@ -37,6 +37,7 @@ def worker(service: str, instance: str, state: str = "ready") -> Heartbeat:
         endpoints={name: f"tcp://{instance}:{name}" for name in PROVIDES[service]},
         needs=NEEDS[service],
         facts=FACTS[service],
+        sessions={"mine": SessionInput()},
     )
 
 
@@ -280,3 +281,12 @@ def test_distinguishes_a_restarted_worker_from_the_crashed_one(system: System) -
     assert not system.registry.reclaim_lost("recognizer-1", Peer(b"restarted")), (
         "it is not the same"
     )
+
+
+def test_a_heartbeat_without_sessions_may_be_older(system: System) -> None:
+    system.add(replace(worker("synthesizer", "synthesizer-1"), sessions={}))
+    assert system.registry.overdue_s() == pytest.approx(3.0)
+    system.add(worker("recognizer", "recognizer-1"), 1.0)
+    assert system.registry.overdue_s() == pytest.approx(3.75)
+    assert system.registry.overdue(3.7) == []
+    assert system.registry.overdue(3.8) == ["synthesizer-1"]
