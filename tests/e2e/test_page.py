@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import socket
 import subprocess
 import sys
@@ -33,6 +34,7 @@ PAGE = ROOT / "services" / "gateway" / "page"
 HEADS = {"woman": PAGE / "head.glb", "man": PAGE / "head-man.glb"}
 NOTICE = "document.getElementById('notice').textContent"
 STATE = "window.kouxing.state"
+IS_BEHIND = "document.getElementById('status').dataset.state === 'behind'"
 IS_BACK = f"!{STATE}.microphone && {STATE}.session === 'seen'"  # the microphone is off
 # Rows 15 (a) and 13 (b) of the Mandarin viseme table: FAP number to value.
 FAP_COLUMNS = [*range(3, 15), 16, 17, 44, 45, 46, 47, *range(51, 61)]
@@ -240,8 +242,9 @@ def test_the_caption_shows_syllables_or_phones(
 def test_sound_starts_with_a_click_and_waits_for_its_image(audible: Browser) -> None:
     played = audible.evaluate(f"{STATE}.soundSamplesPlayed")
     audible.wait_for(f"{STATE}.soundSamplesPlayed > {played + 16000}")
-    audible.wait_for("document.getElementById('delay').textContent.startsWith('sound delay')")
-    assert audible.evaluate(f"{STATE}.playoutDelayMs") > LOOK_AHEAD_MS - 20
+    text = "document.getElementById('delay').textContent"
+    audible.wait_for(f"{text}.startsWith('sound delay') || {IS_BEHIND}")  # a busy machine
+    audible.wait_for(f"{STATE}.playoutDelayMs > {LOOK_AHEAD_MS - 20}")
 
 
 def test_senders_are_started_delayed_to_match_the_sound_and_stopped(audible: Browser) -> None:
@@ -278,6 +281,22 @@ def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
     page.wait_for(f"Math.abs({STATE}.soundMinusPictureMs) < 15")
     control.look_ahead_ms = LOOK_AHEAD_MS
     page.evaluate("window.requestAnimationFrame = window.tick; window.ticks.forEach(tick)")
+
+
+def test_reports_a_face_that_is_behind_and_draws_fewer_pictures(
+    control: PageControl, audible: Browser
+) -> None:
+    page = audible
+    control.look_ahead_ms = LOOK_AHEAD_MS + 2010
+    page.wait_for(f"{IS_BEHIND} && {STATE}.lateMs > 1500")
+    status = page.evaluate("document.getElementById('status').textContent")
+    assert re.search(r"behind: this computer is busy +\d\.\d s", status), status
+    page.click("fewer-pictures")
+    page.wait_for("!document.getElementById('all-pictures').hidden")
+    page.evaluate("document.getElementById('all-pictures').click()")
+    page.wait_for("document.getElementById('all-pictures').hidden")
+    control.look_ahead_ms = LOOK_AHEAD_MS
+    page.wait_for(f"{STATE}.lateMs < 1500")
 
 
 def test_the_microphone_reaches_the_recognizer(
@@ -527,6 +546,6 @@ def test_reconnects_when_the_gateway_restarts(
 ) -> None:
     assert gateway.stop() == 0
     page.wait_for(f"{NOTICE}.includes('The gateway has stopped')")
-    assert "connecting" in page.evaluate("document.getElementById('status').textContent")
+    assert "disconnected" in page.evaluate("document.getElementById('status').textContent")
     gateway.start()
     page.wait_for(f"{STATE}.connected")

@@ -44,3 +44,22 @@ test("the delay of an image includes half of the time for which it is visible", 
   drawRate.recordVisible(5500, 60000); // the page is hidden
   assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
 });
+
+test("the user can halve the number of images, down to about 4 a second", () => {
+  for (const [drawRate, rates] of [
+    [new DrawRate(2, 2, false), [60, 30, 15, 7.5, 3.75]],
+    [new DrawRate(0.35, 0.35, true), [20, 10, 5]],
+  ]) {
+    let fromMs = 0;
+    for (const rate of rates) {
+      assert.equal(drawRate.isReduced, rate < rates[0]);
+      const perSecond = draw(drawRate, { fullMs: 0, minMs: rates[0] === 20 ? 26 : 5, fromMs });
+      assert.ok(Math.abs(perSecond - rate) <= 0.2 * rate, `${perSecond} instead of ${rate}`);
+      assert.equal(drawRate.canHalve, rate !== rates.at(-1));
+      drawRate.halve();
+      fromMs += 10000;
+    }
+    drawRate.restore();
+    assert.ok(draw(drawRate, { fullMs: 0, minMs: 5, fromMs }) > 50);
+  }
+});

@@ -13,8 +13,8 @@ import {
   errorText,
   hintText,
   playoutDelaysText,
-  stateKind,
-  stateText,
+  secondsText,
+  stateKey,
   turnText,
 } from "../../services/gateway/page/status.js";
 
@@ -89,13 +89,13 @@ test("an idle face without sound is not live", () => {
 
 test("the state is shown with the delay", () => {
   const state = { isConnected: true, isLive: true, isInterrupted: true };
-  assert.equal(stateText(state), "live");
-  assert.equal(stateText({ ...state, isLive: false }), "interrupted");
-  assert.equal(stateText({ ...state, isLive: false, isInterrupted: false }), "waiting for speech");
-  assert.equal(stateText({ ...state, isConnected: false }), "connecting …");
-  assert.equal(stateKind(state), "live");
-  assert.equal(stateKind({ ...state, isLive: false }), "waiting");
-  assert.equal(stateKind({ ...state, isConnected: false }), "lost");
+  assert.equal(stateKey(state), "live");
+  assert.equal(stateKey({ ...state, isBehind: true }), "behind");
+  assert.equal(stateKey({ ...state, isLive: false }), "interrupted");
+  assert.equal(stateKey({ ...state, isLive: false, isInterrupted: false }), "waiting");
+  assert.equal(stateKey({ ...state, isConnected: false }), "disconnected");
+  assert.equal(stateKey({ ...state, isConnected: false, isStarting: true }), "connecting");
+  assert.equal(secondsText(1234), "1.2 s");
   assert.deepEqual([delayText(null, null), delayText(123.4, 200)], ["", "120 ms"]);
   assert.equal(delayText(null, 161), "sound delay 160 ms");
   assert.equal(playoutDelaysText(161, null), "");

@@ -16,7 +16,7 @@ class Stream:
         self.meter = LatenessMeter()
         self.now_s = now_s
         self._time_s = 0.0
-        self._speed = speed  # of the client's clock
+        self._speed = speed  # of media time
 
     def run(self, duration_s: float, late_s: float = 0.0) -> None:
         """Send frames, each late by the same time."""
@@ -38,35 +38,34 @@ def test_frames_are_late_by_what_they_exceed_the_earliest_frame() -> None:
     stream.run(9.0)
     stream.run(0.9, late_s=0.1)
     stream.run(0.1, late_s=2.0)
-    assert stream.late_ms() == pytest.approx((0.0, 100.0, 2000.0), abs=40.0)
+    assert stream.late_ms() == pytest.approx((0.0, 100.0, 2000.0), abs=10.0)
 
 
 def test_only_the_last_ten_seconds_count() -> None:
     stream = Stream()
     stream.run(5.0, late_s=0.5)
-    stream.run(10.5)
+    stream.run(11.0)
     assert max(stream.late_ms()) < 1.0
     assert stream.meter.percentiles_ms(stream.now_s + 20.0) is None
 
 
-@pytest.mark.parametrize("speed", [0.991, 1.0, 1.009])
-def test_the_drift_of_a_clients_clock_is_no_lateness(speed: float) -> None:
+def test_a_growing_delay_stays_visible() -> None:
+    stream = Stream(speed=0.7)  # 7 s of frames in 10 s
+    stream.run(60.0)
+    assert stream.late_ms() == pytest.approx((1500.0, 2850.0, 3000.0), abs=100.0)
+
+
+@pytest.mark.parametrize("speed", [0.9998, 1.0002])
+def test_the_clocks_of_client_and_host_may_differ(speed: float) -> None:
     stream = Stream(speed=speed)
-    stream.run(120.0)
-    assert max(stream.late_ms()) < 1.0
-
-
-def test_a_long_overload_stays_visible() -> None:
-    stream = Stream()
-    stream.run(1.0)
-    stream.run(60.0, late_s=2.0)
-    assert stream.late_ms()[0] > 1000.0
+    stream.run(60.0)
+    assert max(stream.late_ms()) < 3.0
 
 
 def test_a_pause_of_the_audio_is_no_lateness() -> None:
     stream = Stream()
     stream.run(1.0)
-    stream.now_s += 30.0
+    stream.now_s += 5.0
     stream.meter.pause()
     stream.run(1.0)
     assert max(stream.late_ms()) < 1.0

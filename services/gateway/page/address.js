@@ -22,3 +22,8 @@ export function socketUrl(path, fields) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   return `${scheme}://${location.host}${pathOf(path, fields)}`;
 }
+
+/** Return whether the gateway runs on this computer, as far as the page's URL shows. */
+export function isThisComputer() {
+  return ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
+}

@@ -12,6 +12,7 @@ const MAX_DELAY_MS = 1000; // after a longer delay the page was hidden
 const WINDOW_MS = 2000; // over which delays are measured
 const TOLERANCE_MS = 8; // half a tick of the display; an image starts later than its tick
 const PERIOD_MS = 50; // 20 images per second
+const TICK_MS = 1000 / 60;
 const POLL_MS = 2; // interval of checking whether an image is done
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const MIN_REST_MS = 10;
@@ -28,6 +29,7 @@ export class DrawRate {
   #tookMs = 0;
   #numImages = 0;
   #visibleMs = -Infinity; // when the last image became visible
+  #minPeriodMs = 0; // between two images, by the user's choice
   #shownMs = 0; // for how long an image is visible
   #delays = new SlidingWindow(WINDOW_MS); // until images were visible, ms
 
@@ -45,9 +47,28 @@ export class DrawRate {
 
   /** Whether it is time for the next image, if the last one is done. */
   isDue(nowMs) {
-    if (!this.#rests) return true;
-    const restMs = Math.min(this.#tookMs, Math.max(PERIOD_MS - this.#tookMs, MIN_REST_MS));
-    return nowMs - this.#startMs >= this.#tookMs + restMs - TOLERANCE_MS;
+    const periodMs = this.#rests ? restingPeriodMs(this.#tookMs) : 0;
+    return nowMs - this.#startMs >= Math.max(periodMs, this.#minPeriodMs) - TOLERANCE_MS;
+  }
+
+  /** Whether the user may halve the number of images, again. */
+  get canHalve() {
+    return this.#minPeriodMs < MAX_SHOWN_MS;
+  }
+
+  get isReduced() {
+    return this.#minPeriodMs > 0;
+  }
+
+  /** Draw half as many images. */
+  halve() {
+    const periodMs = this.#rests ? restingPeriodMs(this.imageMs) : this.imageMs;
+    this.#minPeriodMs = 2 * Math.max(periodMs, this.#minPeriodMs, TICK_MS);
+  }
+
+  /** Undo all halving. */
+  restore() {
+    this.#minPeriodMs = 0;
   }
 
   /** Record an image that was drawn. The ratio may change. */
@@ -72,6 +93,11 @@ export class DrawRate {
     this.#delays.add(visibleMs, visibleMs - faceMs + this.#shownMs / 2);
     this.visibleDelayMs = this.#delays.percentile(0.5);
   }
+}
+
+/** Return the time between two images of which each takes a time, with a pause after each, ms. */
+function restingPeriodMs(tookMs) {
+  return tookMs + Math.min(tookMs, Math.max(PERIOD_MS - tookMs, MIN_REST_MS));
 }
 
 /** Return whether the processor draws instead of a graphics card. */

@@ -150,6 +150,11 @@ export class Head {
     return { left: radToDeg(view.theta - front.theta), up: radToDeg(view.phi - front.phi) };
   }
 
+  /** Decides how many images are drawn. */
+  get drawRate() {
+    return this.#drawRate;
+  }
+
   /** How long after drawing starts an image is visible, ms, to the middle of its time. */
   get visibleDelayMs() {
     return this.#drawRate.visibleDelayMs;

@@ -186,6 +186,7 @@ window.kouxing = {
       numFrames: player.numFrames,
       faps: Array.from(player.faps),
       mediaTime: player.playout.mediaAt(performance.now()),
+      lateMs: player.lateness.recentMs,
       playoutDelayMs: player.playout.delayMs,
       frameWaitMs: player.playout.frameWaitMs,
       voiceToFrameMs: player.voiceToFrameMs,

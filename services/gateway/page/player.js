@@ -1,5 +1,6 @@
 // Plays the session that is shown: it keeps sound and image in sync and computes the face that is due.
 
+import { Lateness } from "./lateness.js";
 import { NUM_FAPS } from "./messages.js";
 import { FapTrack, Playout } from "./playout.js";
 import { SlidingWindow } from "./sliding-window.js";
@@ -14,6 +15,7 @@ export class Player {
   numFrames = 0; // received
   #track = new FapTrack();
   activity = new StreamActivity();
+  lateness = new Lateness();
   #streamFaps;
   #imageDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to the image
   #frameDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to its frame
@@ -38,6 +40,7 @@ export class Player {
   reset() {
     this.playout.reset();
     this.#track.reset();
+    this.lateness = new Lateness();
     this.#imageDelays.reset();
     this.#frameDelays.reset();
   }
@@ -46,6 +49,7 @@ export class Player {
     const nowMs = performance.now();
     if (this.#track.push(mediaTime, faps)) this.playout.frameArrived(nowMs, mediaTime);
     this.activity.frameArrived(nowMs);
+    this.lateness.frameArrived(nowMs, mediaTime);
     this.#addVoiceAge(this.#frameDelays, nowMs, mediaTime);
     this.numFrames++;
   }

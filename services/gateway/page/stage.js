@@ -72,6 +72,8 @@ export class Stage {
     this.#sound = sound;
     this.#handlers = handlers;
     element("record").onclick = () => this.#toggleRecording();
+    element("fewer-pictures").onclick = () => this.#changeDrawRate((drawRate) => drawRate.halve());
+    element("all-pictures").onclick = () => this.#changeDrawRate((drawRate) => drawRate.restore());
     element("head").onkeydown = (event) => {
       if (this.#head === null || TURN_DEGREES[event.key] === undefined) return;
       event.preventDefault();
@@ -104,9 +106,16 @@ export class Stage {
     this.#head?.draw(nowMs, onVisible);
   }
 
-  /** Show how the head is drawn, if that is not at full quality. */
+  #changeDrawRate(change) {
+    change(this.#head.drawRate);
+    this.showDrawing();
+  }
+
+  /** Show how the head is drawn, if that is not at full quality, and what can be changed. */
   showDrawing() {
     if (this.#head === null) return;
+    element("fewer-pictures").hidden = !this.#head.drawRate.canHalve;
+    element("all-pictures").hidden = !this.#head.drawRate.isReduced;
     const text = drawingText(this.#head.drawing);
     element("head").title = text;
     setText(element("drawing"), text);

@@ -1,5 +1,6 @@
 // The page's state: texts, the status line, the sound level, notices, and hints about problems.
 
+import { isThisComputer } from "./address.js";
 import { element, setText } from "./elements.js";
 import { say, sayReceived } from "./language.js";
 import { SILENT_DB } from "./level.js";
@@ -21,6 +22,11 @@ export class GatewayState {
   /** Whether the gateway refused the first connection, although it served this page. */
   isRefused = false;
 
+  /** Whether the first connection is being made. */
+  get isStarting() {
+    return !this.wasConnected && !this.isRefused;
+  }
+
   setConnected(isConnected) {
     this.isConnected = isConnected;
     this.wasConnected ||= isConnected;
@@ -40,17 +46,14 @@ export class GatewayState {
   }
 }
 
-/** Return the kind of state, which colors the status light: "lost", "waiting" or "live". */
-export function stateKind({ isConnected, isLive }) {
-  if (!isConnected) return "lost";
-  return isLive ? "live" : "waiting";
-}
-
-/** Return the text of the state. isInterrupted: our microphone should be live. */
-export function stateText({ isConnected, isLive, isInterrupted }) {
-  if (!isConnected) return say("connecting");
-  if (isLive) return say("live");
-  return say(isInterrupted ? "interrupted" : "waiting");
+/**
+ * Return the state, a key of TEXTS. It also colors the status light. isInterrupted: our microphone
+ * should be live.
+ */
+export function stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted }) {
+  if (!isConnected) return isStarting ? "connecting" : "disconnected";
+  if (isLive) return isBehind ? "behind" : "live";
+  return isInterrupted ? "interrupted" : "waiting";
 }
 
 /**
@@ -60,6 +63,11 @@ export function stateText({ isConnected, isLive, isInterrupted }) {
 export function delayText(voiceMs, soundMs) {
   if (voiceMs !== null) return `${roundToTens(voiceMs)} ms`;
   return soundMs === null ? "" : say("soundDelay", { ms: roundToTens(soundMs) });
+}
+
+/** Return the text of a delay of seconds; tenths are enough, and change less often. */
+export function secondsText(ms) {
+  return say("seconds", { seconds: (ms / 1000).toFixed(1) });
 }
 
 /** Return the text of the delays of sound and of frames until their image; "" while unknown. */
@@ -150,24 +158,29 @@ export class StatusBar {
 
   show() {
     const { gateway, player, speech, sound, notice, senders } = this.#parts;
-    const { isConnected, session } = gateway;
-    const isLive = isConnected && player.activity.isLive(performance.now());
+    const { isConnected, isStarting, session } = gateway;
+    const nowMs = performance.now();
+    const isLive = isConnected && player.activity.isLive(nowMs);
     this.#wasLive ||= isLive;
     const isMicrophoneInterrupted = speech.state === "interrupted";
     const isStalled = this.#wasLive && session !== null && session === speech.session;
     const isInterrupted = isMicrophoneInterrupted || isStalled;
-    element("status").dataset.state = stateKind({ isConnected, isLive });
+    player.lateness.update(nowMs, isLive && session !== null);
+    const { isBehind, recentMs } = player.lateness;
+    const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
+    element("status").dataset.state = state;
     element("status").title = session === null ? "" : say("sessionName", { name: session });
-    setText(element("state"), stateText({ isConnected, isLive, isInterrupted }));
+    setText(element("state"), say(isBehind && isThisComputer() ? "behindBusy" : state));
+    element("behind").hidden = !isBehind;
 
     const { playout, voiceToImageMs } = player;
     const isAudible = isLive && sound.state === "on";
     const soundMs = isAudible ? playout.delayMs : null;
     const frameMs = isAudible ? playout.frameWaitMs : null;
-    setText(element("delay"), isLive ? delayText(voiceToImageMs, soundMs) : "");
+    const delay = isBehind ? secondsText(recentMs) : delayText(voiceToImageMs, soundMs);
+    setText(element("delay"), isLive ? delay : "");
     setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
     senders.frameWaitMs = frameMs;
-    const nowMs = performance.now();
     const fault = this.#fault.update(nowMs, hintText(gateway));
     const pause = isMicrophoneInterrupted ? say("microphoneInterrupted") : "";
     const microphone = this.#microphoneFault.update(nowMs, pause);

@@ -26,8 +26,12 @@ export const TEXTS = {
 
   // Status
   sessionName: { en: "session {name}", zh: "会话 {name}" },
+  disconnected: { en: "disconnected", zh: "已断开" },
   connecting: { en: "connecting …", zh: "连接中…" },
   live: { en: "live", zh: "直播" },
+  behind: { en: "behind", zh: "滞后" },
+  behindBusy: { en: "behind: this computer is busy", zh: "滞后：这台电脑很忙" },
+  seconds: { en: "{seconds} s", zh: "{seconds} 秒" },
   interrupted: { en: "interrupted", zh: "中断" },
   waiting: { en: "waiting for speech", zh: "等待语音" },
   soundDelay: { en: "sound delay {ms} ms", zh: "声音延迟 {ms} ms" },
@@ -39,6 +43,11 @@ export const TEXTS = {
   turnedDown: { en: "{degrees}° down", zh: "向下 {degrees}°" },
 
   // Hints: what is wrong, and what to do
+  closePrograms: {
+    en: "Close other programs, and other windows that show this page.",
+    zh: "请关闭其他程序，以及显示本页的其他窗口。",
+  },
+  fewerPictures: { en: "Draw fewer pictures", zh: "减少画面" },
   gatewayStopped: {
     en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
     zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
@@ -109,6 +118,7 @@ export const TEXTS = {
     en: "No graphics card was found, so the head has fewer triangles and pixels: {size}",
     zh: "没有显卡，画面已简化：{size} 像素",
   },
+  allPictures: { en: "Draw all pictures again", zh: "恢复全部画面" },
   lips: { en: "Lips", zh: "口型" },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
   expression: { en: "Expression", zh: "表情" },

@@ -1,0 +1,49 @@
+// How far a live stream is behind, and whether the page says so. Time is injected.
+
+import { SlidingWindow } from "./sliding-window.js";
+import { SAMPLES_PER_MS } from "./playout.js";
+
+const WINDOW_MS = 10000; // as in services/synthesizer/lateness.py
+const LATE_MS = 300;
+const SHOWN_AFTER_MS = 1000; // of late frames
+const OVER_AFTER_MS = 2000; // of frames in time
+const RECENT_MS = 1000; // window of the lateness that is shown
+
+/**
+ * The lateness of the newest frame. A live client sends audio in real time. The arrival of a frame
+ * minus its media time is therefore constant for frames in time, and greater for late frames. Frames
+ * are compared with the earliest one of the last 10 s: clocks differ, and a client may lose audio.
+ */
+export class Lateness {
+  isBehind = false; // whether frames have been late for some time
+  #newest = -1; // media time, samples
+  #differences = new SlidingWindow(WINDOW_MS); // arrival - media time, ms
+  #recent = new SlidingWindow(RECENT_MS); // lateness, ms
+  #agreedMs = null; // when the frames last agreed with isBehind
+
+  /** Record the arrival of a frame. Media time stands still while the client sends no audio. */
+  frameArrived(nowMs, mediaTime) {
+    if (mediaTime === this.#newest) this.#differences.reset();
+    if (mediaTime <= this.#newest) return;
+    this.#newest = mediaTime;
+    this.#differences.add(nowMs, nowMs - mediaTime / SAMPLES_PER_MS);
+  }
+
+  /** Update isBehind; call this regularly. isLive: whether frames and sound arrive. */
+  update(nowMs, isLive) {
+    const differenceMs = nowMs - this.#newest / SAMPLES_PER_MS;
+    const lateMs = isLive ? Math.max(0, differenceMs - this.#differences.min) : 0;
+    this.#recent.add(nowMs, lateMs);
+    const isLate = lateMs > LATE_MS;
+    if (!isLive) this.isBehind = false;
+    if (!isLive || isLate === this.isBehind) this.#agreedMs = nowMs;
+    this.#agreedMs ??= nowMs;
+    const waitMs = isLate ? SHOWN_AFTER_MS : OVER_AFTER_MS;
+    if (nowMs - this.#agreedMs >= waitMs) this.isBehind = isLate;
+  }
+
+  /** The greatest lateness of the last second, ms. */
+  get recentMs() {
+    return this.#recent.percentile(1);
+  }
+}
