@@ -25,6 +25,8 @@ import zmq
 
 from kouxing.shared import kernel_sockets
 from kouxing.shared.arrivals import Arrivals
+from kouxing.shared.budget import BUDGET, MIN_BUDGET, Budget
+from kouxing.shared.connection_quota import ConnectionQuota
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
@@ -40,16 +42,10 @@ SMALL_INCOMPLETE = 4 * KIB  # of each connection, in addition
 MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
-MAX_CONNECTIONS = 1024
-MAX_SHARE = 0.75  # of all connections, for one key or, until the key is known, one address
-SERVICES_SHARE = 0.1  # of all connections, reserved for services
-RESERVED_FILES = 256  # for models, pages and outgoing connections
+MAX_ENDED = 1024  # connections that a service has not noticed yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
-BUDGET = 5000.0  # of a connection
-BUDGET_PER_S = 500.0
-MIN_BUDGET = 100.0  # of a new connection: enough for an honest client of a key that was misused
 PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
@@ -81,26 +77,6 @@ class Limits:
     def message_bytes(self) -> int:
         """Bytes of an incomplete message, with those that libzmq reads at once."""
         return self.part_bytes + 16 * KIB
-
-
-class Budget:
-    """How much work a peer may still cause; it recovers with time."""
-
-    def __init__(self, left: float = BUDGET, clock: Callable[[], float] = time.monotonic) -> None:
-        self._left, self._clock, self._since_s = left, clock, clock()
-
-    @property
-    def left(self) -> float:
-        """What may be spent now; negative after too much was spent."""
-        return min(BUDGET, self._left + (self._clock() - self._since_s) * BUDGET_PER_S)
-
-    def spend(self, cost: float) -> None:
-        """Reduce the budget."""
-        self._left, self._since_s = self.left - cost, self._clock()
-
-    def block(self, seconds: float) -> None:
-        """Keep the budget negative for some time."""
-        self._left, self._since_s = min(self.left, -seconds * BUDGET_PER_S), self._clock()
 
 
 class Connection:
@@ -195,7 +171,7 @@ class LimitedSocket:
         self.port = 0  # 0 until it is bound
         self.num_sent = 0  # messages, to all peers
         self.num_polls = 0  # times that all complete messages had been delivered
-        self.ended: deque[int] = deque(maxlen=MAX_CONNECTIONS)  # inodes of ended connections
+        self.ended: deque[int] = deque(maxlen=MAX_ENDED)  # inodes of ended connections
         self.limiter = limiter
         self._monitor = monitor
 
@@ -254,8 +230,7 @@ class LimitedSocket:
 class ConnectionLimiter:
     """Watches the connections to all bound sockets of a process.
 
-    It allows ``extra_connections`` in addition to ``MAX_CONNECTIONS``. ``is_service`` returns
-    whether a key belongs to a service.
+    ``extra_connections`` and ``is_service`` are those of ``ConnectionQuota``.
     """
 
     def __init__(
@@ -263,9 +238,7 @@ class ConnectionLimiter:
         extra_connections: int = 0,
         is_service: Callable[[str], bool] = lambda key: False,
     ) -> None:
-        self._extra_connections = extra_connections
-        self._is_service = is_service
-        self._max_connections = 0
+        self._quota = ConnectionQuota(extra_connections, is_service)
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
@@ -291,9 +264,6 @@ class ConnectionLimiter:
         socket = LimitedSocket(self, limits, monitor)
         self._sockets.append(socket)
         if not self._thread.is_alive():
-            max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-            wanted = MAX_CONNECTIONS + self._extra_connections
-            self._max_connections = max(1, min(wanted, max_files - RESERVED_FILES))
             self._thread.start()
         return socket
 
@@ -376,7 +346,8 @@ class ConnectionLimiter:
                 self.find(descriptor, socket)
         has_ended = self._forget_ended(now_s)
         connections = [c for c in list(self._connections.values()) if not c.is_cut]
-        self._limit_number(connections)
+        for connection, reason in self._quota.excess(connections):
+            connection.disconnect(reason)
         for connection in connections:
             connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
         _disconnect_heaviest(
@@ -394,41 +365,6 @@ class ConnectionLimiter:
             del self._trims_s[0]
             self._num_ended = 0
             trim_heap()
-
-    def _limit_number(self, connections: list[Connection]) -> None:
-        """Disconnect some peers if there are too many: silent ones first, services last.
-
-        The owner with the most connections first loses its oldest silent one, else its newest one.
-        """
-        max_shared = MAX_SHARE * self._max_connections
-        if len(connections) <= max_shared:
-            return
-        max_others = (1 - SERVICES_SHARE) * self._max_connections
-        silent: list[Connection] = []
-        known: list[Connection] = []
-        services: list[Connection] = []
-        for connection in connections:
-            is_service = self._is_service(connection.key)
-            is_known = connection.num_delivered > 0
-            (services if is_service else known if is_known else silent).append(connection)
-        ranks: dict[Connection, int] = {}
-        shares: Counter[str] = Counter()
-        for connection in (*services, *known, *reversed(silent)):
-            shares[connection.owner] += 1
-            ranks[connection] = -shares[connection.owner]
-        known.reverse()  # of owners with equal shares, the newest connection is first
-        others = [*sorted(silent, key=ranks.__getitem__), *sorted(known, key=ranks.__getitem__)]
-        max_services = self._max_connections - min(len(others), max_others)
-        services.sort(key=ranks.__getitem__)
-        for group, max_number in ((others, max_others), (services, max_services)):
-            num_excess = len(group) - max_number
-            for connection in group:
-                if num_excess > 0:
-                    connection.disconnect("too many connections")
-                elif -ranks[connection] > max_shared:
-                    owner = "key" if connection.key else "address"
-                    connection.disconnect(f"its {owner} has too many connections")
-                num_excess -= connection.is_cut
 
     def _forget_ended(self, now_s: float) -> bool:
         """Forget the connections that have ended; return whether there are any."""

@@ -79,6 +79,7 @@ class ControlService(Service):
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
         self._num_events = 0
+        self._keys_version = (0, 0)  # whose revoked keys have no sessions
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._sleep_s = 0.0  # planned time until the next tick
         self._move_repeats = MoveRepeats()
@@ -122,7 +123,9 @@ class ControlService(Service):
         self._registry.exclude_pause(pause_s - MAX_PAUSE_S)
         if self.bus.zap is not None:
             self.bus.zap.refresh()
-            self._end_revoked_sessions()
+            if self.bus.zap.version != self._keys_version:
+                self._keys_version = self.bus.zap.version
+                self._end_revoked_sessions()
         if self._takeover.is_active and now_s > self._takeover.end_s:
             self._takeover.is_active = self._requests.defers = False
             self._restore_sessions()
@@ -356,6 +359,7 @@ class ControlService(Service):
             self._send_start(record, record.waiting_for | uninformed)
             if record.lost:
                 self._move_session(record)
+        self._end_revoked_sessions()
         self._requests.retry_deferred()
 
     def _send_start(self, record: SessionRecord, instances: set[str]) -> None:

@@ -8,17 +8,14 @@ from unittest import mock
 
 import pytest
 
-from kouxing.shared import connections, kernel_sockets
+from kouxing.shared import connection_quota, connections, kernel_sockets
+from kouxing.shared.budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, Budget
 from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
-    BUDGET,
-    BUDGET_PER_S,
     MAX_QUEUED,
-    MIN_BUDGET,
     NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
     TRIMS_S,
-    Budget,
     Connection,
     ConnectionLimiter,
 )
@@ -38,7 +35,7 @@ class Scene:
         patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 5560)
         patch.setattr(kernel_sockets, "address_of", lambda d: self.addresses.get(d, "loopback"))
         patch.setattr(kernel_sockets, "traffic_of", lambda d: self.traffic.get(d, Traffic()))
-        patch.setattr(connections, "MAX_CONNECTIONS", 10)
+        patch.setattr(connection_quota, "MAX_CONNECTIONS", 10)
         patch.setattr("threading.Thread.start", lambda _thread: None)
         self.limiter = ConnectionLimiter(is_service=lambda key: key == "service")
         monitor = SimpleNamespace(getsockopt=lambda _option: 10**6)
@@ -122,8 +119,7 @@ def test_one_peer_cannot_take_all_connections(scene: Scene, key: str) -> None:
     assert [connection.is_cut for connection in made] == [False] * 7 + [True] * 2
 
 
-def test_services_and_other_keys_of_a_machine_keep_their_connections(scene: Scene) -> None:
-    scene.limiter._max_connections = 20
+def test_clients_cannot_take_the_places_of_services_or_of_other_keys(scene: Scene) -> None:
     honest = [scene.deliver(1, "service"), scene.deliver(2, "laptop")]
     for number in range(10, 40):
         scene.deliver(number, f"flood {number % 2}")
@@ -131,15 +127,25 @@ def test_services_and_other_keys_of_a_machine_keep_their_connections(scene: Scen
     honest += [scene.deliver(3, "service"), scene.deliver(4, "laptop")]
     scene.enforce_limits(0.0)
     assert not any(connection.is_cut for connection in honest)
-    assert len(scene.limiter.connections_to(scene.socket)) == 20
+    assert len(scene.limiter.connections_to(scene.socket)) == 10 + 2
+
+
+def test_services_can_use_the_places_of_clients(scene: Scene) -> None:
+    services = [scene.deliver(number, "service") for number in range(20)]
+    scene.enforce_limits(0.0)
+    assert [connection.is_cut for connection in services] == [False] * 15 + [True] * 5
+    for number in range(20, 30):
+        scene.deliver(number, f"key {number}")
+    scene.enforce_limits(0.0)
+    assert len(scene.limiter.connections_to(scene.socket)) == 17
 
 
 def test_silent_connections_make_room(scene: Scene) -> None:
     scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
-    silent = [scene.limiter.find(number, scene.socket) for number in range(9)]
-    talker = scene.deliver(9, "talker")
+    silent = [scene.limiter.find(number, scene.socket) for number in range(10)]
+    talker = scene.deliver(10, "talker")
     scene.enforce_limits(0.0)
-    assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 8
+    assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 9
     assert not talker.is_cut
 
 

@@ -1,0 +1,63 @@
+"""How many connections a process allows, and which ones end if there are more."""
+
+from __future__ import annotations
+
+import resource
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from kouxing.shared.connections import Connection
+
+MAX_CONNECTIONS = 512  # of clients; libzmq takes up to 0.1 MB for each
+MAX_SHARE = 0.75  # of them, for one key or, until the key is known, one address
+RESERVED_FILES = 256  # for models, pages and outgoing connections
+
+
+class ConnectionQuota:
+    """Limits the connections of clients and of services.
+
+    Clients have ``MAX_CONNECTIONS`` and ``extra_connections``. Services have the same number, and
+    those that clients do not use. ``is_service`` returns whether a key belongs to a service.
+    """
+
+    def __init__(self, extra_connections: int, is_service: Callable[[str], bool]) -> None:
+        max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        max_clients = min(MAX_CONNECTIONS + extra_connections, (max_files - RESERVED_FILES) // 2)
+        self._max_clients = max(1, max_clients)
+        self._is_service = is_service
+
+    def excess(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, str]]:
+        """Yield the connections that must end, and the reason.
+
+        ``connections`` start with the oldest one. Silent ones end first, those of the owner with
+        the most connections before others. An owner first loses its oldest silent connection,
+        then its newest one.
+        """
+        if len(connections) <= MAX_SHARE * self._max_clients:
+            return
+        services, known, silent = [], [], []
+        for connection in connections:
+            if not connection.num_delivered:
+                silent.append(connection)
+            elif self._is_service(connection.key):
+                services.append(connection)
+            else:
+                known.append(connection)
+        silent.reverse()
+        places: dict[Connection, int] = {}  # of each connection among those of its owner, from 1
+        nums: Counter[str] = Counter()
+        for connection in (*services, *known, *silent):
+            nums[connection.owner] += 1
+            places[connection] = nums[connection.owner]
+        clients = known + silent
+        max_services = 2 * self._max_clients - min(len(clients), self._max_clients)
+        for group, limit in ((clients, self._max_clients), (services, max_services)):
+            group.sort(key=lambda connection: (connection.num_delivered == 0, places[connection]))
+            for connection in reversed(group[limit:]):
+                yield connection, "too many connections"
+            for connection in group[:limit]:
+                if places[connection] > MAX_SHARE * limit:
+                    owner = "key" if connection.key else "address"
+                    yield connection, f"its {owner} has too many connections"
