@@ -143,7 +143,9 @@ def read_clips(
 
 
 def read_clip(path: Path) -> LipClip:
-    """Read one clip by the path of its ``.json``; UserError if it cannot be read."""
+    """Read one clip by the path of one of its files; UserError if it cannot be read."""
+    if path.suffix not in (".json", ".flac", ".csv"):
+        raise UserError(f"{path}: not a clip; give the .json file that kouxing track wrote")
     clip = _read_clip(path.with_suffix(".json"), None, any_license=True)
     assert clip is not None  # noqa: S101 - in any language
     return clip

@@ -428,9 +428,13 @@ def plot_heads(
     choices: Annotated[
         Path | None, typer.Option(help="Folder for a small picture of every head.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """Draw every head and every viseme, from the front and from 40 degrees."""
-    from kouxing.evaluation.head_pictures import draw_choices, draw_sheets
+    from kouxing.evaluation import head_pictures
 
-    for path in draw_sheets(folder) + (draw_choices(choices) if choices else []):
+    pictures = head_pictures.sheets(folder) | (head_pictures.choices(choices) if choices else {})
+    check_output(*(path for path in pictures if path.exists()), force=force)
+    for path, draw in pictures.items():
+        head_pictures.save(path, draw())
         print_message(f"wrote {path}")

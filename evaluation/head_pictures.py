@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,22 +36,40 @@ def _head_names() -> list[str]:
     return sorted(names, key=lambda name: (name != DEFAULT_HEAD, name))
 
 
-def draw_choices(folder: Path) -> list[Path]:
-    """Write ``head-NAME.webp`` for every head into a folder; return their paths."""
-    return [
-        _save(folder / f"head-{name}.webp", _picture(name, _REST, _CHOICE_PX))
+def sheets(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
+    """Return the files for the docs, ``heads.webp`` and ``faces.webp``, and what draws them."""
+    return {folder / "heads.webp": _draw_heads, folder / "faces.webp": _draw_visemes}
+
+
+def choices(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
+    """Return the files for the page, ``head-NAME.webp``, and what draws them."""
+    return {
+        folder / f"head-{name}.webp": partial(_picture, name, _REST, _CHOICE_PX)
         for name in _head_names()
-    ]
+    }
 
 
-def draw_sheets(folder: Path) -> list[Path]:
-    """Write ``heads.webp`` and ``faces.webp`` (every viseme) into a folder; return their paths."""
-    heads = [
-        [_labelled(_picture(name, _REST, _HEAD_PX, turn), name) for name in _head_names()]
-        for turn in _TURNS_DEG
-    ]
+def save(path: Path, image: Image.Image) -> None:
+    """Write a picture; raises ``UserError`` if this is impossible."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        image.save(path, quality=85)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _draw_heads() -> Image.Image:
+    return _sheet(
+        [
+            [_labelled(_picture(name, _REST, _HEAD_PX, turn), name) for name in _head_names()]
+            for turn in _TURNS_DEG
+        ]
+    )
+
+
+def _draw_visemes() -> Image.Image:
     visemes = list(VISEME_INDEX)
-    faces = [
+    rows = [
         [
             _labelled(_picture(DEFAULT_HEAD, _spoken(viseme), _VISEME_PX, turn), viseme)
             for viseme in visemes[at : at + _VISEMES_A_ROW]
@@ -57,8 +77,7 @@ def draw_sheets(folder: Path) -> list[Path]:
         for at in range(0, len(visemes), _VISEMES_A_ROW)
         for turn in _TURNS_DEG
     ]
-    sheets = {"heads.webp": heads, "faces.webp": faces}
-    return [_save(folder / name, _sheet(rows)) for name, rows in sheets.items()]
+    return _sheet(rows)
 
 
 def _spoken(viseme: str) -> Float32:
@@ -90,12 +109,3 @@ def _sheet(rows: list[list[Image.Image]]) -> Image.Image:
         for column, image in enumerate(images):
             sheet.paste(image, (width * column, height * row))
     return sheet
-
-
-def _save(path: Path, image: Image.Image) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        image.save(path, quality=85)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
-    return path

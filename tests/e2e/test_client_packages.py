@@ -90,6 +90,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (project / "package.json").write_text("{}", encoding="utf-8")
     npm(source, "pack", "--pack-destination", project)
     (package,) = project.glob("kouxing-client-*.tgz")
+    shutil.rmtree(source / "page")
+    npm(project, "install", "--offline", "--omit=peer", source)  # a link to the folder
+    assert {path.name for path in (source / "page").iterdir()} >= {"playout.js", "player.js"}
     npm(project, "install", "--offline", "--omit=peer", package)
     for module in ("three", "@pixiv"):
         (project / "node_modules" / module).symlink_to(JAVASCRIPT_CLIENT / "node_modules" / module)

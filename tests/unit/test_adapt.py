@@ -74,6 +74,11 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
             run(track_app, tmp_path / f"{name}.mp4", "-o", tmp_path / "out")
 
 
+def test_a_file_that_is_not_a_clip_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"notes.txt: not a clip; give the .json file"):
+        run(adapt_app, tmp_path / "notes.txt", "-o", tmp_path / "me.mouth")
+
+
 def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     """The mouth opens with the loudness of the sound."""
     sentences = [samples_of_file(DEMO / f"{name}.wav") for name in ("hello-female", "hello-male")]

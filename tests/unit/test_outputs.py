@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from kouxing.evaluation.commands import plot_heads
 from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.main import app
 from kouxing.shared.errors import UserError
@@ -29,6 +30,13 @@ def test_an_output_is_never_an_input(tmp_path: Path) -> None:
     link.symlink_to(source)
     with pytest.raises(UserError, match="the output is also an input"):
         check_output(link, inputs=[None, source, Path("a" * 5000)], force=True)
+
+
+def test_pictures_of_heads_are_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "faces.webp").write_bytes(b"mine")
+    with pytest.raises(UserError, match=r"faces.webp exists; add --force"):
+        plot_heads(tmp_path)
+    assert [*tmp_path.iterdir()] == [tmp_path / "faces.webp"]
 
 
 def test_standard_output_is_not_a_file() -> None:
