@@ -25,6 +25,14 @@ test("sound waits for its image and one more FAP frame", () => {
   assert.ok(Math.abs(silent.delayMs - 180) <= 5, "without sound, the face waits only for most frames");
 });
 
+test("sound waits for a slow loudspeaker", () => {
+  const playout = new Playout();
+  playout.outputLatencyMs = 600;
+  stream(playout, { forMs: 20000 });
+  assert.ok(Math.abs(playout.delayMs - 640) <= 20, `${playout.delayMs}`);
+  assert.ok(playout.frames.count > 400, "it did not start again");
+});
+
 test("a small error is corrected by gliding", () => {
   const playout = new Playout();
   stream(playout, { forMs: 10000 });
@@ -58,6 +66,26 @@ test("a burst after a network stall does not leave a lasting delay", () => {
   assert.ok(Math.abs(playout.delayMs - beforeMs) <= 30, `${playout.delayMs}`);
   stream(playout, { fromMs: 7000, forMs: 3000, clockMs: 5000 }); // the sender paused
   assert.ok(Math.abs(playout.delayMs - beforeMs) <= 30, `${playout.delayMs}`);
+});
+
+test("after a stall, the page is live within a second, however fast the delayed data arrives", () => {
+  for (const burstMs of [1, 100, 200, 400]) {
+    for (const isAudible of [true, false]) {
+      const playout = new Playout();
+      playout.isAudible = isAudible;
+      stream(playout, { forMs: 5000 });
+      const beforeMs = playout.offsetMs;
+      const arriveMs = (ms) => Math.max(ms, 8000 + ((ms - 5000) / 3000) * burstMs); // of a chunk
+      for (let ms = 5000; ms < 9000; ms += FRAME_MS) {
+        const nowMs = arriveMs(ms + FRAME_MS);
+        playout.soundArrived(nowMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
+        playout.frameArrived(nowMs, (ms - 60) * SAMPLES_PER_MS);
+        playout.adjust(nowMs);
+      }
+      const lateMs = playout.offsetMs - beforeMs;
+      assert.ok(Math.abs(lateMs) <= 60, `${lateMs} ms after ${burstMs} ms, ${isAudible}`);
+    }
+  }
 });
 
 test("faces between two frames are interpolated", () => {

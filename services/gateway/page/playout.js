@@ -17,8 +17,25 @@ const WINDOW_MS = 10000; // of the percentiles; long enough to ignore a single h
 const MIN_FRAMES = 20; // before the percentile is used
 const JUMP_MS = 300; // restart if the stream is late or early by more than this
 const LATE_MS = 100; // and late for this long; less than the delay, so that no sound is lost
+const EARLY_MS = 300; // or early for this long
+const START_MS = 300; // in which the earliest arrival sets the offset
 const MAX_BEHIND_MS = 3000; // restart at once if media time leaps ahead by more than this
 const MAX_FRAMES = 1000;
+
+/** For how long a condition has held. Time is injected. */
+class Streak {
+  #sinceMs = null;
+
+  get holds() {
+    return this.#sinceMs !== null;
+  }
+
+  /** Take the condition at a time; return for how long it has held without a break, ms. */
+  update(nowMs, holds) {
+    this.#sinceMs = holds ? (this.#sinceMs ?? nowMs) : null;
+    return holds ? nowMs - this.#sinceMs : 0;
+  }
+}
 
 /**
  * The playout clock.
@@ -31,7 +48,8 @@ const MAX_FRAMES = 1000;
  *
  * The drift of the network and of the clocks moves the target. The offset glides towards the target
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
- * half of it is corrected at once, every half second. So one bad second does not cause a leap.
+ * half of it is corrected at once, every half second. So one bad second does not cause a leap. After a
+ * stall, the delayed data arrives in a burst. It is not measured, so that the page is live at its end.
  */
 export class Playout {
   isAudible = true;
@@ -42,7 +60,9 @@ export class Playout {
   #targetMs = null; // of the offset
   #adjustedMs = 0; // when the target was set
   #glidedMs = 0; // when the offset was moved last
-  #lateSinceMs = null; // since when arrivals have been too late
+  #lateFrames;
+  #lateSound;
+  #earlyFrames;
 
   constructor() {
     this.reset();
@@ -52,7 +72,13 @@ export class Playout {
   reset() {
     this.offsetMs = null;
     this.#targetMs = null;
-    this.#lateSinceMs = null;
+    this.#lateFrames = new Streak();
+    this.#lateSound = new Streak();
+    this.#earlyFrames = new Streak();
+    this.#forgetArrivals();
+  }
+
+  #forgetArrivals() {
     // Lateness: arrival - media time, ms.
     this.frames = new SlidingWindow(WINDOW_MS);
     this.soundStarts = new SlidingWindow(WINDOW_MS);
@@ -79,19 +105,22 @@ export class Playout {
   /** Record the arrival of a frame. Its media time must be greater than that of the frame before. */
   frameArrived(nowMs, mediaTime) {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
-    this.#resyncIfFar(nowMs, latenessMs);
-    this.frames.add(nowMs, latenessMs);
+    const outputMs = Math.max(this.imageDelayMs, this.outputLatencyMs);
+    const isEarly = this.offsetMs !== null && latenessMs + outputMs < this.offsetMs - JUMP_MS;
+    if (this.#earlyFrames.update(nowMs, isEarly) > EARLY_MS) this.reset(); // the others were delayed
+    if (this.#isLate(nowMs, latenessMs, this.#lateFrames)) return;
     this.#start(nowMs, latenessMs + FIRST_DELAY_MS / 2);
+    this.frames.add(nowMs, latenessMs);
   }
 
   /** Record the arrival of a chunk of sound. */
   soundArrived(nowMs, mediaTime, numSamples) {
     const startMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const endMs = startMs - numSamples / SAMPLES_PER_MS;
-    this.#resyncIfFar(nowMs, endMs);
+    if (this.#isLate(nowMs, endMs, this.#lateSound)) return;
+    this.#start(nowMs, endMs + FIRST_DELAY_MS);
     this.soundStarts.add(nowMs, startMs);
     this.soundEnds.add(nowMs, endMs);
-    this.#start(nowMs, endMs + FIRST_DELAY_MS);
   }
 
   /** Move the offset towards its target. Call it for every image. */
@@ -100,10 +129,6 @@ export class Playout {
     if (this.offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
     if (this.frames.count < MIN_FRAMES) return;
     this.#adjustedMs = nowMs;
-    if (this.frames.maxSince(nowMs - ADJUST_EVERY_MS) < this.offsetMs - JUMP_MS) {
-      this.reset(); // delayed data has arrived, and the stream is on time again
-      return;
-    }
     const { percentile, marginMs, leapMs } = this.isAudible ? WITH_SOUND : WITHOUT_SOUND;
     let latestMs = this.frames.percentile(percentile) + this.imageDelayMs;
     if (this.isAudible && this.soundStarts.count) {
@@ -127,22 +152,22 @@ export class Playout {
   /** Set the first offset. Queued data arrives in a burst, and its end gives the best estimate. */
   #start(nowMs, offsetMs) {
     if (this.offsetMs === null) this.#startMs = nowMs;
-    if (nowMs - this.#startMs < LATE_MS) {
-      this.offsetMs = Math.min(this.offsetMs ?? Infinity, offsetMs);
-    }
+    else if (nowMs - this.#startMs > START_MS || offsetMs >= this.offsetMs) return;
+    this.offsetMs = offsetMs;
+    this.#forgetArrivals();
   }
 
   /**
-   * Start again if the sender paused or media time leapt ahead. Data that was delayed by the network
-   * or by a busy page arrives in one burst whose end is on time. This is not a pause.
+   * Return whether data is so late that it says nothing about the usual delay. Data that was delayed
+   * by the network or by a busy page arrives in one burst whose end is on time. If more data is late,
+   * the sender paused. Then, and if media time leapt ahead, start again.
    */
-  #resyncIfFar(nowMs, latenessMs) {
-    if (this.offsetMs === null) return;
+  #isLate(nowMs, latenessMs, streak) {
+    if (this.offsetMs === null) return false;
     const lateMs = latenessMs - this.offsetMs;
-    if (lateMs <= JUMP_MS) this.#lateSinceMs = null;
-    else this.#lateSinceMs ??= nowMs;
-    const hasPaused = this.#lateSinceMs !== null && nowMs - this.#lateSinceMs > LATE_MS;
-    if (hasPaused || lateMs < -MAX_BEHIND_MS) this.reset();
+    const forMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : JUMP_MS));
+    if (forMs > LATE_MS || lateMs < -MAX_BEHIND_MS) this.reset();
+    return this.offsetMs !== null && streak.holds;
   }
 }
 

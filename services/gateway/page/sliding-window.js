@@ -30,12 +30,6 @@ export class SlidingWindow {
     return Math.min(...this.#entries.map((entry) => entry[1]));
   }
 
-  /** Return the greatest value since a time; Infinity without values. */
-  maxSince(sinceMs) {
-    const values = this.#entries.filter((entry) => entry[0] > sinceMs).map((entry) => entry[1]);
-    return values.length ? Math.max(...values) : Infinity;
-  }
-
   /** Return the median of the values that are not too old at a time; null without values. */
   medianAt(nowMs) {
     this.#dropOld(nowMs);
