@@ -22,7 +22,7 @@ RESTORE_AFTER_S = 3.0  # without falling so far behind, after which it has phone
 MAX_LATE_FOR_S = 0.4  # a session may be further behind than its limit for this time
 LEAD_HALVED_S = 3.0  # after this time, half of a sender's lead is forgotten: its clock may differ
 REPORT_INTERVAL_S = 1.0  # between reports about one session
-CATCH_UP_S = 3.0  # for a session that moved
+CATCH_UP_S = 1.5  # for a session that moved
 ADAPTED = 0.1  # part of the lateness that is forgotten if the newest audio is just as late
 
 

@@ -67,7 +67,8 @@ class Worker:
         while (status := self._process.poll()) is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(POLL_S)
-            if not self._draining and self._process.hangs():
+            self._process.read_heartbeats()
+            if not self._draining and self._process.hangs:
                 self._process.kill()
         shutil.rmtree(self._folder)
         if not self._draining:

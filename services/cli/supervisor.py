@@ -126,10 +126,16 @@ class Supervisor:
         Raises ``UserError`` if a service reports a wrong configuration.
         """
         now_s = time.monotonic()
+        processes = self._processes.values()
+        for process in processes:
+            process.read_heartbeats()
+        if len(processes) > 1 and all(process.is_silent for process in processes):
+            for process in processes:  # all were stopped: none of them hangs
+                process.restart_silence()
         for name, process in list(self._processes.items()):
             status = process.poll()
             if status is None:
-                if process.hangs():
+                if process.hangs:
                     self._warn(f"{name} hangs; killing it")
                     process.kill()
                 elif process.is_ready and name in self._restarted:

@@ -40,8 +40,8 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge
 
-MAX_BATCH_S = 0.3  # of unpaced audio that is decoded together
-MAX_PART_S = 0.1  # of live audio of each session that is decoded together
+MAX_BATCH_S = 0.3  # of audio that is decoded together
+MIN_PART_S, MAX_PART_S = 0.02, 0.1  # of it, of each live session
 MAX_QUEUED_S = 60.0  # of live audio, above which it waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # for further audio of a session that is late, in total
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
@@ -344,8 +344,9 @@ class RecognizerService(Service):
         if not sessions:
             return
         now_s = time.monotonic()
+        part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / len(sessions)))
         for session in sessions:
-            session.accept_waveform(MAX_PART_S, now_s)
+            session.accept_waveform(part_s, now_s)
         self._decode(sessions)
         self.send_heartbeat_if_due()
 

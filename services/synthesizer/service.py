@@ -98,8 +98,12 @@ class _SynthesizerSession:
 
     def skip_if_behind(self, now_s: float) -> None:
         """Make no frames but the newest, if the session is too far behind."""
-        times_s = (event.time_s for event in self.queue if isinstance(event, events.Progress))
-        waiting_s = self.newest_s - next(times_s, self.newest_s)
+        waiting_s, known_s = 0.0, math.inf
+        for event in self.queue:
+            if isinstance(event, events.Progress):
+                waiting_s += max(0.0, event.time_s - known_s)
+            if isinstance(event, events.Progress | AudioSkipped):
+                known_s = event.time_s
         if self.overload.update(waiting_s, now_s) is Relief.AUDIO:
             self.face.skip_to(self.newest_s)
 

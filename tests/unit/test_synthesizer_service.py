@@ -111,8 +111,13 @@ def test_a_slow_synthesizer_skips_frames(service: Watched, monkeypatch: pytest.M
     for sequence in range(2, 150):
         service.take("gap", sequence, 0.1 * sequence)
     before = len(service.frames("gap"))
+    skip = Progress(
+        session="gap", epoch=1, sequence=150, media_time=320_000, state=AudioState.SKIPPED
+    )
+    service._on_input(skip, Peer())  # by the recognizer
+    service.take("gap", 151, 20.0)
     service.on_tick(now_s)
     assert not service._sessions["gap"].queue
     first, newest = service.frames("gap")[before], service.frames("gap")[-1]
-    assert first.media_time == newest.media_time == to_samples(14.9 - service.facts.delay_ms / 1e3)
+    assert first.media_time == newest.media_time == to_samples(20.0 - service.facts.delay_ms / 1e3)
     assert service.session_inputs()["gap"].skipped_s == pytest.approx(14.7)
