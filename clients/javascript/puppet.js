@@ -1,6 +1,6 @@
 // A model that a stream of values moves: kouxing's heads by FAPs, other models by blend shapes.
 
-import { VRMLoaderPlugin, VRMUtils } from "@pixiv/three-vrm";
+import { VRMLoaderPlugin, VRMLookAtBoneApplier, VRMUtils } from "@pixiv/three-vrm";
 import * as THREE from "three";
 import { MeshoptDecoder } from "three/addons/libs/meshopt_decoder.module.js";
 import { DRACOLoader } from "three/addons/loaders/DRACOLoader.js";
@@ -13,6 +13,13 @@ import { chooseSet, findShapes } from "./shape-names.js";
 const UNREADABLE = { DRACOLoader: "KHR_draco_mesh_compression", KTX2: "KHR_texture_basisu" }; // by words of three.js
 const VIEW_HEIGHT = 1.6; // of the camera's view, relative to the face
 const VRM_FACE_M = 0.24;
+// Degrees by which the eyes turn at weight 1, and the shapes of the sets "vrm" and "arkit".
+const LOOKS = {
+  left: [24.6, "lookLeft", "eyeLookOutLeft", "eyeLookInRight"],
+  right: [24.6, "lookRight", "eyeLookInLeft", "eyeLookOutRight"],
+  down: [17.8, "lookDown", "eyeLookDownLeft", "eyeLookDownRight"],
+  up: [12, "lookUp", "eyeLookUpLeft", "eyeLookUpRight"],
+};
 
 /**
  * Load a model.
@@ -87,6 +94,7 @@ function morphAvatar(scene, meshes) {
   return {
     scene: upright,
     set,
+    turnsEyes: targets.some(({ shape }) => shape.startsWith("eyeLook")),
     view: { target: center, height: VIEW_HEIGHT * height },
     pose(weights, names) {
       const weightOf = new Map(names.map((name, i) => [name, weights[i]]));
@@ -114,6 +122,8 @@ function vrmAvatar(vrm, meshes) {
     ({ set } = speaking);
   }
   const shapes = findShapes(set, names);
+  const turnsEyes = speaking?.turnsEyes || [...shapes.values()].some((shape) => shape.startsWith("eyeLook"));
+  const lookAt = !turnsEyes && vrm.lookAt?.applier instanceof VRMLookAtBoneApplier ? vrm.lookAt : null;
   const head = vrm.humanoid.getRawBoneNode("head");
   vrm.scene.updateMatrixWorld(true);
   const target = head.getWorldPosition(new THREE.Vector3());
@@ -126,9 +136,18 @@ function vrmAvatar(vrm, meshes) {
       speaking?.pose(weights, shapeNames);
       const weightOf = new Map(shapeNames.map((name, i) => [name, weights[i]]));
       for (const [name, shape] of shapes) vrm.expressionManager.setValue(name, weightOf.get(shape) ?? 0);
+      if (lookAt) turnEyes(lookAt, weightOf);
     },
     update(seconds) {
       vrm.update(seconds);
     },
   };
+}
+
+/** Turn the eyes of a VRM that has bones for them instead of expressions. */
+function turnEyes(lookAt, weightOf) {
+  const degrees = ([most, shape, ...parts]) =>
+    most * (weightOf.get(shape) ?? parts.reduce((sum, part) => sum + (weightOf.get(part) ?? 0) / parts.length, 0));
+  lookAt.yaw = degrees(LOOKS.left) - degrees(LOOKS.right);
+  lookAt.pitch = degrees(LOOKS.down) - degrees(LOOKS.up);
 }

@@ -148,7 +148,7 @@ TOWARDS = np.array([[0.0, 0.0, 1.0]] * 3)
 TURNED = np.array([-1.0, 1.0, -1.0])  # VRM 0 looks along -z
 TRIANGLE = np.array([[0, 1, 2]])
 BONES = (
-    *("hips", "spine", "head"),
+    *("hips", "spine", "head", "leftEye", "rightEye"),
     *(side + limb for side in ("left", "right") for limb in ("UpperArm", "LowerArm", "Hand")),
     *(side + limb for side in ("left", "right") for limb in ("UpperLeg", "LowerLeg", "Foot")),
 )
@@ -158,6 +158,13 @@ VRM_1 = {
     "humanoid": {"humanBones": {name: {"node": node} for node, name in enumerate(BONES)}},
     "expressions": {
         "preset": {"aa": {"morphTargetBinds": [{"node": len(BONES), "index": 0, "weight": 1.0}]}}
+    },
+    "lookAt": {
+        "type": "bone",
+        **{
+            f"rangeMap{name}": {"inputMaxValue": 90.0, "outputScale": 90.0}
+            for name in ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
+        },
     },
 }
 VRM_0 = {
@@ -265,6 +272,25 @@ def test_the_web_component_plays_recordings_on_models_of_all_kinds(
         region = slice(width), slice(left, left + width)
         while not (faces.image()[region] != closed[region]).any():
             pass
+
+
+def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser) -> None:
+    script = """
+        import('/node_modules/kouxing-client/puppet.js').then(async ({ loadPuppet }) => {
+          const puppet = await loadPuppet('vrm.vrm');
+          const eye = puppet.scene.getObjectByName('rightEye');
+          return [[['lookLeft', 'lookUp'], [1, 0.5]], [['eyeLookInLeft', 'eyeLookOutRight'], [1, 0]]].map(
+            ([names, weights]) => {
+              puppet.pose(weights, names);
+              puppet.update(0.02);
+              const [x, y] = eye.rotation.clone().reorder('YXZ');
+              return [x, y].map((angle) => angle * 180 / Math.PI);
+            });
+        })
+    """
+    up_left, right = faces.evaluate(script)
+    assert up_left == pytest.approx([-6.0, 24.6], abs=0.01)
+    assert right == pytest.approx([0.0, -12.3], abs=0.01)
 
 
 @contextlib.contextmanager
