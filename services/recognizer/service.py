@@ -105,7 +105,7 @@ class RecognizerService(Service):
         has_unpaced = bool(self._unpaced) and not self._is_unpaced_blocked
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
         self._read_late_audio()
-        self._decode_live()
+        self._decode_live([*self._sessions.values()])
         is_live_waiting = self._has_live_audio or (
             not self._is_live_blocked and self._audio.wait(0.0)
         )
@@ -131,7 +131,6 @@ class RecognizerService(Service):
 
     def start_session(self, start: StartSession) -> bool:
         """Create a session, or connect an existing one to another synthesizer."""
-        self._decode_all_live()
         session = self._sessions.get(start.session)
         is_new = session is None or session.start.token != start.token
         if session is None or is_new:
@@ -159,7 +158,6 @@ class RecognizerService(Service):
 
     def stop_session(self, session: str) -> None:
         """Forget a session."""
-        self._decode_all_live()
         stopped = self._sessions.pop(session, None)
         if stopped is not None:
             self._unpaced.drop(stopped, keep_end=False)
@@ -168,9 +166,10 @@ class RecognizerService(Service):
 
     def flush_session(self, session: str) -> None:
         """Drop the current speech; the next audio starts again."""
-        self._decode_all_live()
         flushed = self._sessions.get(session)
         if flushed is not None:
+            while flushed.audio:
+                self._decode_live([flushed])
             self._unpaced.drop(flushed, keep_end=True)
             flushed.link.forget()
             flushed.without_audio_s = 0.0  # so that the face learns of a stalled client again
@@ -189,8 +188,7 @@ class RecognizerService(Service):
         blocked = set()
         for session in self._sessions.values():
             self._accept_in_order(session, session.order.tick(now_s), session.client)
-            if session.acknowledge_due_s is not None and now_s >= session.acknowledge_due_s:
-                self._acknowledge(session, now_s)
+            session.acknowledge_if_due(now_s)
             self.metrics.count("resent", session.link.tick(now_s))
             if session.link.check_overdue(now_s):
                 text = "the synthesizer is too slow, so the face misses part of the speech"
@@ -215,8 +213,9 @@ class RecognizerService(Service):
 
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
-        self._decode_all_live()
         sessions = self._sessions.values()
+        while self._has_live_audio:
+            self._decode_live([*sessions])
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
         while self._unpaced:
@@ -288,11 +287,10 @@ class RecognizerService(Service):
                 self._accept_chunk(session, message, sender)
             if message.last:
                 session.end = message
-                if session.start.paced:
-                    self._decode_all_live()
-                    self._finish(session)
-                else:
+                if not session.start.paced:
                     self._unpaced.append(session, None)
+                elif not session.audio:
+                    self._finish(session)
 
     def _accept_chunk(self, session: RecognizerSession, message: AudioChunk, sender: Peer) -> None:
         if error := session.mouth_profile_error:
@@ -334,13 +332,9 @@ class RecognizerService(Service):
                 return
             self.handle_messages(self._audio)
 
-    def _decode_all_live(self) -> None:
-        while self._has_live_audio:
-            self._decode_live()
-
-    def _decode_live(self) -> None:
-        """Decode a part of the queued audio of all live sessions; skip audio that is too old."""
-        sessions = [session for session in self._sessions.values() if session.audio]
+    def _decode_live(self, sessions: Sequence[RecognizerSession]) -> None:
+        """Decode a part of the queued audio of live sessions; skip audio that is too old."""
+        sessions = [session for session in sessions if session.audio]
         if not sessions:
             return
         now_s = time.monotonic()
@@ -348,6 +342,10 @@ class RecognizerService(Service):
         for session in sessions:
             session.accept_waveform(part_s, now_s)
         self._decode(sessions)
+        for session in sessions:
+            has_moved = self._sessions.get(session.name) is not session
+            if session.end is not None and not session.audio and not has_moved:
+                self._finish(session)
         self.send_heartbeat_if_due()
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
@@ -389,8 +387,6 @@ class RecognizerService(Service):
             self._decode([*batch.values()])
             batch.clear()
             self._finish(session)
-            if session.end is not None and session.end.acknowledge:
-                session.request_acknowledgement(time.monotonic(), at_once=True)
         if batch:
             self._decode([*batch.values()])
         self._limit_unpaced()
@@ -401,6 +397,8 @@ class RecognizerService(Service):
             session.stream.input_finished()
             self._recognizer.decode_streams([session.stream])
             self._send_results(session)
+            if session.end is not None and session.end.acknowledge:
+                session.request_acknowledgement(time.monotonic(), at_once=True)
             LOG.info("end of audio", extra={"session": session.name})
 
     # --- messages --------------------------------------------------------------------------------
@@ -414,14 +412,6 @@ class RecognizerService(Service):
             session=message.session, media_time=message.media_time, code=rejection.code, text=text
         )
         socket.send(error, to=sender)
-
-    def _acknowledge(self, session: RecognizerSession, now_s: float) -> None:
-        """Report to the client which audio it need not resend."""
-        session.acknowledge_due_s, session.acknowledged_s = None, now_s
-        acknowledgement = Acknowledge(
-            session=session.name, epoch=session.start.epoch, sequence=session.received_sequence
-        )
-        session.socket.send(acknowledgement, to=session.client)
 
     def _send_results(self, session: RecognizerSession) -> None:
         """Send new results to the subscribers, the synthesizer and control.

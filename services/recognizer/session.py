@@ -189,6 +189,16 @@ class RecognizerSession:
         due_s = now_s if at_once else self.acknowledged_s + ACKNOWLEDGE_EVERY_S
         self.acknowledge_due_s = min(self.acknowledge_due_s or due_s, due_s)
 
+    def acknowledge_if_due(self, now_s: float) -> None:
+        """Report to the client which audio it need not resend."""
+        if self.acknowledge_due_s is None or now_s < self.acknowledge_due_s:
+            return
+        self.acknowledge_due_s, self.acknowledged_s = None, now_s
+        acknowledgement = Acknowledge(
+            session=self.name, epoch=self.start.epoch, sequence=self.received_sequence
+        )
+        self.socket.send(acknowledgement, to=self.client)
+
     def new_results(self, recognizer: Recognizer) -> list[StreamOutput]:
         """Return the stream's new results, without those that a lost recognizer has emitted."""
         results = recognizer.get_result(self.stream)

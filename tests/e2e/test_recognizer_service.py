@@ -48,7 +48,8 @@ class Recognizer(RecognizerService):
         self._on_audio(self._sessions[message.session].socket, message, Peer())
 
     def decode_all(self) -> None:
-        self._decode_all_live()
+        while self._has_live_audio:
+            self._decode_live([*self._sessions.values()])
         while self._unpaced:
             self._decode_unpaced()
             self.send_heartbeat_if_due()
