@@ -55,7 +55,7 @@ def free_port_environment(
 def available_port_environment(settings: Settings) -> dict[str, str]:
     """Return an environment in which services bind free ports instead of default ports in use.
 
-    Raises ``UserError`` if a port in use was set by the user.
+    Raises ``UserError`` if a port that the user set is not available.
     """
     free = free_port_environment()
     environment = {}
@@ -67,12 +67,13 @@ def available_port_environment(settings: Settings) -> dict[str, str]:
             setting = values[key]
             endpoint_host, _, port = str(setting.value).removeprefix("tcp://").rpartition(":")
             if port not in ("0", "*"):
-                if not _is_port_in_use(endpoint_host or host, int(port)):
+                problem = _port_problem(endpoint_host or host, int(port))
+                if not problem:
                     continue
                 if not setting.is_default:
                     raise UserError(
-                        f"{kind.name}.{key}: another program uses port {port}; set another port, or"
-                        " remove the setting to use a free one"
+                        f"{kind.name}.{key}: {problem}; choose another port,"
+                        " or none to use a free one"
                     )
             environment[variable(kind.name, key)] = free[variable(kind.name, key)]
     return environment
@@ -102,11 +103,16 @@ def kind_of(name: str) -> str:
     return name.partition("-")[0]
 
 
-def _is_port_in_use(host: str, port: int) -> bool:
+def _port_problem(host: str, port: int) -> str:
+    """Return why a port cannot be bound, empty if it can."""
     host = "" if host in WILDCARDS else host.strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.create_server((host, port), family=family):
-            return False
+            return ""
     except OSError as error:
-        return error.errno == errno.EADDRINUSE
+        problems = {
+            errno.EADDRINUSE: f"another program uses port {port}",
+            errno.EACCES: f"port {port} needs privileges",
+        }
+        return problems.get(error.errno or 0, "")

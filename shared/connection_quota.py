@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from kouxing.shared.connections import Connection
 
-MAX_CONNECTIONS = 512  # of clients; libzmq takes up to 0.1 MB for each
+MAX_CONNECTIONS = 400  # of clients; libzmq takes up to 0.1 MB for each
 MAX_SHARE = 0.75  # of them, for one key or, until the key is known, one address
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 

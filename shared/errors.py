@@ -1,7 +1,11 @@
 """Errors that say what is wrong and what to do."""
 
+from __future__ import annotations
+
+import contextlib
 import importlib.util
 import sys
+from collections.abc import Iterator
 
 
 class UserError(Exception):
@@ -16,6 +20,17 @@ def install_command(package: str) -> str:
     if importlib.util.find_spec("pip") is None:  # an environment of uv
         return f"uv pip install --python {sys.executable} '{package}'"
     return f"{sys.executable} -m pip install '{package}'"
+
+
+@contextlib.contextmanager
+def naming_option(option: str, key: str, *, is_given: bool) -> Iterator[None]:
+    """Let errors about a configuration key name the option, if that has set the key."""
+    try:
+        yield
+    except UserError as error:
+        if not is_given:
+            raise
+        raise UserError(str(error).replace(f"{key}:", f"{option}:", 1)) from None
 
 
 def with_name(name: str, text: str) -> str:

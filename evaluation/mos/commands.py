@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from kouxing.services.cli.options import Assignments, ConfigFile, Output
+from kouxing.shared.errors import naming_option
 from kouxing.shared.terminal import (
     Force,
     JsonFile,
@@ -69,9 +70,10 @@ def serve(
     gateway = read_settings(config).load(GatewayConfig, overrides)
     study, store = load_study(folder), Store(folder)
     try:
-        asyncio.run(
-            server.serve(study, store, gateway, lambda url: print_message(f"judges open {url}"))
-        )
+        with naming_option("--port", "gateway.port", is_given=port is not None):
+            asyncio.run(
+                server.serve(study, store, gateway, lambda url: print_message(f"judges open {url}"))
+            )
     finally:
         store.close()
 

@@ -26,7 +26,7 @@ from kouxing.services.kinds import (
 )
 from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import UserError, naming_option
 from kouxing.shared.keys import check_keys, control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 
@@ -67,9 +67,8 @@ def run(
 
     if play is None and (stop_after or track is not None):
         raise UserError("--stop-after and --track need a file: kouxing run --play my.wav")
-    given = parse_assignments(assignments or [])
-    if port is not None:
-        given["gateway.port"] = str(port)
+    chosen_port = {} if port is None else {"gateway.port": str(port)}
+    given = parse_assignments(assignments or []) | chosen_port
     settings = read_settings(config, given)
     for kind in KINDS.values():
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
@@ -81,7 +80,8 @@ def run(
     startup.enter_context(
         starting(lambda: print_message("waiting until another kouxing has started"))
     )
-    addresses = available_port_environment(settings)
+    with naming_option("--port", "gateway.port", is_given=port is not None):
+        addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
     bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
     control = _control_address(bound_control)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
+from unittest import mock
 
 import pytest
 
@@ -15,7 +17,7 @@ from kouxing.services.kinds import (
     kind_of,
     read_settings,
 )
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import UserError, naming_option
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "*"])
@@ -34,6 +36,17 @@ def test_rejects_a_configured_port_that_is_taken(host: str) -> None:
         )
         with pytest.raises(UserError, match=r"control\.events"):
             available_port_environment(chosen)
+
+
+def test_reports_a_port_that_needs_privileges(monkeypatch: pytest.MonkeyPatch) -> None:
+    refusal = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    monkeypatch.setattr(socket, "create_server", refusal)
+    chosen = read_settings(assignments={"gateway.port": "80"})
+    with (
+        pytest.raises(UserError, match="--port: port 80 needs privileges"),
+        naming_option("--port", "gateway.port", is_given=True),
+    ):
+        available_port_environment(chosen)
 
 
 def test_a_taken_default_and_port_0_are_replaced_by_a_free_port() -> None:
