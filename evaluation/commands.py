@@ -22,6 +22,7 @@ from kouxing.shared.terminal import (
 )
 
 if TYPE_CHECKING:
+    from kouxing.corpora.sounds import Sound
     from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
     from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 
@@ -55,6 +56,10 @@ LookAhead = Annotated[
     list[float] | None,
     typer.Option("--look-ahead-ms", help="Look-ahead, for models with a choice; repeatable."),
 ]
+Sounds = Annotated[
+    list[Path] | None,
+    typer.Option(help="Folder of sounds; the held-out ones are used. Default: synthesized."),
+]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
 Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
@@ -67,53 +72,90 @@ def recognizer(
     split: Split = "test",
     acoustic: Acoustic = None,
     look_ahead: LookAhead = None,
+    sounds: Sounds = None,
+    condition: Annotated[
+        list[str] | None,
+        typer.Option(help='Disturbance, such as "babble 10 dB"; repeatable. Default: all.'),
+    ] = None,
     curve: Annotated[Path | None, typer.Option(help="Plot errors against delay (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Compare phone and viseme errors and delays of acoustic models."""
+    """Compare phone and viseme errors and delays of acoustic models.
+
+    The speech is clean, disturbed by noise, music, other voices, a room or a telephone band, and
+    grouped by speaking rate. The JSON file also contains the figures by speaker and of other output
+    rules.
+    """
+    from kouxing.corpora.speech_corpus import RowErrors
+    from kouxing.evaluation.recognizer.disturbances import disturbances_for, music_from
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
+    from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
 
     check_output(curve, json_file, force=force)
+    models = list(_models(acoustic, look_ahead))
+    music = music_from(_read_sounds(sounds))
+    errors = RowErrors()
+    references = align_corpus(models[0][2], manifest, split, errors, audio)
+    disturbances = disturbances_for(references, music, condition or ())
     results = {
         title: {
             "acoustic": name,
-            **evaluate_recognizer(model, manifest, split, rule, audio=audio),
+            "split": split,
+            **evaluate_recognizer(model, references, disturbances, rule),
         }
-        for title, name, model, rule in _models(acoustic, look_ahead)
+        for title, name, model, rule in models
     }
-    print_figures(results, Console())
+    print_figures(results, split, Console())
+    errors.report_to(print_message)
     write_json(json_file, results)
     if curve is not None:
         draw_delay_curve(list(results.values()), curve)
 
 
 @app.command()
-def robustness(
+def voice(
     manifest: Manifest,
     audio: AudioFolder = None,
     split: Split = "test",
     acoustic: Acoustic = None,
-    look_ahead: LookAhead = None,
-    other_language: Annotated[
-        Path | None, typer.Option(help="Folder of recordings in another language.")
-    ] = None,
+    sounds: Sounds = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure errors in disturbed speech, and phones recognized in sounds without speech."""
-    from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+    """Measure voice activity: the share of time in which it is on, by kind of audio.
+
+    The audio is speech, clean and disturbed, the held-out sounds, and synthesized voices and
+    noises.
+    """
+    from kouxing.corpora.speech_corpus import RowErrors
+    from kouxing.evaluation.recognizer.disturbances import (
+        BABBLE,
+        MUSIC,
+        disturbances_for,
+        music_from,
+    )
+    from kouxing.evaluation.recognizer.references import align_corpus
+    from kouxing.evaluation.recognizer.voice import evaluate_voice, materials_of, print_voice
 
     check_output(json_file, force=force)
-    results = {
-        title: evaluate_robustness(
-            model, manifest, split, rule, audio=audio, other_language=other_language
-        )
-        for title, _, model, rule in _models(acoustic, look_ahead)
-    }
-    print_robustness(results, Console())
+    models = {title: model for title, _, model, _ in _models(acoustic, None)}
+    kept = _read_sounds(sounds)
+    music = music_from(kept)
+    errors = RowErrors()
+    references = align_corpus(next(iter(models.values())), manifest, split, errors, audio)
+    disturbances = disturbances_for(references, music, (MUSIC, BABBLE))
+    results = evaluate_voice(models, materials_of(references, disturbances, music, kept))
+    print_voice(results, split, Console())
+    errors.report_to(print_message)
     write_json(json_file, results)
+
+
+def _read_sounds(folders: list[Path] | None) -> list[Sound]:
+    from kouxing.corpora.sounds import read_sounds
+
+    return read_sounds(folders or (), shipping=False)
 
 
 def _models(

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from string import ascii_uppercase
+
 
 def format_number(value: float | None, form: str = ".2f") -> str:
     """Format a figure; None is a dash."""
     return "-" if value is None else format(value, form)
 
 
-def percent(rate: float | None) -> str:
+def percent(rate: float | None, form: str = ".1f") -> str:
     """Format a rate as a percentage; None is a dash."""
-    return format_number(None if rate is None else 100 * rate, ".1f")
+    return format_number(None if rate is None else 100 * rate, form)
+
+
+def letters_of(names: Sequence[str]) -> tuple[dict[str, str], str]:
+    """Return a letter for each of several models, because a path is too long for a column.
+
+    The second value explains the letters. A single model needs no letter.
+    """
+    if len(names) == 1:
+        return {names[0]: ""}, names[0]
+    letters = dict(zip(names, ascii_uppercase, strict=False))
+    return letters, ", ".join(f"{letter}: {name}" for name, letter in letters.items())

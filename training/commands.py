@@ -241,7 +241,10 @@ def ear_report(
     sounds: Sounds,
     clips: Clips,
 ) -> None:
-    """Compare the small ear with Silero and the causal network on held-out audio."""
+    """Measure the voice classes and the lips of a small ear on held-out audio.
+
+    ``kouxing evaluate voice`` measures the voice activity of the recognizer.
+    """
     with _neural_training():
         from kouxing.training.ear.recipe import Sources
         from kouxing.training.ear.report import report_ear

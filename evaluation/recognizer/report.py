@@ -1,8 +1,8 @@
-"""Print the recognizer's figures as tables, and plot them."""
+"""Print the recognizer's figures as a table, and plot them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -10,92 +10,56 @@ from typing import Any
 from rich.console import Console
 
 from kouxing.corpora.figures import new_figure, save_figure
-from kouxing.evaluation.tables import percent
+from kouxing.evaluation.recognizer.disturbances import CLEAN
+from kouxing.evaluation.recognizer.error_rates import HYPOTHESES
+from kouxing.evaluation.tables import letters_of, percent
 from kouxing.shared.terminal import plural, print_table
 
 Figures = Mapping[str, Any]  # result of evaluate_recognizer
 
 
-def print_figures(results: Mapping[str, Figures], console: Console) -> None:
-    """Print the tables of each model, then all models side by side, then bad rows.
-
-    ``results`` has the figures by the name of the model.
-    """
-    for name, figures in results.items():
-        console.rule(name)
-        print_table(
-            console,
-            f"{figures['split']}: {plural(figures['recordings'], 'recording')}, "
-            f"{plural(figures['speakers'], 'speaker')}",
-            ("output", "phone error %", "95 %", "ins/del/sub %", "viseme error %", "95 %"),
-            map(_output, figures["scores"]),
-        )
-        print_table(
-            console,
-            "live",
-            ("output", "final phone / viseme error %", "delay p50 / p95 ms"),
-            (
-                (score["output"], _rates(score, "final_"), _delay(score))
-                for score in figures["scores"]
-            ),
-        )
-        print_table(
-            console,
-            "p, b, m and f, %",
-            ("output", "recall", "precision"),
-            (
-                (output, *map(percent, fractions.values()))
-                for output, fractions in figures["labials"].items()
-            ),
-        )
-    if len(results) > 1:
-        print_table(
-            console,
-            "phone / viseme error %",
-            ("model", "offline", "first hypothesis", "final hypothesis", "delay p50 / p95 ms"),
-            (
-                (name, _rates(first), _rates(last), _rates(last, "final_"), _delay(last))
-                for name, (first, *_, last) in (
-                    (name, figures["scores"]) for name, figures in results.items()
-                )
-            ),
-        )
-    messages = dict.fromkeys(line for figures in results.values() for line in figures["bad_rows"])
-    for message in messages:
-        console.print(message, markup=False, soft_wrap=True)
-    if messages:
-        console.print(f"{plural(len(messages), 'row')} skipped")
+def print_figures(results: Mapping[str, Figures], split: str, console: Console) -> None:
+    """Print one table. ``results`` has the figures by the name of the model."""
+    letters, legend = letters_of(list(results))
+    first = next(iter(results.values()))
+    print_table(
+        console,
+        f"{split}: {plural(first['recordings'], 'recording')}, "
+        f"{plural(first['speakers'], 'speaker')}. {legend}\n"
+        "phone/viseme errors, %; delay of the first hypothesis, p50/p95, ms;\n"
+        "p b m f of the final hypothesis, recall/precision, %; /s: clean, syllables/s",
+        ("speech", "", "phones", *HYPOTHESES, "delay", "p b m f"),
+        _rows(results, letters),
+    )
 
 
-def _output(score: Figures) -> list[str]:
-    errors = score["phone_errors"]
-    kinds = ("insertions", "deletions", "substitutions")
+def _rows(results: Mapping[str, Figures], letters: Mapping[str, str]) -> Iterator[list[str]]:
+    for kind in dict.fromkeys(kind for figures in results.values() for kind in figures["speech"]):
+        label = kind
+        for name, figures in results.items():
+            if score := figures["speech"].get(kind):
+                yield [label, letters[name], *_cells(score)]
+                label = ""
+
+
+def _cells(score: Figures) -> list[str]:
+    delay = score.get("delay_ms")  # missing if no phone was right
+    labials = score["final"]["labials"].values()
     return [
-        score["output"],
-        percent(score["phone_error_rate"]),
-        _interval(score["phone_interval_95"]),
-        "/".join(percent(errors[kind] / max(1, errors["reference"])) for kind in kinds),
-        percent(score["viseme_error_rate"]),
-        _interval(score["viseme_interval_95"]),
+        str(score["final"]["phone_errors"]["reference"]),
+        *(
+            "/".join(
+                percent(score[hypothesis][f"{unit}_error_rate"]) for unit in ("phone", "viseme")
+            )
+            for hypothesis in HYPOTHESES
+        ),
+        f"{delay['p50']:.0f}/{delay['p95']:.0f}" if delay else "-",
+        "/".join(percent(rate, ".0f") for rate in labials),
     ]
 
 
-def _rates(score: Figures, hypothesis: str = "") -> str:
-    rates = (score.get(f"{hypothesis}{kind}_error_rate") for kind in ("phone", "viseme"))
-    return " / ".join(map(percent, rates))
-
-
-def _interval(bounds: tuple[float, float] | None) -> str:
-    return "-" if bounds is None else f"{percent(bounds[0])}-{percent(bounds[1])}"
-
-
-def _delay(score: Figures) -> str:
-    delay = score.get("delay_ms")  # missing if no phone was right
-    return f"{delay['p50']:.0f} / {delay['p95']:.0f}" if delay else "-"
-
-
 def draw_delay_curve(results: Sequence[Figures], path: Path) -> None:
-    """Plot the errors of both hypotheses over the median delay of the first.
+    """Plot the errors of both hypotheses in clean speech over the median delay of the first.
 
     The results have the model's name as ``acoustic``. Those of one model, with several look-aheads,
     are adjacent. Raises UserError if the picture cannot be written.
@@ -104,12 +68,12 @@ def draw_delay_curve(results: Sequence[Figures], path: Path) -> None:
     for axes, kind in zip(figure.subplots(1, 2), ("phone", "viseme"), strict=True):
         by_model = groupby(results, key=lambda result: result["acoustic"])
         for number, (name, group) in enumerate(by_model):
-            defaults = [result["scores"][-1] for result in group]
-            scores = [score for score in defaults if "delay_ms" in score]
+            clean = [result["speech"][CLEAN] for result in group]
+            scores = [score for score in clean if "delay_ms" in score]
             scores.sort(key=lambda score: score["delay_ms"]["p50"])
             delays_ms = [score["delay_ms"]["p50"] for score in scores]
-            for prefix, style, hypothesis in (("", "o-", "first"), ("final_", "s--", "final")):
-                rates = [100 * score[f"{prefix}{kind}_error_rate"] for score in scores]
+            for hypothesis, style in (("first", "o-"), ("final", "s--")):
+                rates = [100 * score[hypothesis][f"{kind}_error_rate"] for score in scores]
                 label = f"{name}, {hypothesis} hypothesis"
                 axes.plot(delays_ms, rates, style, color=f"C{number}", label=label)
         axes.set_xlabel("median delay of the first hypothesis, ms")

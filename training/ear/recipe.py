@@ -18,6 +18,7 @@ from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.corpora.sounds import read_sounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out, may_ship
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
@@ -27,7 +28,6 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.ear.batches import BATCH_S, Material, batch_of
 from kouxing.training.ear.export import save_ear
 from kouxing.training.ear.network import Ear
-from kouxing.training.ear.sounds import read_sounds
 from kouxing.training.ear.targets import Piece, Recording, Samples, TargetStore, Voice
 from kouxing.training.ear.teachers import Teachers
 from kouxing.training.model_card import write_card
@@ -81,7 +81,9 @@ def train_ear(
     utterances = utterances_of(sources, errors, inventory, "train")
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
-    sounds = [one for one in read_sounds(sources.sounds, sources.shipping) if not one.is_held_out]
+    sounds = [
+        one for one in read_sounds(sources.sounds, shipping=sources.shipping) if not one.is_held_out
+    ]
     backgrounds = [sound.samples for sound in sounds if sound.kind in _BACKGROUNDS]
     if not backgrounds:
         raise UserError("no music or noise to mix with the speech; give a folder with --sounds")

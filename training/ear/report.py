@@ -1,7 +1,8 @@
-"""Compares the small ear with Silero (voice) and the causal network (lips).
+"""Measures the classes of the small ear, and compares its lips with the causal network's.
 
-Voice: the share of time with detected voice. The block network's phones in the clean recording
-define "inside" and "outside" speech.
+Voice: the share of time in which the ear finds a voice, laughter or singing. The block network's
+phones in the clean recording define "inside" and "outside" speech. ``kouxing evaluate voice``
+measures the recognizer's decision, which follows from these classes.
 
 Lips: the correlation of the lip opening with a linear prediction from the last 160 ms. The
 prediction uses audio up to 55 ms after the lip position. It is trained on clips of other speakers,
@@ -23,10 +24,10 @@ from rich.progress import track
 
 from kouxing.corpora.feature_cache import as_floats, as_integers, samples_of
 from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.corpora.sounds import Sound, held_out, read_sounds
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.onnx_session import open_network
 from kouxing.shared.errors import UserError
@@ -36,7 +37,6 @@ from kouxing.training.ear.export import load_ear
 from kouxing.training.ear.network import LOOK_AHEAD
 from kouxing.training.ear.recipe import Sources, load_teachers, may_train, utterances_of
 from kouxing.training.ear.singing import sing
-from kouxing.training.ear.sounds import Sound, read_sounds
 from kouxing.training.ear.targets import Voice
 from kouxing.training.ear.teachers import POSITION_SAMPLES, Teachers
 from kouxing.training.lips.recipe import fit_ridge, history_of
@@ -99,8 +99,8 @@ def report_ear(path: Path, sources: Sources, *, whisper: Path, console: Console)
     rows = _voice_rows(speech, sounds, teachers)
     print_table(
         console,
-        "time with detected voice, %",
-        ("audio", "Silero", "product", "ear", "ear: laughter", "ear: sung"),
+        "share of time, %",
+        ("audio", "voice", "laughter", "sung"),
         (
             [name, *(f"{100 * share:.0f}" for share in _voice_shares(ear, audio))]
             for name, audio in track(rows.items(), description="voice")
@@ -112,12 +112,8 @@ def report_ear(path: Path, sources: Sources, *, whisper: Path, console: Console)
     errors.report_to(console.print)
 
 
-def _held_out(sounds: Sequence[Sound], kind: str) -> list[Sound]:
-    return [sound for sound in sounds if sound.kind == kind and sound.is_held_out]
-
-
 def _mix_with(sounds: Sequence[Sound], kind: str, snr_db: float) -> Disturb:
-    others = [sound.samples for sound in _held_out(sounds, kind)]
+    others = [sound.samples for sound in held_out(sounds, kind)]
     if not others:
         raise UserError(f"no held-out {kind} to measure with; give more of it with --sounds")
 
@@ -142,7 +138,7 @@ def _voice_rows(
 ) -> dict[str, list[Audio]]:
     """Collect the audio of each row of the table."""
     rows: dict[str, list[Audio]] = {
-        kind: [(as_floats(sound.samples), None) for sound in _held_out(sounds, kind)]
+        kind: [(as_floats(sound.samples), None) for sound in held_out(sounds, kind)]
         for kind in ("music", "noise", "breath", "laughter", "singing")
     }
     rng = np.random.default_rng(0)
@@ -165,34 +161,16 @@ def _voice_rows(
 
 
 def _voice_shares(ear: EarRunner, audio: Sequence[Audio]) -> list[float]:
-    """Return the voice shares of Silero, the product and the ear, and of two ear classes."""
+    """Return the shares of positions with a voice, with laughter and with a sung voice."""
     shares: list[Mask] = []
     for samples, counted in audio:
         voice = ear.run(samples)["voice"][LOOK_AHEAD:]
         best = voice.argmax(axis=1)
-        columns = [
-            *_detected(samples, len(voice)),
-            voice[:, Voice.NONE] < _PROBABLE,
-            best == Voice.LAUGHTER,
-            best == Voice.SUNG,
-        ]
+        columns = [voice[:, Voice.NONE] < _PROBABLE, best == Voice.LAUGHTER, best == Voice.SUNG]
         rows = np.stack(columns, axis=1)
         mask = np.full(len(rows), True) if counted is None else counted[: len(rows)]
         shares.append(rows[: len(mask)][mask])
     return np.concatenate(shares).mean(axis=0).tolist() if shares else []
-
-
-def _detected(samples: Floats, num_positions: int) -> list[Mask]:
-    """Return whether Silero detects a voice at each position, and whether the product does."""
-    detector = VoiceActivityDetector()
-    probable, speaking = [], []
-    for start in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES):
-        probability = detector.speech_probability(samples[start : start + BLOCK_SAMPLES])
-        probable.append(probability >= _PROBABLE)
-        speaking.append(detector.update(probability).is_speech)
-    middle = POSITION_SAMPLES * np.arange(num_positions) + POSITION_SAMPLES // 2
-    block = np.minimum(middle // BLOCK_SAMPLES, len(probable) - 1)
-    return [np.array(probable)[block], np.array(speaking)[block]]
 
 
 def _print_lips(

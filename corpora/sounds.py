@@ -13,11 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.corpora.speech_corpus import may_ship
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import read_text, split_lines
-from kouxing.training.ear.targets import Samples
 
 _MAX_BYTES = 16 << 20
 _BY_FILE = ("music", "noise")
@@ -29,11 +31,11 @@ class Sound:
 
     name: str
     kind: str
-    samples: Samples
+    samples: NDArray[np.int16]  # 16 kHz
     is_held_out: bool
 
 
-def read_sounds(folders: Sequence[Path], shipping: bool) -> list[Sound]:
+def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
     """Read folders; UserError if a file is missing or cannot be read.
 
     ``shipping`` excludes sounds whose license does not allow distributing the model.
@@ -55,6 +57,11 @@ def read_sounds(folders: Sequence[Path], shipping: bool) -> list[Sound]:
         except ValueError as error:
             raise UserError(f"cannot read a sound in {folder}: {error}") from error
     return sounds
+
+
+def held_out(sounds: Sequence[Sound], kind: str) -> list[Sound]:
+    """Return the held-out sounds of a kind."""
+    return [sound for sound in sounds if sound.kind == kind and sound.is_held_out]
 
 
 def _parts(kind: str, path: Path) -> list[Sound]:

@@ -1,0 +1,71 @@
+"""The recordings of a corpus with the times of their phones, and their speaking rates.
+
+The speaking rate is the number of syllables per second of phones, without pauses.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from rich.progress import track
+
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
+from kouxing.evaluation.recognizer.synthetic_sounds import Samples
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+
+_RATES = (4.0, 5.5, 7.0)  # limits of the classes of speaking rates, syllables per second
+RATE_NAMES = (
+    f"below {_RATES[0]:g}/s",
+    *(f"{low:g} to {high:g}/s" for low, high in pairwise(_RATES)),
+    f"above {_RATES[-1]:g}/s",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """A recording of a corpus, and the phones of its text, without silence."""
+
+    utterance: Utterance
+    phones: list[Phone]
+
+    def read_audio(self) -> Samples:
+        """Read the recording, 16 kHz mono."""
+        return read_audio(self.utterance.path)
+
+    @property
+    def rate_name(self) -> str:
+        """The class of the speaking rate."""
+        seconds = sum(phone.duration_s for phone in self.phones)
+        return RATE_NAMES[bisect(_RATES, len(self.utterance.syllables) / seconds)]
+
+
+def align_corpus(
+    model: AcousticModel, corpus: Path, split: str, errors: RowErrors, audio: Path | None = None
+) -> list[Reference]:
+    """Find the phones of one split of a corpus in the model's language.
+
+    ``errors`` receives the rows that cannot be used. Raises UserError if the split has no usable
+    recording.
+    """
+    references = []
+    utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
+    for utterance in track(utterances, description=f"aligning {split}"):
+        try:
+            samples = read_audio(utterance.path)
+            syllables = syllables_of(utterance, model.inventory)
+            phones = align_phones(model, samples, SAMPLE_RATE_HZ, syllables)
+        except (UserError, ValueError) as error:
+            errors.add(utterance.utterance_id, str(error))
+            continue
+        references.append(Reference(utterance, spoken(phones, model.inventory)))
+    if not references:
+        raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
+    return references

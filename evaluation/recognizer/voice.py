@@ -1,0 +1,165 @@
+"""Voice activity of the recognizer: the share of time in which it is on, by kind of audio.
+
+The audio passes through a live recognizer in slices of 20 ms. A slice counts with the state that
+the recognizer has reported (``SpeechChange``) when the slice is processed. So the share includes
+the delays of the decision, such as the half second before speech ends.
+
+- Speech: the recordings of a corpus, with 2 s of silence before and after each, clean and with
+  music or babble. Forced alignment of the text finds the phones; only phones are voice.
+- Held-out recordings of a folder of sounds (:mod:`kouxing.corpora.sounds`).
+- Synthesized sounds (:mod:`~kouxing.evaluation.recognizer.synthetic_sounds`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.corpora.sounds import Sound, held_out
+from kouxing.evaluation.recognizer import synthetic_sounds
+from kouxing.evaluation.recognizer.disturbances import Disturb, add_sound
+from kouxing.evaluation.recognizer.references import Reference
+from kouxing.evaluation.recognizer.synthetic_sounds import Samples
+from kouxing.evaluation.tables import letters_of, percent
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.pcm import SLICE, slices
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.phones.events import Phone, SpeechChange
+from kouxing.shared.terminal import print_table
+
+Mask = NDArray[np.bool_]  # (slices,)
+Figures = Mapping[str, Any]
+
+_SLICE_S = SLICE / SAMPLE_RATE_HZ
+_PAUSE = 2 * SAMPLE_RATE_HZ  # samples of silence before and after a recording of speech
+_SYNTHETIC_S = 60.0
+_SUNG_OVER_MUSIC_DB = 5.0
+_KINDS = {"singing": True, "laughter": False, "breath": False, "music": False, "noise": False}
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """Recordings of one kind, each with the slices that have a voice."""
+
+    kind: str
+    recordings: Sequence[tuple[Samples, Mask]]
+
+
+def materials_of(
+    references: Sequence[Reference],
+    disturbances: Mapping[str, Disturb],
+    music: Samples,
+    sounds: Sequence[Sound],
+) -> Iterator[Material]:
+    """Read, disturb and synthesize the audio, one kind after the other.
+
+    ``music`` accompanies the melodies.
+    """
+    speech = [np.pad(reference.read_audio(), _PAUSE) for reference in references]
+    voiced = [
+        _voiced_slices(reference.phones, len(samples))
+        for reference, samples in zip(references, speech, strict=True)
+    ]
+    for name, disturb in disturbances.items():
+        yield Material(f"speech, {name}", [*zip(map(disturb, speech), voiced, strict=True)])
+    for kind, is_voice in _KINDS.items():
+        recordings = [as_floats(sound.samples) for sound in held_out(sounds, kind)]
+        if recordings:
+            yield _material(kind, recordings, is_voice=is_voice)
+    melodies = synthetic_sounds.melodies()
+    over_music = [add_sound(melody, music, _SUNG_OVER_MUSIC_DB) for melody in melodies]
+    yield _material("melody", melodies, is_voice=True)
+    yield _material("melody, music 5 dB", over_music, is_voice=True)
+    yield _material("held vowels", synthetic_sounds.held_vowels(), is_voice=True)
+    for name, make in synthetic_sounds.WITHOUT_VOICE.items():
+        yield _material(name, [make(_SYNTHETIC_S)], is_voice=False)
+
+
+def _material(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> Material:
+    return Material(
+        kind,
+        [(samples, np.full(-(-len(samples) // SLICE), is_voice)) for samples in recordings],
+    )
+
+
+def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
+    """Return whether the middle of each slice is in a phone, after the pause."""
+    middle_s = ((np.arange(-(-num_samples // SLICE)) + 0.5) * SLICE - _PAUSE) / SAMPLE_RATE_HZ
+    mask = np.zeros(len(middle_s), np.bool_)
+    for phone in phones:
+        mask |= (phone.onset_s <= middle_s) & (middle_s < phone.onset_s + phone.duration_s)
+    return mask
+
+
+def evaluate_voice(
+    models: Mapping[str, AcousticModel], materials: Iterable[Material]
+) -> dict[str, dict[str, Any]]:
+    """Measure voice activity; return JSON figures by model and kind of audio.
+
+    They have the seconds with and without a voice, and the share of each in which voice activity is
+    on; None without such audio.
+    """
+    results: dict[str, dict[str, Any]] = {name: {} for name in models}
+    for material in materials:
+        voiced = np.concatenate([mask for _, mask in material.recordings])
+        for name, model in models.items():
+            recordings = track(material.recordings, description=material.kind)
+            is_on = np.concatenate([voice_activity(model, samples) for samples, _ in recordings])
+            results[name][material.kind] = {
+                part: {
+                    "seconds": float(mask.sum()) * _SLICE_S,
+                    "on": float(is_on[mask].mean()) if mask.any() else None,
+                }
+                for part, mask in (("voice", voiced), ("no_voice", ~voiced))
+            }
+    return results
+
+
+def voice_activity(model: AcousticModel, samples: Samples) -> Mask:
+    """Return the state of the live recognizer after each slice of a recording, (n,)."""
+    recognizer = Recognizer(model)
+    stream = recognizer.create_stream()
+    is_active = False
+    states = []
+    for piece in slices(samples, 0):
+        stream.accept_waveform(piece)
+        recognizer.decode_streams([stream])
+        for event in recognizer.get_result(stream):
+            if isinstance(event, SpeechChange):
+                is_active = event.active
+        states.append(is_active)
+    return np.array(states)
+
+
+def print_voice(results: Mapping[str, Figures], title: str, console: Console) -> None:
+    """Print one table with all models. ``results`` has the figures by the name of the model."""
+    letters, legend = letters_of(list(results))
+    print_table(
+        console,
+        f"{title}. {legend}\nvoice activity on, % of the time with and without a voice",
+        ("audio", "", "s", "voice", "no voice"),
+        _rows(results, letters),
+    )
+
+
+def _rows(results: Mapping[str, Figures], letters: Mapping[str, str]) -> Iterator[list[str]]:
+    for kind in next(iter(results.values())):
+        label = kind
+        for name, figures in results.items():
+            shares = figures[kind].values()
+            seconds = sum(share["seconds"] for share in shares)
+            yield [
+                label,
+                letters[name],
+                f"{seconds:.0f}",
+                *(percent(share["on"]) for share in shares),
+            ]
+            label = ""

@@ -1,0 +1,110 @@
+"""Shares of voice activity, and the sounds behind them."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from numpy.typing import NDArray
+from rich.console import Console
+
+from kouxing.corpora.sounds import Sound, read_sounds
+from kouxing.corpora.speech_corpus import Utterance
+from kouxing.evaluation.recognizer import voice
+from kouxing.evaluation.recognizer.disturbances import add_sound, music_from
+from kouxing.evaluation.recognizer.references import Reference
+from kouxing.evaluation.recognizer.synthetic_sounds import held_vowels, varying_noise
+from kouxing.evaluation.recognizer.voice import (
+    Material,
+    evaluate_voice,
+    materials_of,
+    print_voice,
+    voice_activity,
+)
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from tests.system import VOWELS_FILE
+
+RATE_HZ = 16_000
+PER_S = 50  # slices
+
+
+@pytest.fixture
+def sounds(tmp_path: Path) -> list[Sound]:
+    """Return two pieces of music, of which the loud one is held out, and laughter."""
+    rows = ["path\tkind\tlicence"]
+    for name, kind, level in (("a", "music", 0.5), ("b", "music", 0.1), ("ha", "laughter", 0.2)):
+        soundfile.write(tmp_path / f"{name}.flac", np.full(RATE_HZ, level), RATE_HZ)
+        rows.append(f"{name}.flac\t{kind}\tCC0")
+    (tmp_path / "manifest.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return read_sounds([tmp_path], shipping=True)
+
+
+@pytest.mark.slow
+def test_voice_activity_follows_the_speech_of_the_live_recognizer() -> None:
+    model = load_model(model_path("gmm"))
+    vowels, _ = soundfile.read(VOWELS_FILE, dtype="float32")
+    silence = np.zeros(RATE_HZ, np.float32)
+    is_on = voice_activity(model, np.concatenate([silence, vowels[:RATE_HZ], silence]))
+    before, during, after = is_on.reshape(3, PER_S)
+    assert not before.any()
+    assert during.mean() > 0.5
+    assert not after[-PER_S // 4 :].any()
+
+
+def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch) -> None:
+    def first_half(_: object, samples: NDArray[np.float32]) -> NDArray[np.bool_]:
+        return np.arange(len(samples)) < len(samples) / 2
+
+    monkeypatch.setattr(voice, "voice_activity", first_half)
+    masks = np.array([[True, True, True, False], [True, False, False, False]])
+    pieces = [(np.zeros(4, np.float32), mask) for mask in masks]
+    materials = [Material("mixed", pieces), Material("voice", [(np.zeros(2), np.full(2, True))])]
+    results = evaluate_voice({"one": load_model(model_path("gmm"))}, materials)
+    shares = results["one"]["mixed"]
+    assert shares["voice"] == {"seconds": pytest.approx(0.08), "on": 0.75}
+    assert shares["no_voice"] == {"seconds": pytest.approx(0.08), "on": 0.25}
+    assert results["one"]["voice"]["no_voice"] == {"seconds": 0.0, "on": None}
+    output = io.StringIO()
+    print_voice(results | {"two": results["one"]}, "dev", Console(file=output, width=80))
+    assert "dev. A: one, B: two" in output.getvalue()
+    assert output.getvalue().splitlines()[-1].split() == ["B", "0", "50.0", "-"]
+
+
+def test_materials_have_a_voice_where_the_text_has_phones(
+    sounds: list[Sound], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(voice, "_SYNTHETIC_S", 1.0)
+    phone = Phone(index=0, symbol="a", onset_s=0.2, duration_s=0.4, confidence=1.0, final=True)
+    reference = Reference(Utterance(utterance_id="vowels", path=VOWELS_FILE), [phone])
+    materials = materials_of([reference], {"clean": np.copy}, varying_noise(1.0), sounds)
+    by_kind = {material.kind: material.recordings for material in materials}
+    ((_, mask),) = by_kind["speech, clean"]
+    assert np.flatnonzero(mask).tolist() == list(range(110, 130))  # after 2 s
+    assert [len(mask) for _, mask in by_kind["laughter"]] == [PER_S / 2]  # the second half
+    assert len(by_kind["music"]) == 1
+    assert "breath" not in by_kind  # not in the folder
+    assert all(mask.all() for _, mask in by_kind["held vowels"])
+    assert not any(mask.any() for _, mask in by_kind["keyboard"])
+
+
+def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> None:
+    music = music_from(sounds)
+    assert len(music) == RATE_HZ
+    speech = held_vowels()[0]
+    power = np.mean((add_sound(speech, music, 10.0) - speech) ** 2) / np.mean(speech**2)
+    assert 10 * np.log10(power) == pytest.approx(-10, abs=0.1)
+    with pytest.raises(UserError, match="no held-out music to measure with"):
+        music_from([sound for sound in sounds if not sound.is_held_out])
+
+
+def test_held_vowels_have_the_pitch_of_their_voice() -> None:
+    low, high = (held_vowels()[number] for number in (0, 6))
+    for vowel, pitch_hz in ((low, 120), (high, 220)):
+        spectrum = np.fft.rfft(vowel[RATE_HZ : 2 * RATE_HZ], 1 << 17)
+        similarity = np.fft.irfft(np.abs(spectrum) ** 2)
+        lags = np.arange(RATE_HZ * 0.7 // pitch_hz, RATE_HZ * 1.4 // pitch_hz, dtype=int)
+        period = lags[similarity[lags].argmax()]
+        assert RATE_HZ / period == pytest.approx(pitch_hz, rel=0.03)
