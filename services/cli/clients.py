@@ -253,11 +253,13 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
                 "speaking" if session.speaking else session.state,
                 f"{session.age_s:.0f} s",
                 _lateness_text(session.lateness),
+                f"{session.skipped_s:.1f} s",
                 ", ".join(sorted({*session.workers.values()})),
             )
             for session in report.sessions
         ]
-        columns = ("session", "state", "open for", "late: p50, p95, worst", "workers")
+        lateness = "late: p50, p95, worst"
+        columns = ("session", "state", "open for", lateness, "skipped", "workers")
         print_table(out, "", columns, sessions)
     write_json(json_file, asdict(report))
 

@@ -57,7 +57,11 @@ class _WebSocket(web.WebSocketResponse):
     def __init__(self, max_message_bytes: int, ping_s: float | None) -> None:
         # aiohttp rejects messages of the limit itself
         super().__init__(
-            heartbeat=ping_s, max_msg_size=max_message_bytes + 1, timeout=1.0, compress=False
+            heartbeat=ping_s,
+            max_msg_size=max_message_bytes + 1,
+            timeout=1.0,
+            compress=False,
+            writer_limit=0,  # each message waits until the transport can take it
         )
         self._max_size = f"{max_message_bytes >> 10} KiB"
 

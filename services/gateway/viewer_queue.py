@@ -6,7 +6,7 @@ import asyncio
 from collections import deque
 from enum import Enum
 
-MAX_QUEUED = 200  # messages; about 2 s of a talking session
+MAX_QUEUED = 100  # messages; about a second of a talking session
 NUM_FRAMES_KEPT = 5
 NUM_TEXTS_KEPT = 50
 

@@ -21,7 +21,8 @@ from kouxing.shared.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
 
 MAX_VIEWERS = 64
-SEND_BUFFER_BYTES = 64 * 1024  # in the kernel, for a slow viewer; about a second
+WRITE_BUFFER_BYTES = 4096  # in this process
+SEND_BUFFER_BYTES = 32 * 1024  # in the kernel, for a slow viewer; about half a second
 _SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -154,7 +155,7 @@ class Viewers:
         except UserError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
         async with self._web_sockets.open(request, self._quota) as browser:
-            _limit_send_buffer(request)
+            _limit_send_buffers(request)
             with self.connected(chosen, shape_encoder) as viewer:
                 await self._serve_commands(viewer, browser)
         return browser
@@ -262,9 +263,11 @@ class Viewers:
         return wire.text("status", missing=self._missing)
 
 
-def _limit_send_buffer(request: web.Request) -> None:
-    raw = request.transport.get_extra_info("socket") if request.transport else None
-    if raw is not None:
+def _limit_send_buffers(request: web.Request) -> None:
+    """Let messages for a slow viewer wait in its queue, which drops old ones."""
+    if (transport := request.transport) is not None:
+        transport.set_write_buffer_limits(WRITE_BUFFER_BYTES)
+        raw = transport.get_extra_info("socket")
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
 
 

@@ -17,11 +17,11 @@ from pythonosc.osc_bundle import OscBundle
 
 from kouxing.services.gateway.microphone import MAX_MESSAGE_BYTES
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
-from kouxing.shared.face.faps import FAP_NUMBER
+from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionStarted
-from kouxing.shared.wire.face import EndOfFaps, SetFace
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.session import CloseSession, FlushSession
 from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (
@@ -35,7 +35,7 @@ from tests.process.web_clients import (
     receive_of_session,
     until,
 )
-from tests.system import LIMIT_S, Gateway, free_port
+from tests.system import LIMIT_S, Gateway, free_port, port_of
 
 LONG_TIMEOUT = """
 from kouxing.services.gateway import audio_sessions
@@ -81,6 +81,38 @@ def own_gateway(own_control: FakeControl) -> Iterator[Gateway]:
 
 
 # --- viewers
+
+
+def publish_frame(control: FakeControl, session: str, media_time: int) -> None:
+    frame = FapFrame(
+        session=session,
+        epoch=EPOCH,
+        sequence=media_time // 320,
+        media_time=media_time,
+        values=FACE,
+        mask=bytes(MASK_BYTES),
+    )
+    control.publish(control.faps, frame)
+
+
+def media_time_of(message: bytes) -> float:
+    return float(struct.unpack_from("<d", message, 8)[0])
+
+
+def connect_with_small_buffer(page: str, path: str) -> socket.socket:
+    """Open a WebSocket for a client that reads later."""
+    client = socket.socket()
+    client.settimeout(LIMIT_S)
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    client.connect(("127.0.0.1", port_of(page)))
+    lines = (
+        f"GET /{path} HTTP/1.1",
+        f"Host: 127.0.0.1:{port_of(page)}",
+        *("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"),
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+    )
+    client.sendall("\r\n".join([*lines, "", ""]).encode())
+    return client
 
 
 @async_test
@@ -184,6 +216,26 @@ async def test_an_expression_shows_on_the_face_at_rest(
         while await watch(viewer) > 1:
             pass
     assert control.sessions_of(SetFace) == [""]
+
+
+@async_test
+async def test_a_slow_viewer_gets_the_newest_frames(control: FakeControl, gateway: Gateway) -> None:
+    times = [320 * number for number in range(1, 1501)]  # 30 s
+    path = "viewer?session=long"
+    with connect_with_small_buffer(gateway.page, path) as slow:
+        async with connected(gateway.page, path) as (viewer,):
+            control.start("long")
+            await receive_json(viewer, "session", session="long")
+            for media_time in times:
+                publish_frame(control, "long", media_time)
+                if media_time % 6400 == 0:  # the gateway and this viewer keep up
+                    while media_time_of(await receive_binary(viewer, FAP_TYPE)) < media_time:
+                        pass
+        received = b""
+        while struct.pack("<d", times[-1]) + FACE not in received:
+            received += slow.recv(65536)
+    assert received.count(FACE) < len(times) / 5
+    control.stop_session("long")
 
 
 # --- microphones and the sample sentence

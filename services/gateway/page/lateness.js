@@ -5,6 +5,8 @@ import { SAMPLES_PER_MS } from "./playout.js";
 
 const WINDOW_MS = 10000; // as in services/synthesizer/lateness.py
 const LATE_MS = 300;
+const MIN_SKIP_MS = 100;
+const MAX_SKIP_MS = 10000; // a longer gap is a pause of the client
 const SHOWN_AFTER_MS = 1000; // of late frames
 const OVER_AFTER_MS = 2000; // of frames in time
 const RECENT_MS = 1000; // window of the lateness that is shown
@@ -21,10 +23,18 @@ export class Lateness {
   #recent = new SlidingWindow(RECENT_MS); // lateness, ms
   #agreedMs = null; // when the frames last agreed with isBehind
 
-  /** Record the arrival of a frame. Media time stands still while the client sends no audio. */
+  /**
+   * Record the arrival of a frame. Media time stands still while the client sends no audio. It leaps
+   * if a busy machine skips frames, so that the face does not fall further behind.
+   */
   frameArrived(nowMs, mediaTime) {
-    if (mediaTime === this.#newest) this.#differences.reset();
-    if (mediaTime <= this.#newest) return;
+    const stepMs = (mediaTime - this.#newest) / SAMPLES_PER_MS;
+    if (stepMs === 0) this.#differences.reset();
+    if (stepMs <= 0) return;
+    if (this.#newest >= 0 && stepMs > MIN_SKIP_MS && stepMs < MAX_SKIP_MS) {
+      this.isBehind = true;
+      this.#agreedMs = nowMs;
+    }
     this.#newest = mediaTime;
     this.#differences.add(nowMs, nowMs - mediaTime / SAMPLES_PER_MS);
   }
