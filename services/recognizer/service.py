@@ -41,7 +41,7 @@ from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge
 
 MAX_BATCH_S = 0.3  # of audio that is decoded together
-MIN_PART_S, MAX_PART_S = 0.02, 0.1  # of it, of each live session
+MIN_PART_S, MAX_PART_S = 0.02, 0.06  # of it, of each live session
 MAX_QUEUED_S = 60.0  # of live audio, above which it waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # for further audio of a session that is late, in total
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
