@@ -3,7 +3,8 @@
 A heartbeat states the share of the last two seconds in which a worker's loop was busy. Sessions
 that were placed or ended since then count with the cost of one session: the highest cost measured
 recently. Every session is expected to take that much, since a silent client may start to speak at
-any moment.
+any moment. A worker processes the audio of all sessions together, so many sessions cost less each.
+Therefore, the cost falls quickly to the load divided by the number of sessions that speak.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ MIN_SESSIONS = 2  # never refused; on a busy machine every session seems to be e
 MEASURED_S = 2.0  # period over which a worker measures its load
 DEFAULT_COST = 0.25  # of a session, until it is measured; true for a slow machine
 COST_HALF_LIFE_S = 60.0  # of the highest measured cost
+SPEAKING_HALF_LIFE_S = 4.0  # while all sessions that speak cost less
 RETRY_AFTER_S = 5.0  # for a client that is refused
 
 
@@ -51,18 +53,21 @@ class WorkerLoad:
             self._num_unpaced -= 1
             self._unpaced_until_s = now_s + MEASURED_S
 
-    def measure(self, load: float, now_s: float) -> None:
-        """Use the load of a heartbeat."""
+    def measure(self, load: float, now_s: float, num_speaking: int = 0) -> None:
+        """Use the load of a heartbeat. Silent sessions may also take a part of it."""
         if self._is_unpaced(now_s):
             return
-        decay = 0.5 ** ((now_s - self._measured_s) / COST_HALF_LIFE_S)
+        passed_s = now_s - self._measured_s
         self._measured, self._measured_s = load, now_s
         num_measured = self.num_sessions + _num_recent(self._ended_s, now_s)
         if not num_measured:
             self._idle = load if self._idle is None else min(load, self._idle)
         else:
-            cost = max(0.0, load - (self._idle or 0.0)) / num_measured
-            self._cost = max(cost, (self._cost or 0.0) * decay)
+            of_sessions = max(0.0, load - (self._idle or 0.0))
+            is_cheaper = self.cost * num_speaking > of_sessions
+            half_life_s = SPEAKING_HALF_LIFE_S if is_cheaper else COST_HALF_LIFE_S
+            decayed = (self._cost or 0.0) * 0.5 ** (passed_s / half_life_s)
+            self._cost = max(of_sessions / num_measured, decayed)
 
     def expected(self, now_s: float) -> float:
         """Return the load when all sessions speak."""

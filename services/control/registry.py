@@ -104,8 +104,11 @@ class Registry:
             text = f"{heartbeat.instance} is registered with another key"
             raise Refusal(ErrorCode.NOT_ALLOWED, text)
 
-    def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float) -> None:
-        """Register a service, or record its newest heartbeat."""
+    def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float, num_speaking: int = 0) -> None:
+        """Register a service, or record its newest heartbeat.
+
+        ``num_speaking`` is the number of the service's sessions in which somebody speaks.
+        """
         instance = heartbeat.instance
         record = self._services.get(instance)
         if record is None:
@@ -123,7 +126,7 @@ class Registry:
         if record.peer != NO_PEER:  # this is not control itself
             (self._busy if heartbeat.sessions else self._idle)[instance] = record
         if heartbeat.role == "worker":
-            self.load(instance).measure(heartbeat.load, now_s)
+            self.load(instance).measure(heartbeat.load, now_s, num_speaking)
 
     def _register(self, heartbeat: Heartbeat, peer: Peer) -> ServiceRecord:
         instance = heartbeat.instance

@@ -235,7 +235,8 @@ class ControlService(Service):
             self._check_sessions(heartbeat, sender)  # those that have moved
             return
         replaced = self._registry.replaced_by(heartbeat, sender) if is_new else None
-        self._registry.add(heartbeat, sender, time.monotonic())
+        num_speaking = self._sessions.num_speaking(instance)
+        self._registry.add(heartbeat, sender, time.monotonic(), num_speaking)
         self._takeover.record_observer(heartbeat)
         self._check_sessions(heartbeat, sender)  # before others are placed on it
         if is_new:

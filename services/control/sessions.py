@@ -91,6 +91,10 @@ class Sessions:
                 del self._pending[record.name]
         return list(self._pending.values())
 
+    def num_speaking(self, instance: str) -> int:
+        """Return in how many sessions of a worker somebody speaks."""
+        return sum(record.speaking for record in self._of_worker.get(instance, {}).values())
+
     def participants(self, record: SessionRecord) -> set[str]:
         """Return the running services that take part: the session's workers and all observers."""
         return ({*record.workers.values()} - record.lost) | self._registry.observers()

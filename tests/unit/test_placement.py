@@ -43,6 +43,19 @@ def test_admits_as_many_sessions_as_the_measured_load_leaves_room_for(
     assert num_admitted(loaded(num_sessions, measured), 10.0) == admitted
 
 
+def test_many_speaking_sessions_show_that_each_costs_less() -> None:
+    load = loaded(1, 0.2)
+    for _ in range(7):
+        load.add_session(10.0, paced=True)
+    for second in range(11, 31):
+        load.measure(0.4, float(second), num_speaking=1)  # the others may cost more when they speak
+    assert load.cost > 0.15
+    for second in range(31, 51):
+        load.measure(0.4, float(second), num_speaking=6)
+    assert load.cost == pytest.approx(0.4 / 8, abs=0.02)
+    assert num_admitted(load, 50.0) >= 5
+
+
 @pytest.fixture
 def system() -> System:
     made = System(max_sessions=100, max_load=MAX_LOAD)
@@ -77,7 +90,8 @@ def test_refuses_a_session_without_room_and_says_when_to_try_again(system: Syste
         open_at(system, 0.0)
     for instance in WORKERS:
         measure(system, instance, 0.75 if "recognizer" in instance else 0.1, 5.0)
-    with pytest.raises(Refusal, match="every recognizer is busy") as caught:
+    text = "every recognizer is busy: this session needs 38 % of its time, and 5 % is left"
+    with pytest.raises(Refusal, match=text) as caught:
         open_at(system, 5.0)
     assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
     measure(system, "recognizer-2", 0.2, 6.0)
@@ -91,7 +105,7 @@ def test_unpaced_sessions_of_one_key_leave_room_for_another_client(system: Syste
     opening, greedy = OpenSession(request="r", paced=False), Peer(b"a", "greedy")
     for _ in range(4):  # two of the three for which each recognizer has room
         system.sessions.open(opening, greedy, 0.0)
-    with pytest.raises(Refusal, match="busy"):
+    with pytest.raises(Refusal, match=r"this and another session need 50 % .* 30 % is left"):
         system.sessions.open(opening, greedy, 0.0)
     assert system.sessions.open(opening, Peer(b"b", "other"), 0.0)
 
