@@ -44,8 +44,11 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
     for folder in folders:
         manifest = folder / "manifest.tsv"
         lines = split_lines(manifest, read_text(manifest, _MAX_BYTES))
+        rows = list(csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE))
+        if not rows:
+            raise UserError(f"{manifest} lists no sounds; add some, or give another folder")
         try:
-            for row in csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE):
+            for row in rows:
                 if may_ship(row["licence"]) or not shipping:
                     sounds += _parts(row["kind"], folder / row["path"])
         except OSError as error:

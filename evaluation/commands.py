@@ -88,12 +88,17 @@ def recognizer(
     rules.
     """
     from kouxing.corpora.speech_corpus import RowErrors
-    from kouxing.evaluation.recognizer.disturbances import disturbances_for, music_from
+    from kouxing.evaluation.recognizer.disturbances import (
+        check_conditions,
+        disturbances_for,
+        music_from,
+    )
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
     from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
 
     check_output(curve, json_file, force=force)
+    check_conditions(condition or ())
     models = list(_models(acoustic, look_ahead))
     music = music_from(_read_sounds(sounds))
     errors = RowErrors()
@@ -141,12 +146,12 @@ def voice(
 
     check_output(json_file, force=force)
     models = {title: model for title, _, model, _ in _models(acoustic, None)}
-    kept = _read_sounds(sounds)
-    music = music_from(kept)
+    recorded = _read_sounds(sounds)
+    music = music_from(recorded)
     errors = RowErrors()
     references = align_corpus(next(iter(models.values())), manifest, split, errors, audio)
     disturbances = disturbances_for(references, music, (MUSIC, BABBLE))
-    results = evaluate_voice(models, materials_of(references, disturbances, music, kept))
+    results = evaluate_voice(models, materials_of(references, disturbances, music, recorded))
     print_voice(results, split, Console())
     errors.report_to(print_message)
     write_json(json_file, results)

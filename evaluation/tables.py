@@ -23,5 +23,6 @@ def letters_of(names: Sequence[str]) -> tuple[dict[str, str], str]:
     """
     if len(names) == 1:
         return {names[0]: ""}, names[0]
-    letters = dict(zip(names, ascii_uppercase, strict=False))
+    pairs = (first + last for first in ("", *ascii_uppercase) for last in ascii_uppercase)
+    letters = dict(zip(names, pairs, strict=False))
     return letters, ", ".join(f"{letter}: {name}" for name, letter in letters.items())

@@ -31,7 +31,8 @@ from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.errors import UserError
 
 Disturb = Callable[[Samples], Samples]
-CLEAN, MUSIC, BABBLE = "clean", "music 10 dB", "babble 10 dB"
+CONDITIONS = ("clean", "noise 10 dB", "music 10 dB", "babble 10 dB", "room", "telephone")
+CLEAN, NOISE, MUSIC, BABBLE, ROOM, TELEPHONE = CONDITIONS
 _REVERBERATION_S = 0.5  # time in which echoes fall by 60 dB
 _NUM_VOICES, _MAX_BABBLE_RECORDINGS = 6, 60
 _BELOW_DB = 10.0
@@ -44,22 +45,25 @@ def disturbances_for(
 ) -> dict[str, Disturb]:
     """Return clean speech and the disturbances with these names, by default all.
 
-    The babble consists of these recordings. Raises UserError if a name is unknown.
+    The babble consists of these recordings.
     """
     step = len(references) // _MAX_BABBLE_RECORDINGS + 1
     others = babble([reference.read_audio() for reference in references[::step]])
     known: dict[str, Disturb] = {
         CLEAN: lambda samples: samples,
-        "noise 10 dB": lambda samples: add_noise(samples, _BELOW_DB),
+        NOISE: lambda samples: add_noise(samples, _BELOW_DB),
         MUSIC: lambda samples: add_sound(samples, music, _BELOW_DB),
         BABBLE: lambda samples: add_sound(samples, others, _BELOW_DB),
-        "room": add_echoes,
-        "telephone": limit_to_telephone_band,
+        ROOM: add_echoes,
+        TELEPHONE: limit_to_telephone_band,
     }
-    if unknown := [name for name in names if name not in known]:
-        raise UserError(f"no condition {unknown[0]!r}; choose from: {', '.join(known)}")
-    chosen = (CLEAN, *names) if names else known
-    return {name: disturb for name, disturb in known.items() if name in chosen}
+    return {name: known[name] for name in CONDITIONS if name in (CLEAN, *(names or CONDITIONS))}
+
+
+def check_conditions(names: Sequence[str]) -> None:
+    """Raise UserError if a name is not one of ``CONDITIONS``."""
+    if unknown := [name for name in names if name not in CONDITIONS]:
+        raise UserError(f"no condition {unknown[0]!r}; choose from: {', '.join(CONDITIONS)}")
 
 
 def music_from(sounds: Sequence[Sound]) -> Samples:

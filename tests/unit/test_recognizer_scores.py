@@ -8,7 +8,7 @@ from rich.console import Console
 
 from kouxing.corpora.scoring import matched_pairs
 from kouxing.corpora.speech_corpus import RowErrors
-from kouxing.evaluation.recognizer.disturbances import disturbances_for
+from kouxing.evaluation.recognizer.disturbances import check_conditions, disturbances_for
 from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
 from kouxing.evaluation.recognizer.references import RATE_NAMES, align_corpus
 from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
@@ -81,7 +81,7 @@ def test_evaluates_a_corpus_with_bad_rows(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="'nothing'"):
         align_corpus(model, tmp_path, "nothing", RowErrors())
     with pytest.raises(UserError, match="no condition 'rain'; choose from: clean, noise 10 dB"):
-        disturbances_for(references, noise(1.0), ["rain"])
+        check_conditions(["clean", "rain"])
 
 
 def test_prints_several_models_in_80_columns() -> None:

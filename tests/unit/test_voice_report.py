@@ -100,6 +100,21 @@ def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> No
         music_from([sound for sound in sounds if not sound.is_held_out])
 
 
+@pytest.mark.parametrize(
+    ("rows", "problem"),
+    [
+        ("", "lists no sounds"),
+        ("a.flac\t\n", "lacks the column 'licence'"),
+        ("short row", "cannot read a sound in"),
+    ],
+)
+def test_reports_an_unusable_list_of_sounds(tmp_path: Path, rows: str, problem: str) -> None:
+    columns = "path\tkind" if "licence" in problem else "kind\tlicence\tpath"
+    (tmp_path / "manifest.tsv").write_text(f"{columns}\n{rows}", encoding="utf-8")
+    with pytest.raises(UserError, match=problem):
+        read_sounds([tmp_path], shipping=False)
+
+
 def test_held_vowels_have_the_pitch_of_their_voice() -> None:
     low, high = (held_vowels()[number] for number in (0, 6))
     for vowel, pitch_hz in ((low, 120), (high, 220)):
