@@ -20,7 +20,6 @@ from enum import IntEnum
 SAVING_BEHIND_S = 0.1  # a session that is further behind gives up phones
 RESTORE_AFTER_S = 3.0  # without falling so far behind, after which it has phones again
 MAX_LATE_FOR_S = 0.4  # a session may be further behind than its limit for this time
-LEAD_HALVED_S = 3.0  # after this time, half of a sender's lead is forgotten: its clock may differ
 REPORT_INTERVAL_S = 1.0  # between reports about one session
 CATCH_UP_S = 1.5  # for a session that moved
 ADAPTED = 0.1  # part of the lateness that is forgotten if the newest audio is just as late
@@ -50,20 +49,16 @@ class Overload:
         self._max_behind_s = max_behind_s
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: when it arrives
-        self._arrived_s = 0.0  # when it arrived
         self._saved_at_s = -math.inf  # when the session was last so far behind that it saves
         self._late_since_s = math.inf  # when it exceeded its limit
         self._reported_s, self._report_due_s = 0.0, -math.inf  # part of skipped_s; next report
 
-    def add(self, duration_s: float, now_s: float) -> None:
-        """Record that audio has arrived."""
-        if self._due_s is None or now_s < self._start_s:
-            self._due_s = now_s
-        else:
-            lead_s = max(0.0, self._due_s - now_s)
-            forgotten = 1.0 - 0.5 ** ((now_s - self._arrived_s) / LEAD_HALVED_S)
-            self._due_s += duration_s - forgotten * lead_s
-        self._arrived_s = now_s
+    def add(self, duration_s: float, now_s: float, *, has_waiting: bool) -> None:
+        """Record that audio has arrived, and whether other audio waits before it."""
+        due_s = now_s if self._due_s is None else self._due_s + duration_s
+        if now_s < self._start_s:
+            due_s = now_s
+        self._due_s = due_s if has_waiting else min(due_s, now_s)
 
     def restart(self, start_s: float) -> None:
         """Start again at a time; the session has moved."""

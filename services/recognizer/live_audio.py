@@ -32,7 +32,8 @@ class LiveAudio:
         """Add a chunk that has arrived."""
         media_time, samples = chunk
         end = media_time + len(samples) * MEDIA_RATE_HZ // self._rate_hz
-        self.overload.add(to_seconds(max(0, end - self._end)), now_s)
+        duration_s = to_seconds(max(0, end - self._end))
+        self.overload.add(duration_s, now_s, has_waiting=bool(self._chunks))
         self._end = end
         self._chunks.append(chunk)
         self._num_samples += len(samples)

@@ -44,7 +44,7 @@ class Session:
         return reliefs
 
     def receive(self, duration_s: float) -> None:
-        self.overload.add(duration_s, self.now_s)
+        self.overload.add(duration_s, self.now_s, has_waiting=self.waiting_s >= 0.0)
         self.waiting_s += duration_s
 
 
@@ -98,7 +98,8 @@ def _send_after_a_pause(session: Session) -> None:
 def _send_a_long_chunk(session: Session) -> None:
     session.run(2.0, speed=3.0)
     session.now_s += 2.0
-    session.overload.add(2.0, session.now_s)
+    session.receive(2.0)
+    session.waiting_s = 0.0
 
 
 @pytest.mark.parametrize("send", [_send_ahead, _send_after_a_pause, _send_a_long_chunk])
@@ -106,6 +107,14 @@ def test_keeps_audio_that_is_not_late(send: Callable[[Session], None]) -> None:
     session = Session()
     send(session)
     assert set(session.run(4.0, speed=1.3, sent=0.0)) <= {Relief.NOTHING, Relief.PHONES}
+
+
+def test_a_late_first_chunk_does_not_hide_lateness() -> None:
+    session = Session()
+    session.receive(CHUNK_S)
+    session.now_s -= 0.5  # the following chunks arrive half a second earlier
+    session.run(1.0, speed=3.0)
+    assert Relief.AUDIO in session.run(2.0, speed=0.3)
 
 
 def test_a_session_that_moved_may_catch_up_first() -> None:
