@@ -79,11 +79,16 @@ class DriverService(Service):
             self.poses.express(message.face.expressions, message.face.hold_s)
 
     def start_session(self, start: StartSession) -> bool:
-        """Follow a session's frames; confirm once the subscriptions are in effect."""
+        """Follow a session's frames if they are shown or recorded.
+
+        The session has started once the subscriptions are in effect.
+        """
         session = self._sessions.get(start.session)
         if session is not None and session.start.token != start.token:
             self._leave(session)  # a different session with the same name
             session = None
+        if session is None and not start.record and not self.view.is_live:
+            return True
         if session is None:
             key = start.client_key or ""
             if start.record and (reason := self.recordings.rejection_reason(key)):

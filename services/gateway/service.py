@@ -247,7 +247,7 @@ class GatewayService(Service):
         """Move the face at rest, and request the status of the services."""
         if self._viewers.has_viewers and now_s >= self._rest_due_s:
             self._rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
-            self._viewers.show_rest(self._resting_face.faps(now_s).astype("<f4").tobytes())
+            self._viewers.show_rest(self._resting_face, now_s)
         is_answered = self._report_s >= self._request_s
         interval_s = STATUS_INTERVAL_S if self._viewers.has_viewers else STATUS_TIMEOUT_S
         due_s = self._request_s + (interval_s if is_answered else STATUS_TIMEOUT_S)
@@ -309,7 +309,8 @@ class GatewayService(Service):
         self._viewers.add_session(start.session, session.follower.epoch, start.face.lip_model or "")
 
     def _on_frame(self, frame: FapFrame) -> None:
-        self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values)
+        now_s = time.monotonic()
+        self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values, now_s)
         if frame.session == self._viewers.newest:
             self._senders.send_frame(frame.media_time, frame.values)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import re
 import socket
 from collections.abc import Callable, Iterable, Iterator
@@ -17,12 +18,14 @@ from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RateLimi
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel, for a slow viewer; about half a second
+PAUSE_S = 0.2  # without a frame, until a viewer needs the face at rest
 _SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -40,6 +43,7 @@ class Viewer:
     shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
     queue: ViewerQueue = field(default_factory=ViewerQueue)
     shown: tuple[str, int] | None = None  # session and epoch last announced to the viewer
+    moved_s: float = -math.inf  # when the newest frame was sent
 
 
 class Viewers:
@@ -116,19 +120,27 @@ class Viewers:
         for viewer in self._viewers_of(session):
             self._put(viewer, kind, message)
 
-    def show_frame(self, session: str, epoch: int, media_time: int, faps: bytes) -> None:
+    def show_frame(
+        self, session: str, epoch: int, media_time: int, faps: bytes, now_s: float
+    ) -> None:
         """Send a frame to the viewers of a session."""
         message = wire.binary(wire.FAP_TYPE, epoch, media_time, faps)
-        self.forward(session, MessageKind.FRAME, message)
         viewers = self._viewers_of(session)
+        for viewer in viewers:
+            viewer.moved_s = now_s
+            self._put(viewer, MessageKind.FRAME, message)
         self._put_shapes(viewers, MessageKind.SHAPES, "weights", epoch, media_time, faps)
 
-    def show_rest(self, faps: bytes) -> None:
-        """Send every viewer the face at rest, which is shown while no session moves the face."""
+    def show_rest(self, face: RestingFace, now_s: float) -> None:
+        """Send the face at rest to the viewers whose face no session moves."""
+        viewers = [viewer for viewer in self._viewers if now_s > viewer.moved_s + PAUSE_S]
+        if not viewers:
+            return
+        faps = face.faps(now_s).astype("<f4").tobytes()
         message = wire.binary(wire.REST_TYPE, 0, 0, faps)
-        for viewer in self._viewers:
+        for viewer in viewers:
             self._put(viewer, MessageKind.REST, message)
-        self._put_shapes(self._viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
+        self._put_shapes(viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
 
     @property
     def newest(self) -> str:

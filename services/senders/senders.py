@@ -122,7 +122,8 @@ class Senders:
 
     def show(self, session_time_s: float, faps: Faps) -> None:
         """Queue a frame (68,) of the session; return immediately."""
-        self._loop.call_soon_threadsafe(self._add_frame, session_time_s, faps, time.monotonic())
+        if self._senders:
+            self._loop.call_soon_threadsafe(self._add_frame, session_time_s, faps, time.monotonic())
 
     def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
         """Show expressions on the face at rest."""

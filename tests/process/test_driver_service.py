@@ -39,7 +39,15 @@ class Stage:
                 max_videos=4,
             )
         )
+        self.driver.view = self  # type: ignore[assignment]
+        self.is_live = True
         self.step_until(lambda: control.heartbeats)
+
+    def show(self, *_: object) -> None:
+        """Show nothing, as a view."""
+
+    def close(self) -> None:
+        """Close nothing, as a view."""
 
     def step_until(self, condition: Callable[[], object]) -> None:
         wait_until(condition, step=lambda: self.driver.step(0.005))
@@ -185,8 +193,9 @@ def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(stage: Stage) -> 
     stage.start("film", record=True)
     stage.publish("film", 0, 100.0)
     stage.step_until(stage.unfinished)
-    (process,) = multiprocessing.active_children()
-    process.kill()
+    recorder = stage.driver.recordings._recorder
+    assert recorder is not None
+    recorder.process.kill()
     stage.step_until(lambda: stage.events("error"))
     assert stage.events("error")[0].detail.startswith("no-video: ")
     assert stage.unfinished() == []
@@ -214,3 +223,11 @@ def test_a_stopping_driver_saves_the_finished_part_of_a_video(stage: Stage) -> N
     stage.step_until(lambda: stage.driver.metrics.counts["video_ms"])
     stage.driver.on_shutdown()
     assert [path.name for path in stage.folder.iterdir()] == ["film.mp4"]
+
+
+def test_follows_only_sessions_that_it_shows_or_records(stage: Stage) -> None:
+    stage.is_live = False
+    stage.start("heard")
+    assert not stage.driver.session_inputs()
+    stage.start("filmed", record=True)
+    assert [*stage.driver.session_inputs()] == ["filmed"]

@@ -40,6 +40,8 @@ class Transition:
 
     def at(self, elapsed_s: float) -> FapState:
         """Return the remaining difference after ``elapsed_s``."""
+        if elapsed_s >= self.duration_s.max():
+            return FapState(*np.zeros((2, len(self.duration_s))))
         u = np.minimum(elapsed_s / self.duration_s, 1.0)
         start, duration_s = self.difference, self.duration_s
         # cubic Hermite spline from (value, velocity) to (0, 0)

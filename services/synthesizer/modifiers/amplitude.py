@@ -61,8 +61,10 @@ class Amplitude:
         until_s = min(context.known_s, context.time_s + _LEAD_S)
         while self._levels and self._levels[0][0] <= until_s:
             self._add_level(context.articulation, *self._levels.popleft())
-        goal = self._goal * _rate_gain(context.articulation.syllable_onsets_s, until_s)
-        goal = min(max(goal, _MIN_GAIN), _MAX_GAIN) if context.amplitude_applies else 1.0
+        goal = 1.0
+        if context.amplitude_applies:
+            goal = self._goal * _rate_gain(context.articulation.syllable_onsets_s, until_s)
+            goal = min(max(goal, _MIN_GAIN), _MAX_GAIN)
         gain = self._gain.step(goal, context.step_s, _FILTER_S)
         if gain != 1.0:
             opening = faps[_OPENING_FAPS]

@@ -110,7 +110,7 @@ def blend(
         return np.tile(parameters.neutral, (len(time_s), 1))
     weights = softmax(log_weights(parameters, timeline, time_s))  # (E + S, F, P)
     targets = np.concatenate(
-        [parameters.target[timeline.viseme], np.tile(parameters.neutral, (num_silences, 1))]
+        [parameters.target[timeline.viseme], parameters.neutral[None].repeat(num_silences, axis=0)]
     )
     curves: NDArray[np.float64] = np.einsum("efp,ep->fp", weights, targets)
     return curves  # Wang & Cai 2003, eq. 6

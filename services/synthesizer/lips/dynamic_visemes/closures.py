@@ -38,7 +38,7 @@ class ClosureTracker:
         with late closures moved, and whether a closure was moved for the first time.
         """
         start_s, end_s = timeline.apex_start_s.copy(), timeline.apex_end_s.copy()
-        is_new = False
+        is_new = is_moved = False
         for row in self._closing_rows(timeline):
             index = int(timeline.phone_index[row])
             if index not in self._postponed_s:
@@ -46,8 +46,11 @@ class ClosureTracker:
                     continue
                 self._postponed_s[index] = last_s + _CATCH_UP_S
                 is_new = True
+            is_moved = True
             end_s[row] = max(end_s[row], self._postponed_s[index])
             start_s[row] = max(start_s[row], min(self._postponed_s[index], end_s[row]))
+        if not is_moved:
+            return timeline, False
         moved = replace(timeline, apex_start_s=start_s, apex_end_s=end_s)
         return moved.select(np.argsort(start_s, kind="stable")), is_new
 

@@ -66,13 +66,14 @@ class Timeline:
 
     def select(self, selected: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
         """Return a timeline with selected visemes (mask or rows), all silences and syllables."""
-        return replace(
-            self,
+        return Timeline(
             viseme=self.viseme[selected],
             apex_start_s=self.apex_start_s[selected],
             apex_end_s=self.apex_end_s[selected],
             phone_index=self.phone_index[selected],
-            open_phone=None,
+            silence_start_s=self.silence_start_s,
+            silence_end_s=self.silence_end_s,
+            syllable_s=self.syllable_s,
         )
 
     def same_visemes(self, other: Timeline) -> bool:

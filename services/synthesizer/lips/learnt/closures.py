@@ -68,8 +68,14 @@ class ClosureRule:
         return self.sound + sound + phones - unsupported * (apart + narrow)
 
 
-_UPPER_LIP = [(4, 51), (8, 55), (9, 56)]  # FAPs of inner and outer lip
-_LOWER_LIP = [(5, 52), (10, 57), (11, 58)]
+# columns of middle, left and right of a lip; the outer lip follows the inner one
+_UPPER, _UPPER_OUTER, _LOWER, _LOWER_OUTER = (
+    np.array([MOUTH_FAPS.index(fap) for fap in faps])
+    for faps in ((4, 8, 9), (51, 55, 56), (5, 10, 11), (52, 57, 58))
+)
+_INNER = np.concatenate([_UPPER, _LOWER])
+_OUTER = np.concatenate([_UPPER_OUTER, _LOWER_OUTER])
+_BOTH = np.stack([_UPPER, _UPPER_OUTER, _LOWER, _LOWER_OUTER])
 
 
 class ClosingPhones:
@@ -161,28 +167,26 @@ def closure_share(log_odds: float, doubt: float) -> float:
 
 def close_lips(faps: Array, share: float) -> None:
     """Move both lips, FAPs (num_mouth_faps,), towards their closure, in place."""
-    _move_to_rest(faps, share, _UPPER_LIP + _LOWER_LIP)
+    _move_to_rest(faps, share, _INNER, _OUTER)
 
 
 def lip_to_teeth(faps: Array, share: float) -> None:
     """Move the lower lip towards the upper teeth, in place."""
-    _move_to_rest(faps, share, _LOWER_LIP)
+    _move_to_rest(faps, share, _LOWER, _LOWER_OUTER)
 
 
 def separate_lips(faps: Array) -> None:
     """Separate lips that pass through each other, in place."""
-    for (upper, upper_outer), (lower, lower_outer) in zip(_UPPER_LIP, _LOWER_LIP, strict=True):
-        crossed = max(0.0, faps[_column(upper)] + faps[_column(lower)])
-        faps[[_column(fap) for fap in (upper, upper_outer, lower, lower_outer)]] -= 0.5 * crossed
+    crossed = faps[_UPPER] + faps[_LOWER]
+    if (crossed > 0.0).any():
+        faps[_BOTH] -= 0.5 * np.maximum(crossed, 0.0)
 
 
-def _move_to_rest(faps: Array, share: float, pairs: list[tuple[int, int]]) -> None:
+def _move_to_rest(
+    faps: Array, share: float, inner: NDArray[np.intp], outer: NDArray[np.intp]
+) -> None:
     """Move inner lips towards rest, and the outer lips by the same distance."""
-    for inner, outer in pairs:
-        moved = share * faps[_column(inner)]
-        faps[_column(inner)] -= moved
-        faps[_column(outer)] -= moved
-
-
-def _column(fap: int) -> int:
-    return MOUTH_FAPS.index(fap)
+    if share > 0.0:
+        moved = share * faps[inner]
+        faps[inner] -= moved
+        faps[outer] -= moved

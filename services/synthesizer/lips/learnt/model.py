@@ -17,6 +17,7 @@ visemes move the whole mouth.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -111,6 +112,7 @@ class LearntStream:
         self._flushed_until_s = -np.inf  # ignore lip frames of the audio up to here
         self._known_s = start_s  # the newest lip frame depends on the audio up to here
         self._track = LipTrack(self._neutral)
+        self._on_track = still(self._neutral)  # the track at the last frame
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._rest: RestTransition | None = None  # while media time stands still
         self._late_s = 0.0  # lateness of the newest lip frame
@@ -133,7 +135,7 @@ class LearntStream:
 
     def _add_lip_frame(self, frame: LipPositions) -> None:
         numbers = (frame.time_s, frame.delay_s, frame.closure)
-        is_valid = np.isfinite(numbers).all() and (np.abs(frame.faps) < _MAX_FAP).all()
+        is_valid = all(map(math.isfinite, numbers)) and (np.abs(frame.faps) < _MAX_FAP).all()
         is_new = frame.time_s > self._newest_s
         if not is_valid or not is_new or frame.time_s + frame.delay_s <= self._flushed_until_s:
             return
@@ -148,7 +150,7 @@ class LearntStream:
         self._queue.clear()
         for phones in (self._bilabials, self._labiodentals):
             phones.clear()
-        self._track = LipTrack(self._neutral)
+        self._track, self._on_track = LipTrack(self._neutral), still(self._neutral)
         self._flushed_until_s = self._known_s + _FLUSHED_S
         self._start_transition(still(self._neutral), _SLOW_TRANSITION_S)
 
@@ -175,7 +177,7 @@ class LearntStream:
         return self._frame(visemes.articulation)
 
     def _follow_track(self, time_s: float) -> None:
-        before = self._track.at(self._time_s)
+        before = self._on_track
         self._extend_track(time_s)
         now = self._track.at(self._time_s)
         if self._rest is not None:
@@ -183,7 +185,8 @@ class LearntStream:
         elif _is_different(before, now):
             self._start_transition(now, _TRANSITION_S)
         difference = self._transition.at(time_s - self._transition_start_s)
-        self._mouth = self._track.at(time_s) + difference
+        self._on_track = self._track.at(time_s)
+        self._mouth = self._on_track + difference
 
     def _start_transition(self, target: FapState, duration_s: float) -> None:
         """Start a transition from the current mouth to a target."""
