@@ -7,6 +7,7 @@ unacknowledged messages, because ZeroMQ drops messages in flight when a peer dis
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Callable
 from itertools import islice
@@ -19,6 +20,7 @@ from kouxing.shared.wire.speech import Acknowledge
 RESEND_AFTER_S = 0.5
 MAX_RESENT = 200  # messages at a time; more would delay a busy receiver further
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
+ACKNOWLEDGE_INTERVAL_S = 0.05  # between acknowledgements of a tick
 
 
 class ReliableSender:
@@ -81,6 +83,7 @@ class ReliableReceiver:
         self._epoch = -1
         self._last = 0
         self._acknowledged = 0
+        self._acknowledge_due_s = 0.0
         self._peer = NO_PEER
 
     def receive(self, message: Message, sender: Peer) -> bool:
@@ -103,10 +106,15 @@ class ReliableReceiver:
             self.acknowledge()
         return True
 
-    def tick(self) -> None:
-        """Acknowledge messages that have arrived since the last acknowledgement."""
-        if self._last > self._acknowledged:
+    def tick(self, now_s: float) -> float:
+        """Acknowledge what has arrived since the last acknowledgement, if it is time.
+
+        Return when to call this again, unless another message arrives before.
+        """
+        if self._last > self._acknowledged and now_s >= self._acknowledge_due_s:
+            self._acknowledge_due_s = now_s + ACKNOWLEDGE_INTERVAL_S
             self.acknowledge()
+        return self._acknowledge_due_s if self._last > self._acknowledged else math.inf
 
     def acknowledge(self) -> None:
         """Send an acknowledgement to the sender of the last message, if there was a message."""

@@ -246,7 +246,7 @@ class SynthesizerService(Service):
             self._faps.disconnect_stalled((FapFrame,), live)
         due_s = self._dropped_s + DROP_INTERVAL_S
         for name, session in self._sessions.items():
-            session.receiver.tick()
+            due_s = min(due_s, session.receiver.tick(now_s))
             self.report_skipped(name, session.overload.take_report_s(now_s))
             if session.start.paced and not session.finished and not session.queue:
                 self._relax(session, now_s)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any, cast
 
 from kouxing.shared.keys import Peer
-from kouxing.shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
+from kouxing.shared.reliable import (
+    ACKNOWLEDGE_INTERVAL_S,
+    RESEND_AFTER_S,
+    ReliableReceiver,
+    ReliableSender,
+)
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress
 
@@ -51,7 +57,7 @@ class Link:
                 self.received.append(message.sequence)
 
     def acknowledge(self) -> None:
-        self.receiver.tick()
+        self.receiver.tick(math.inf)
         while self.router.sent:
             self.sender.acknowledge(self.router.sent.popleft().sequence, 0.0)
 
@@ -79,3 +85,17 @@ def test_a_new_epoch_starts_again_and_old_ones_are_ignored() -> None:
     link.send(1)
     link.deliver()
     assert link.received == [1, 2, 3, 1]
+
+
+def test_acknowledges_at_intervals_until_everything_is_acknowledged() -> None:
+    link = Link()
+    link.send(1)
+    link.deliver()
+    assert link.receiver.tick(10.0) == math.inf
+    link.send(1)
+    link.deliver()
+    due_s = 10.0 + ACKNOWLEDGE_INTERVAL_S
+    assert link.receiver.tick(10.01) == due_s
+    assert len(link.router.sent) == 1
+    assert link.receiver.tick(due_s) == math.inf
+    assert [message.sequence for message in link.router.sent] == [1, 2]
