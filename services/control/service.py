@@ -17,12 +17,11 @@ from typing import Any
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.faults import Faults
 from kouxing.services.control.kind import KIND
-from kouxing.services.control.move_repeats import MoveRepeats
+from kouxing.services.control.lifecycle import Lifecycle
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.refusal import Refusal
 from kouxing.services.control.registry import Registry
 from kouxing.services.control.requests import Requests
-from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.sessions import Sessions
 from kouxing.services.control.status import Status
 from kouxing.services.control.takeover import Takeover
@@ -46,7 +45,6 @@ from kouxing.shared.wire.session import (
     CloseSession,
     Done,
     Error,
-    ErrorCode,
     FlushSession,
     OpenSession,
     StatusRequest,
@@ -54,8 +52,6 @@ from kouxing.shared.wire.session import (
 from kouxing.shared.wire.speech import Speech
 
 STOPPED = "stopped"  # reason for a service that shut down
-START_TIMEOUT_S = 5.0
-MOVE_TIMEOUT_S = 20.0  # after which a session without a worker is closed
 CHECK_S = 0.5  # between looks at waiting sessions and the list of keys
 MAX_PAUSE_S = 0.1  # of a tick after it was due; anything longer is control's own delay
 # Events that a service may publish
@@ -78,11 +74,9 @@ class ControlService(Service):
         self._faults = Faults()
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
-        self._num_events = 0
         self._keys_version = (0, 0)  # whose revoked keys have no sessions
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._sleep_s = 0.0  # planned time until the next tick
-        self._move_repeats = MoveRepeats()
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         public = self.key.public if self.key else ""
@@ -92,6 +86,15 @@ class ControlService(Service):
         }
         requests = self._requests = Requests(self.bus, self._commands, self.metrics)
         requests.defers = True
+        self._lifecycle = Lifecycle(
+            self._registry,
+            self._sessions,
+            requests,
+            commands=self._commands,
+            events=self._events,
+            events_address=self.endpoints["events"],
+            metrics=self.metrics,
+        )
         self.register(
             self._commands,
             {
@@ -125,7 +128,7 @@ class ControlService(Service):
             self.bus.zap.refresh()
             if self.bus.zap.version != self._keys_version:
                 self._keys_version = self.bus.zap.version
-                self._end_revoked_sessions()
+                self._lifecycle.end_revoked()
         if self._takeover.is_active and now_s > self._takeover.end_s:
             self._takeover.is_active = self._requests.defers = False
             self._restore_sessions()
@@ -137,20 +140,15 @@ class ControlService(Service):
         for instance in self._registry.overdue(now_s):
             self._on_service_lost(instance, "no heartbeat")
         self._faults.report(now_s)
-        for moved in self._move_repeats.due(now_s):
-            record = self._sessions.get(moved.session)
-            if record is not None and record.epoch == moved.epoch:
-                self._commands.send(moved, to=record.client)
-        for record in self._sessions.pending():
-            self._check_timeout(record, now_s)
-        due_s = min(now_s + CHECK_S, self._registry.overdue_s(), self._move_repeats.due_s)
+        moves_due_s = self._lifecycle.on_tick(now_s)
+        due_s = min(now_s + CHECK_S, self._registry.overdue_s(), moves_due_s)
         self._sleep_s = max(0.0, due_s - now_s)
         return due_s
 
     def on_drain(self) -> bool:
         """Close all sessions."""
         for record in self._sessions:
-            self._end_session(record, "control stops")
+            self._lifecycle.end(record, "control stops")
         return True
 
     # --- requests of clients ---
@@ -162,26 +160,26 @@ class ControlService(Service):
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
             if known.announced and known.next_sequence == 1:  # its token may have been lost
-                self._end_session(known, "its client was disconnected before it was told")
+                self._lifecycle.end(known, "its client was disconnected before it was told")
                 known = None
         if known is not None and not known.announced:
             return None  # the services are starting
         record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
-        self._send_start(record, record.waiting_for)
+        self._lifecycle.send_start(record, record.waiting_for)
         return None
 
     def _close_session(self, message: CloseSession, _sender: Peer) -> Message | None:
         record = self._sessions.find_owned(message.session, message.token or "")
-        self._end_session(record, "closed by its client")
+        self._lifecycle.end(record, "closed by its client")
         if message.request is None:
             return None
         return Done(session=message.session, request=message.request)
 
     def _flush_session(self, message: FlushSession, _sender: Peer) -> Message:
         record = self._sessions.find_owned(message.session, message.token)
-        self._send_to_participants(record, replace(message, epoch=record.epoch))
-        self._publish(EventName.SESSION_FLUSHED, record.name)
+        self._lifecycle.send_to_participants(record, replace(message, epoch=record.epoch))
+        self._lifecycle.publish(EventName.SESSION_FLUSHED, record.name)
         return Done(session=message.session, request=message.request)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
@@ -192,7 +190,9 @@ class ControlService(Service):
         else:
             record = self._sessions.find(message.session)
             record.face.change(message.face, time.monotonic())
-            self._send_to_participants(record, replace(message, epoch=record.epoch, request=None))
+            self._lifecycle.send_to_participants(
+                record, replace(message, epoch=record.epoch, request=None)
+            )
         if message.request is None:
             return None
         return Done(session=message.session, request=message.request)
@@ -265,7 +265,9 @@ class ControlService(Service):
         """
         now_s = time.monotonic()
         lasted_s = self._faults.end(heartbeat.instance, now_s)
-        self._publish(EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}")
+        self._lifecycle.publish(
+            EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}"
+        )
         if replaced is not None:
             self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
         uninformed = []
@@ -275,7 +277,7 @@ class ControlService(Service):
         self._restore_sessions()
         for record in self._sessions.pending():
             if record.lost:
-                self._move_session(record)
+                self._lifecycle.move(record)
         if heartbeat.role == "observer":
             uninformed = [one for one in self._sessions if one.name not in heartbeat.sessions]
         for record in uninformed:
@@ -294,7 +296,7 @@ class ControlService(Service):
             if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
             elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:
-                self._end_session(record, f"no audio for {self._idle_limit_s:g} s")
+                self._lifecycle.end(record, f"no audio for {self._idle_limit_s:g} s")
 
     def _on_session_started(self, started: SessionStarted, instance: str) -> None:
         record = self._sessions.get(started.session)
@@ -306,8 +308,8 @@ class ControlService(Service):
                 self.warn("no-takeover", text, started.session)
         elif record is not None and started.request == record.start_request:
             deferred = self._sessions.record_started(record, instance, started.media_time)
-            self._send_start(record, deferred)
-            self._announce_if_started(record)
+            self._lifecycle.send_start(record, deferred)
+            self._lifecycle.announce_if_started(record)
 
     def _on_start_refused(self, error: Error, instance: str) -> None:
         """Reject a session that a service rejected, unless its client already uses it."""
@@ -315,7 +317,7 @@ class ControlService(Service):
         if record is None or record.announced or error.request != record.start_request:
             return
         if instance in record.waiting_for:
-            self._refuse_session(record, error)
+            self._lifecycle.refuse(record, error)
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)
@@ -325,11 +327,11 @@ class ControlService(Service):
             record.speech_time = speech.media_time
         record.speaking = speech.active
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
-        self._publish(name, record.name, media_time=speech.media_time)
+        self._lifecycle.publish(name, record.name, media_time=speech.media_time)
 
     def _on_service_event(self, event: Event, instance: str) -> None:
         if event.name in SERVICE_EVENTS:
-            self._publish(EventName(event.name), event.session, detail=event.detail)
+            self._lifecycle.publish(EventName(event.name), event.session, detail=event.detail)
         else:
             self.warn("event", f"{instance} may not publish {event.name!r}", event.session)
 
@@ -340,12 +342,12 @@ class ControlService(Service):
             LOG.info("%s stopped", instance)
         else:
             self._faults.begin(instance, reason, time.monotonic())
-        self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
+        self._lifecycle.publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
         self._move_sessions_of(instance)
 
     def _move_sessions_of(self, instance: str) -> None:
         for record in self._sessions.mark_worker_lost(instance, time.monotonic()):
-            self._move_session(record)
+            self._lifecycle.move(record)
 
     # --- sessions ---
 
@@ -357,110 +359,8 @@ class ControlService(Service):
             record = self._sessions.restore(start, time.monotonic())
             LOG.info("session taken over", extra={"session": record.name})
             uninformed = self._takeover.uninformed_observers(record.name)
-            self._send_start(record, record.waiting_for | uninformed)
+            self._lifecycle.send_start(record, record.waiting_for | uninformed)
             if record.lost:
-                self._move_session(record)
-        self._end_revoked_sessions()
+                self._lifecycle.move(record)
+        self._lifecycle.end_revoked()
         self._requests.retry_deferred()
-
-    def _send_start(self, record: SessionRecord, instances: set[str]) -> None:
-        start = record.start_message(time.monotonic())
-        for instance in instances:
-            self._commands.send(start, to=self._registry[instance].peer)
-
-    def _send_to_participants(self, record: SessionRecord, message: Message) -> None:
-        for instance in self._sessions.participants(record):
-            self._commands.send(message, to=self._registry[instance].peer)
-
-    def _check_timeout(self, record: SessionRecord, now_s: float) -> None:
-        waited_s = now_s - record.started_s
-        if record.lost:
-            if waited_s > MOVE_TIMEOUT_S:
-                lost = ", ".join(sorted(record.lost))
-                self._end_session(record, f"{lost} is lost, and no other worker is free")
-        elif record.waiting_for and waited_s > (
-            MOVE_TIMEOUT_S if record.announced else START_TIMEOUT_S
-        ):
-            self._stop_waiting(record)
-        else:
-            self._announce_if_started(record)
-
-    def _announce_if_started(self, record: SessionRecord) -> None:
-        """Tell the client that its session is open or has moved, once the services serve it.
-
-        A new session waits for the observers, so that they miss nothing. A session that moved
-        does not: its client still has audio to resend.
-        """
-        if record.lost:
-            return
-        if not record.announced and not record.waiting_for:
-            record.announced, record.moved = True, False
-            self._publish(EventName.SESSION_OPENED, record.name)
-            opened = record.opened_message(self.endpoints["events"])
-            self._requests.answer(record.client, record.opening.request, opened)
-        elif record.moved and record.announced and not record.missing_workers:
-            self._announce_move(record)
-
-    def _announce_move(self, record: SessionRecord) -> None:
-        moved = record.moved_message()
-        record.moved, record.resume_sequence = False, None
-        self._commands.send(moved, to=record.client)
-        self._events.send(moved)
-        self._publish(EventName.SESSION_MOVED, record.name)
-        workers = ", ".join(sorted({*record.workers.values()}))
-        LOG.info("session moved to %s", workers, extra={"session": record.name})
-        self._move_repeats.add(moved, time.monotonic())
-
-    def _stop_waiting(self, record: SessionRecord) -> None:
-        """Continue without observers that did not start a session; end it without a worker."""
-        missing = record.missing_workers
-        if not missing:
-            record.waiting_for.clear()
-            self._announce_if_started(record)
-            return
-        text = f"{', '.join(sorted(missing))} did not start the session in time"
-        if record.announced:
-            self._end_session(record, text)
-        else:
-            error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text)
-            self._refuse_session(record, error)
-
-    def _refuse_session(self, record: SessionRecord, error: Error) -> None:
-        """Reject a session that was not announced to its client, and end it."""
-        request = record.opening.request
-        self._requests.answer(record.client, request, replace(error, request=request))
-        self._end_session(record, error.text)
-
-    def _move_session(self, record: SessionRecord) -> None:
-        if self._sessions.move(record, time.monotonic()):
-            self._send_start(record, record.waiting_for - record.deferred)
-
-    def _end_session(self, record: SessionRecord, reason: str) -> None:
-        close = CloseSession(session=record.name, epoch=record.epoch)
-        self._send_to_participants(record, close)
-        self._sessions.remove(record, time.monotonic())
-        self._publish(EventName.SESSION_CLOSED, record.name, detail=reason)
-        LOG.info("session closed: %s", reason, extra={"session": record.name})
-
-    def _end_revoked_sessions(self) -> None:
-        """End the sessions of keys that were revoked or can no longer open sessions."""
-        has_role = self._requests.has_role
-        revoked = {key for key in self._sessions.client_keys() if not has_role(key, "client")}
-        for record in self._sessions if revoked else ():
-            if record.client.key in revoked:
-                self._end_session(record, "its client's key was revoked")
-
-    def _publish(
-        self, name: EventName, session: str = "", *, detail: str = "", media_time: int = 0
-    ) -> None:
-        self._num_events += 1
-        self.metrics.count(f"event_{name}")
-        self._events.send(
-            Event(
-                session=session,
-                sequence=self._num_events,
-                media_time=media_time,
-                name=name,
-                detail=detail[:2000],
-            )
-        )

@@ -6,8 +6,7 @@ import time
 
 import pytest
 
-from kouxing.services.control import move_repeats, takeover
-from kouxing.services.control import service as control_service
+from kouxing.services.control import lifecycle, move_repeats, takeover
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
@@ -35,7 +34,7 @@ PLACED = {
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Extend the time limits of control for slow machines."""
     monkeypatch.setattr(takeover, "TAKEOVER_S", 60.0)
-    monkeypatch.setattr(control_service, "START_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(lifecycle, "START_TIMEOUT_S", 60.0)
 
 
 def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:

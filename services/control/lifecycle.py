@@ -1,0 +1,169 @@
+"""The lifecycle of sessions: starts, announces, moves and ends them.
+
+Each step is sent to the services and the client of the session, and is published as an event.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from kouxing.services.control.move_repeats import MoveRepeats
+from kouxing.services.control.registry import Registry
+from kouxing.services.control.requests import Requests
+from kouxing.services.control.session_record import SessionRecord
+from kouxing.services.control.sessions import Sessions
+from kouxing.shared.logs import LOG
+from kouxing.shared.metrics import Metrics
+from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.control import Event, EventName
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import CloseSession, Error, ErrorCode
+
+START_TIMEOUT_S = 5.0
+MOVE_TIMEOUT_S = 20.0  # after which a session without a worker is closed
+
+
+class Lifecycle:
+    """The lifecycle of control's sessions.
+
+    ``commands`` is the socket to services and clients, ``events`` the publisher, and
+    ``events_address`` its address for clients.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        sessions: Sessions,
+        requests: Requests,
+        commands: Socket,
+        events: Socket,
+        events_address: str,
+        metrics: Metrics,
+    ) -> None:
+        self._registry = registry
+        self._sessions = sessions
+        self._requests = requests
+        self._commands = commands
+        self._events = events
+        self._events_address = events_address
+        self._metrics = metrics
+        self._num_events = 0
+        self._move_repeats = MoveRepeats()
+
+    def on_tick(self, now_s: float) -> float:
+        """Repeat moves, and find sessions that wait too long; return when the next move is due."""
+        for moved in self._move_repeats.due(now_s):
+            record = self._sessions.get(moved.session)
+            if record is not None and record.epoch == moved.epoch:
+                self._commands.send(moved, to=record.client)
+        for record in self._sessions.pending():
+            self._check_timeout(record, now_s)
+        return self._move_repeats.due_s
+
+    def send_start(self, record: SessionRecord, instances: set[str]) -> None:
+        """Ask services to start serving a session."""
+        start = record.start_message(time.monotonic())
+        for instance in instances:
+            self._commands.send(start, to=self._registry[instance].peer)
+
+    def send_to_participants(self, record: SessionRecord, message: Message) -> None:
+        """Send a message to the services of a session."""
+        for instance in self._sessions.participants(record):
+            self._commands.send(message, to=self._registry[instance].peer)
+
+    def announce_if_started(self, record: SessionRecord) -> None:
+        """Tell the client that its session is open or has moved, once the services serve it.
+
+        A new session waits for the observers, so that they miss nothing. A session that moved
+        does not: its client still has audio to resend.
+        """
+        if record.lost:
+            return
+        if not record.announced and not record.waiting_for:
+            record.announced, record.moved = True, False
+            self.publish(EventName.SESSION_OPENED, record.name)
+            opened = record.opened_message(self._events_address)
+            self._requests.answer(record.client, record.opening.request, opened)
+        elif record.moved and record.announced and not record.missing_workers:
+            self._announce_move(record)
+
+    def move(self, record: SessionRecord) -> None:
+        """Move a session to other workers, if some are free."""
+        if self._sessions.move(record, time.monotonic()):
+            self.send_start(record, record.waiting_for - record.deferred)
+
+    def refuse(self, record: SessionRecord, error: Error) -> None:
+        """Reject a session that was not announced to its client, and end it."""
+        request = record.opening.request
+        self._requests.answer(record.client, request, replace(error, request=request))
+        self.end(record, error.text)
+
+    def end(self, record: SessionRecord, reason: str) -> None:
+        """End a session; ``reason`` is for the log and the event."""
+        close = CloseSession(session=record.name, epoch=record.epoch)
+        self.send_to_participants(record, close)
+        self._sessions.remove(record, time.monotonic())
+        self.publish(EventName.SESSION_CLOSED, record.name, detail=reason)
+        LOG.info("session closed: %s", reason, extra={"session": record.name})
+
+    def end_revoked(self) -> None:
+        """End the sessions of keys that were revoked or can no longer open sessions."""
+        has_role = self._requests.has_role
+        revoked = {key for key in self._sessions.client_keys() if not has_role(key, "client")}
+        for record in self._sessions if revoked else ():
+            if record.client.key in revoked:
+                self.end(record, "its client's key was revoked")
+
+    def publish(
+        self, name: EventName, session: str = "", *, detail: str = "", media_time: int = 0
+    ) -> None:
+        """Publish an event."""
+        self._num_events += 1
+        self._metrics.count(f"event_{name}")
+        self._events.send(
+            Event(
+                session=session,
+                sequence=self._num_events,
+                media_time=media_time,
+                name=name,
+                detail=detail[:2000],
+            )
+        )
+
+    def _check_timeout(self, record: SessionRecord, now_s: float) -> None:
+        waited_s = now_s - record.started_s
+        if record.lost:
+            if waited_s > MOVE_TIMEOUT_S:
+                lost = ", ".join(sorted(record.lost))
+                self.end(record, f"{lost} is lost, and no other worker is free")
+        elif record.waiting_for and waited_s > (
+            MOVE_TIMEOUT_S if record.announced else START_TIMEOUT_S
+        ):
+            self._stop_waiting(record)
+        else:
+            self.announce_if_started(record)
+
+    def _announce_move(self, record: SessionRecord) -> None:
+        moved = record.moved_message()
+        record.moved, record.resume_sequence = False, None
+        self._commands.send(moved, to=record.client)
+        self._events.send(moved)
+        self.publish(EventName.SESSION_MOVED, record.name)
+        workers = ", ".join(sorted({*record.workers.values()}))
+        LOG.info("session moved to %s", workers, extra={"session": record.name})
+        self._move_repeats.add(moved, time.monotonic())
+
+    def _stop_waiting(self, record: SessionRecord) -> None:
+        """Continue without observers that did not start a session; end it without a worker."""
+        missing = record.missing_workers
+        if not missing:
+            record.waiting_for.clear()
+            self.announce_if_started(record)
+            return
+        text = f"{', '.join(sorted(missing))} did not start the session in time"
+        if record.announced:
+            self.end(record, text)
+        else:
+            error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text)
+            self.refuse(record, error)
