@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.config import DriverConfig
-from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.render.scene import background, camera, load_head
+from kouxing.services.driver.render.scene import background, camera, load_head, open_renderer
 from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
@@ -30,20 +29,20 @@ class View:
     """
 
     def __init__(self, config: DriverConfig, on_switch: Callable[[int], None]) -> None:
-        self._config = config
-        self._head = load_head(config.head)
-        self._background = background(config.background)
-        if self._background is None:
+        if background(config.background) is None:
             raise UserError(
                 "driver.background: windows and MP4 files cannot be transparent; give a color"
             )
-        self._camera = camera(self._head, config.camera)
-        self._window = self._open_window(on_switch)
+        self._window = _open_window(config, on_switch)
         self._is_window_open = self._window is not None
         self._virtual_camera: VirtualCamera | None = None
         if config.virtual_camera:
-            self._virtual_camera = VirtualCamera(self._camera_renderer(), config.frame_rate_hz)
+            context = None if self._window is None else self._window.context
+            renderer = open_renderer(config, context)
+            self._virtual_camera = VirtualCamera(renderer, config.frame_rate_hz)
             LOG.info("the virtual camera is %s", self._virtual_camera.device)
+        elif self._window is None:
+            load_head(config.head)  # an unknown head is an error even if nothing shows it
 
     @property
     def is_live(self) -> bool:
@@ -66,36 +65,26 @@ class View:
         if self._virtual_camera is not None:
             self._virtual_camera.close()
 
-    def _camera_renderer(self) -> Renderer:
-        return Renderer(
-            self._head,
-            self._config.width_px,
-            self._config.height_px,
-            background=self._background,
-            camera=self._camera,
-            context=None if self._window is None else self._window.context,
+
+def _open_window(config: DriverConfig, on_switch: Callable[[int], None]) -> Window | None:
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if config.view == "none" or (config.view == "auto" and not has_display):
+        return None
+    # glfw starts processes on import
+    from kouxing.services.driver.render.window import Window  # noqa: PLC0415
+
+    head = load_head(config.head, "coarse")  # live, smooth motion matters more than outlines
+    try:
+        return Window(
+            head,
+            config.width_px,
+            config.height_px,
+            background=background(config.background),
+            camera=camera(head, config.camera),
+            on_switch=on_switch,
         )
-
-    def _open_window(self, on_switch: Callable[[int], None]) -> Window | None:
-        config = self._config
-        has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-        if config.view == "none" or (config.view == "auto" and not has_display):
-            return None
-        # glfw starts processes on import
-        from kouxing.services.driver.render.window import Window  # noqa: PLC0415
-
-        head = load_head(config.head, "coarse")  # live, smooth motion matters more than outlines
-        try:
-            return Window(
-                head,
-                config.width_px,
-                config.height_px,
-                background=self._background,
-                camera=self._camera,
-                on_switch=on_switch,
-            )
-        except UserError as error:
-            if config.view == "window":
-                raise
-            LOG.warning("cannot open a window: %s", error)
-            return None
+    except UserError as error:
+        if config.view == "window":
+            raise
+        LOG.warning("cannot open a window: %s", error)
+        return None

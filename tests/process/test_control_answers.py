@@ -62,8 +62,8 @@ def test_a_service_can_refuse_a_session(stage: Stage) -> None:
     assert isinstance(stage.open(client, "mine", "2"), SessionOpened)
 
 
-class Link:
-    """Forwards connections to control; a link that is not open holds what arrives."""
+class ControlProxy:
+    """Forwards connections to control; a proxy that is not open holds what arrives."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -110,13 +110,13 @@ class Link:
 
 
 @pytest.fixture
-def link(stage: Stage) -> Iterator[Link]:
+def link(stage: Stage) -> Iterator[ControlProxy]:
     port = stage.control.endpoints["commands"].partition(" ")[0].rpartition(":")[2]
-    with contextlib.closing(Link(int(port))) as made:
+    with contextlib.closing(ControlProxy(int(port))) as made:
         yield made
 
 
-def disconnect_before_the_answer(stage: Stage, link: Link) -> tuple[zmq.Socket[bytes], str]:
+def disconnect_before_the_answer(stage: Stage, link: ControlProxy) -> tuple[zmq.Socket[bytes], str]:
     """Return a client that misses the answer to its request, and the token in that answer."""
     address = f"tcp://127.0.0.1:{link.listener.getsockname()[1]}"
     client = stage.stranger(stage.control.key and user_key(), address)
@@ -131,7 +131,9 @@ def disconnect_before_the_answer(stage: Stage, link: Link) -> tuple[zmq.Socket[b
     return client, lost.token
 
 
-def test_a_client_that_missed_the_answer_opens_the_session_again(stage: Stage, link: Link) -> None:
+def test_a_client_that_missed_the_answer_opens_the_session_again(
+    stage: Stage, link: ControlProxy
+) -> None:
     client, lost = disconnect_before_the_answer(stage, link)
     opened = stage.open(client, "mine")
     assert isinstance(opened, SessionOpened)
@@ -140,7 +142,7 @@ def test_a_client_that_missed_the_answer_opens_the_session_again(stage: Stage, l
     assert stage.open(client, "mine") == opened
 
 
-def test_a_session_with_audio_is_not_opened_again(stage: Stage, link: Link) -> None:
+def test_a_session_with_audio_is_not_opened_again(stage: Stage, link: ControlProxy) -> None:
     client, _ = disconnect_before_the_answer(stage, link)
     record = stage.control._sessions.find("mine")
     recognizer = dataclasses.replace(

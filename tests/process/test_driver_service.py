@@ -103,6 +103,8 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
         yield stage
         stage.driver.on_shutdown()
         stage.driver.bus.close()
+    for recorder in multiprocessing.active_children():  # it may still be ending
+        recorder.join()
 
 
 def test_shows_one_session_while_recording_another(stage: Stage) -> None:

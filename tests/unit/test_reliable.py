@@ -31,7 +31,7 @@ class FakeSocket:
         return True
 
 
-class Link:
+class ReliablePair:
     """A sender and a receiver of one session."""
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class Link:
 
 
 def test_resends_lost_messages_and_delivers_each_once_and_in_order() -> None:
-    link = Link()
+    link = ReliablePair()
     link.send(5)
     link.deliver(lose=(3,))
     assert link.received == [1, 2]
@@ -78,7 +78,7 @@ def test_resends_lost_messages_and_delivers_each_once_and_in_order() -> None:
 
 
 def test_a_new_epoch_starts_again_and_old_ones_are_ignored() -> None:
-    link = Link()
+    link = ReliablePair()
     link.send(3)
     link.deliver()
     link.make_sender(epoch=2).send(Progress(level_db=0.0), now_s=0.0)

@@ -19,7 +19,7 @@ from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speec
 FAPS = bytes(range(4)) * NUM_FAPS
 
 
-class Link(SynthesizerLink):
+class FakeSynthesizerLink(SynthesizerLink):
     """A link to a synthesizer whose socket is a list."""
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ def progress(time_s: float) -> Progress:
 
 
 def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> None:
-    link = Link()
+    link = FakeSynthesizerLink()
     link.send_all(Speech(media_time=0, active=True), *[progress(number) for number in range(1, 8)])
     assert len(link.acknowledge_up_to(7, frame=40)) == 7
     resume, speech, *rest = link.connect_to(2)
@@ -63,7 +63,7 @@ def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> 
 
 
 def test_forgets_messages_before_an_interruption() -> None:
-    link = Link()
+    link = FakeSynthesizerLink()
     link.send_all(Speech(media_time=0, active=True), progress(1.0))
     link.acknowledge_up_to(2)
     link.forget()
@@ -73,7 +73,7 @@ def test_forgets_messages_before_an_interruption() -> None:
 
 
 def test_drops_messages_only_while_the_synthesizer_is_too_slow() -> None:
-    link = Link()
+    link = FakeSynthesizerLink()
     link.send_all(*[progress(0.0)] * (MAX_BACKLOG + 1))
     assert link.is_full, "audio waits"
     assert [link.check_overdue(time_s) for time_s in (1.0, 2.0, 1.1 + MAX_OVERDUE_S)] == [

@@ -41,7 +41,7 @@ _FACE = (
 )  # fmt: skip
 
 
-class FaceFields:
+class SkinFields:
     """The fields of a skin with vertices (V, 3), m, and triangles (F, 3).
 
     ``points`` are the vertices of feature points, at least those in ``INNER`` and ``OUTER``, 2.1

@@ -24,7 +24,7 @@ from kouxing.services.driver.head.import_fields import (
     LOWER_LIP,
     OUTER,
     UPPER_LIP,
-    FaceFields,
+    SkinFields,
 )
 from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
 from kouxing.services.driver.head.pieces import Fields, Primitive, pack, weld
@@ -111,7 +111,7 @@ class _Import:
         fapu = self._measure()
         skin, local, inside = self._skin
         points = {name: int(local[v]) for name, v in self._points.items() if local[v] >= 0}
-        face = FaceFields(self._welded[skin], inside, points, self._eyes, fapu)
+        face = SkinFields(self._welded[skin], inside, points, self._eyes, fapu)
         fields, roles = self._move(face, fapu)
         pieces, rows = self._split(roles)
         order = np.concatenate(rows)
@@ -276,7 +276,7 @@ class _Import:
             )
         return fapu
 
-    def _move(self, face: FaceFields, fapu: dict[str, float]) -> tuple[Fields, NDArray[np.int8]]:
+    def _move(self, face: SkinFields, fapu: dict[str, float]) -> tuple[Fields, NDArray[np.int8]]:
         """Return the fields (V, 3), and per vertex 1 (left eye), 2 (right eye) or 0."""
         skin = self._skin[0]
         fields = {fap: np.zeros_like(self._welded) for fap in face.fields}

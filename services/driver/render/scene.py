@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import moderngl
 import numpy as np
 
 from kouxing.services.driver.config import DriverConfig, Framing
@@ -77,8 +78,8 @@ def background(text: str) -> Background:
     return color, color
 
 
-def open_renderer(config: DriverConfig) -> Renderer:
-    """Open a renderer for the driver's videos.
+def open_renderer(config: DriverConfig, context: moderngl.Context | None = None) -> Renderer:
+    """Open a renderer for the driver's videos; ``context`` is that of a window.
 
     Raises ``UserError`` if OpenGL cannot start, or a setting is invalid.
     """
@@ -89,4 +90,5 @@ def open_renderer(config: DriverConfig) -> Renderer:
         config.height_px,
         background=background(config.background),
         camera=camera(head, config.camera),
+        context=context,
     )
