@@ -68,9 +68,9 @@ class Overload:
         """Record that the sender was silent: its next audio is due when it arrives."""
         self._due_s = None
 
-    def is_late(self, waiting_s: float, now_s: float, *, for_s: float = 0.0) -> bool:
-        """Return whether the oldest audio is late by more than the limit, for some time."""
-        return self._late_s(waiting_s, now_s) > self._max_behind_s + for_s
+    def is_late(self, now_s: float, *, for_s: float = 0.0) -> bool:
+        """Return whether the newest audio has been late by more than the limit, for some time."""
+        return self._late_s(0.0, now_s) > self._max_behind_s + for_s
 
     def adapt(self, now_s: float) -> None:
         """Record that the newest audio was just received: it may be in time."""

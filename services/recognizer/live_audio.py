@@ -38,9 +38,9 @@ class LiveAudio:
         self._chunks.append(chunk)
         self._num_samples += len(samples)
 
-    def is_late(self, now_s: float) -> bool:
-        """Return whether the oldest chunk is too late."""
-        return self.overload.is_late(self._waiting_s, now_s) if self._chunks else False
+    def is_outdated(self, now_s: float) -> bool:
+        """Return whether even the newest chunk is late, so more audio should have arrived."""
+        return bool(self._chunks) and self.overload.is_late(now_s)
 
     def relieve(self, now_s: float) -> Relief:
         """Return what the session gives up; drop audio that is too old."""

@@ -320,10 +320,10 @@ class RecognizerService(Service):
         return sum(session.audio.duration_s for session in self._sessions.values())
 
     def _read_late_audio(self) -> None:
-        """If a session is late, read all audio that has arrived, so that one cut is enough."""
+        """After a stall, read all audio that has arrived, so that one cut is enough."""
         end_s = time.monotonic() + MAX_READ_S
         while not self._is_live_blocked and (now_s := time.monotonic()) < end_s:
-            late = [one.audio for one in self._sessions.values() if one.audio.is_late(now_s)]
+            late = [one.audio for one in self._sessions.values() if one.audio.is_outdated(now_s)]
             if not late:
                 return
             if not self._audio.wait(READ_WAIT_S):

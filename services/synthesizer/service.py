@@ -373,7 +373,7 @@ class SynthesizerService(Service):
             duration_s = max(0.0, event.time_s - session.newest_s)
             session.overload.add(duration_s, now_s, has_waiting=len(session.queue) > 1)
             session.newest_s = max(session.newest_s, event.time_s)
-        if session.start.paced and session.overload.is_late(0.0, now_s, for_s=MAX_LATE_FOR_S):
+        if session.start.paced and session.overload.is_late(now_s, for_s=MAX_LATE_FOR_S):
             return  # newer events may have arrived
         if len(session.queue) == 1:
             self._make_frames(session)
