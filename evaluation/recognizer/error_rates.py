@@ -46,6 +46,7 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import CONSOLE
 
 # The paper's rule, and one for fewer errors. They are measured in clean speech.
 RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))
@@ -161,7 +162,7 @@ def evaluate_recognizer(
     """
     speech: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
     by_rule: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
-    for reference in track(references, description="recognizing"):
+    for reference in track(references, "recognizing", console=CONSOLE, transient=True):
         samples = reference.read_audio()
         for name, disturb in disturbances.items():
             scored = _score(model, disturb(samples))

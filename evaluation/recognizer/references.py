@@ -20,6 +20,7 @@ from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.terminal import CONSOLE
 
 _RATES = (4.0, 5.5, 7.0)  # limits of the classes of speaking rates, syllables per second
 RATE_NAMES = (
@@ -57,7 +58,7 @@ def align_corpus(
     """
     references = []
     utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
-    for utterance in track(utterances, description=f"aligning {split}"):
+    for utterance in track(utterances, f"aligning {split}", console=CONSOLE, transient=True):
         try:
             samples = read_audio(utterance.path)
             syllables = syllables_of(utterance, model.inventory)

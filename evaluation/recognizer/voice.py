@@ -33,7 +33,7 @@ from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.pcm import SLICE, slices
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.phones.events import Phone, SpeechChange
-from kouxing.shared.terminal import print_table
+from kouxing.shared.terminal import CONSOLE, print_table
 
 Mask = NDArray[np.bool_]  # (slices,)
 Figures = Mapping[str, Any]
@@ -108,11 +108,11 @@ def evaluate_voice(
     on; None without such audio.
     """
     results: dict[str, dict[str, Any]] = {name: {} for name in models}
-    for material in materials:
+    for material in track(materials, "voice activity", console=CONSOLE, transient=True):
         voiced = np.concatenate([mask for _, mask in material.recordings])
         for name, model in models.items():
-            recordings = track(material.recordings, description=material.kind)
-            is_on = np.concatenate([voice_activity(model, samples) for samples, _ in recordings])
+            states = [voice_activity(model, samples) for samples, _ in material.recordings]
+            is_on = np.concatenate(states)
             results[name][material.kind] = {
                 part: {
                     "seconds": float(mask.sum()) * _SLICE_S,
