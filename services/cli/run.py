@@ -15,7 +15,7 @@ import typer
 
 from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
-from kouxing.services.cli.running_system import announce, find_control, starting
+from kouxing.services.cli.running_system import announce, find_control, reserve, starting
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.kinds import (
@@ -75,11 +75,9 @@ def run(
     driver = settings.load(DriverConfig)
     out = Path(driver.out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
+    reservation = _entered(reserve(out))
     arguments = ["--config", str(config)] if config else []
-    startup = contextlib.ExitStack()
-    startup.enter_context(
-        starting(lambda: print_message("waiting until another kouxing has started"))
-    )
+    startup = _entered(starting(lambda: print_message("waiting until another kouxing has started")))
     with naming_option("--port", "gateway.port", is_given=port is not None):
         addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
@@ -95,8 +93,13 @@ def run(
     if not control_config.insecure:
         check_keys({kind.name: kind.key_roles for kind in KINDS.values()})
     client_control = control_endpoint(control, insecure=control_config.insecure)
-    more = extra_worker_environments(settings, workers)
-    supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment, more=more)
+    supervisor = Supervisor(
+        arguments,
+        out / "logs",
+        CONSOLE,
+        environment,
+        more=extra_worker_environments(settings, workers),
+    )
     _install_signal_handlers()
     if remark := _port_remark(settings, addresses, control):
         print_message(remark)
@@ -125,6 +128,7 @@ def run(
         print_message("stopping")
     finally:
         supervisor.stop()
+        reservation.close()
 
 
 def head_environment(name: str, out: Path) -> dict[str, str]:
@@ -156,6 +160,13 @@ def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
         for service in (COMMON, *KINDS) if table == COMMON else (table,):
             environment[variable(service, key)] = value
     return environment
+
+
+def _entered(context: contextlib.AbstractContextManager[None]) -> contextlib.ExitStack:
+    """Enter a context; return what closes it."""
+    stack = contextlib.ExitStack()
+    stack.enter_context(context)
+    return stack
 
 
 def _control_address(bound: str) -> str:

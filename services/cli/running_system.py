@@ -13,6 +13,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from kouxing.shared.errors import UserError
+
 
 @contextlib.contextmanager
 def announce(control: str) -> Iterator[None]:
@@ -55,6 +57,27 @@ def starting(on_wait: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def reserve(folder: Path) -> Iterator[None]:
+    """Keep other systems out of the folder for logs and videos while this one runs.
+
+    Raises ``UserError`` if another system uses it. If it cannot be used, nothing is reserved.
+    """
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(
+                    f"{folder}: another kouxing writes its logs and videos to this folder; stop it,"
+                    " or add --set driver.out=FOLDER"
+                ) from None
+        yield
 
 
 def find_control() -> str:

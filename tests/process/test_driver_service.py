@@ -218,7 +218,10 @@ def test_the_recorder_ends_when_there_is_no_video(
     stage.step_until(lambda: not multiprocessing.active_children())
 
 
-def test_a_stopping_driver_saves_the_finished_part_of_a_video(stage: Stage) -> None:
+def test_a_stopping_driver_saves_the_finished_part_of_a_video(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recordings, "CLOSE_LIMIT_S", 60.0)
     stage.start("film", record=True)
     for number in range(26):
         stage.publish("film", number, 100.0)

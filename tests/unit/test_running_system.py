@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.services.cli.clients import control_address
-from kouxing.services.cli.running_system import announce, find_control, starting
+from kouxing.services.cli.running_system import announce, find_control, reserve, starting
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import user_key
 
@@ -84,3 +84,17 @@ def test_a_system_that_cannot_be_announced_runs(monkeypatch: pytest.MonkeyPatch)
         with announce("tcp://127.0.0.1:1"):
             pass
     assert find_control() == ""
+
+
+def test_two_systems_do_not_share_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "my" / "out"
+    with reserve(folder):
+        with reserve(tmp_path / "other"):
+            pass
+        with (
+            pytest.raises(UserError, match=r"my/out: another kouxing writes .* driver.out=FOLDER"),
+            reserve(folder),
+        ):
+            pass
+    with reserve(folder):
+        pass
