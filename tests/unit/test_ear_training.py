@@ -45,7 +45,7 @@ def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def piece(samples: np.ndarray, voice: Voice = Voice.SPEECH) -> Piece:
     """Make a piece whose pitch is the number of the position."""
     num_positions = len(samples) // POSITION_SAMPLES
-    rows = np.zeros((num_positions, COLUMNS.encoder.stop), np.float16)
+    rows = np.zeros((num_positions, COLUMNS.lips.stop), np.float16)
     rows[:, PITCH], rows[:, VOICE] = np.arange(num_positions), voice
     rows[:, COLUMNS.phones] = 1 / NUM_PHONES
     return Piece(as_integers(samples[: POSITION_SAMPLES * num_positions]), rows, 1.0)
@@ -113,7 +113,7 @@ def test_pauses_have_no_voice_and_no_other_target(monkeypatch: pytest.MonkeyPatc
 def test_loss_leaves_out_unknown_targets() -> None:
     ear = Ear(NUM_PHONES, width=8)
     inputs = torch.randn(2, 9, 160)
-    rows = torch.randn(2, 9, COLUMNS.encoder.stop)
+    rows = torch.randn(2, 9, COLUMNS.lips.stop)
     rows[..., VOICE] = 1
     rows[:, 3:5, :VOICE] = rows[:, 3:5, VOICE + 1 :] = torch.nan
     loss = ear.loss(inputs, rows)

@@ -7,8 +7,8 @@ symbol      meaning                                                          sha
 =========== ================================================================ =====================
 frames      the two newest log-mel frames, the older one first               (sessions, 160)
 state       states of both recurrent layers                                  (sessions, 2 width)
-features    components of the causal network and of Whisper's encoder: the   (sessions, 256)
-            inputs of a lip model
+features    components of the causal network and of Whisper's encoder, and   (sessions, 307)
+            lips: the inputs of a lip model
 phones      log posteriors                                                   (sessions, phones)
 voice       probabilities of no voice, speech, sung or held voice, laughter  (sessions, 4)
 scalars     probability of voicing; pitch, log2 of Hz; level; effort         (sessions, 4)
@@ -29,8 +29,14 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
 from kouxing.shared.errors import UserError
-from kouxing.training.ear.network import MEAN_PITCH, NUM_INPUTS, NUM_OTHER_OUTPUTS, Ear
-from kouxing.training.ear.targets import NUM_COMPONENTS, Voice
+from kouxing.training.ear.network import (
+    MEAN_PITCH,
+    NUM_FEATURES,
+    NUM_INPUTS,
+    NUM_OTHER_OUTPUTS,
+    Ear,
+)
+from kouxing.training.ear.targets import Voice
 from kouxing.training.neural.onnx_graph import Floats, Graph, arrays_of, floats
 
 FORMAT = "ear 1"
@@ -82,14 +88,14 @@ class _EarGraph(Graph):
 
     def build_step_model(self) -> NDArray[np.uint8]:
         """Add all nodes; return the ONNX file."""
-        width, features = self._width, 2 * NUM_COMPONENTS
+        width = self._width
         entered = self.node("Relu", [self.product("frames", self._parameters, "entry")])
         states = self.split("state", ["first_state", "second_state"])
         first = self._step(entered, states[0], "first")
         second = self._step(first, states[1], "second")
         self.node("Concat", [first, second], "new_state", axis=-1)
         rows = self.product(self.node("Add", [first, second]), self._parameters, "output")
-        sizes = (features, self._num_phones, len(Voice), 1, 3)
+        sizes = (NUM_FEATURES, self._num_phones, len(Voice), 1, 3)
         names = ["features", "phone_logits", "voice_logits", "voicing_logit", "others"]
         _, phones, voice, voicing, others = self.split(rows, names, *sizes)
         self.node("LogSoftmax", [phones], "phones", axis=-1)
@@ -99,7 +105,7 @@ class _EarGraph(Graph):
         self.node("Concat", parts, "scalars", axis=-1)
         inputs = [floats("frames", "sessions", NUM_INPUTS), floats("state", "sessions", 2 * width)]
         outputs = [
-            floats("features", "sessions", features),
+            floats("features", "sessions", NUM_FEATURES),
             floats("phones", "sessions", self._num_phones),
             floats("voice", "sessions", len(Voice)),
             floats("scalars", "sessions", 4),

@@ -8,14 +8,14 @@
 symbol   meaning                                                            shape
 ======== ================================================================== ==================
 x        two log-mel frames, 2 p + 1 and 2 p + 2, of position p             (160,)
-y        components of the causal network at position p; at position        (outputs,)
-         p - 2: components of Whisper's encoder, phones and voice classes
-         (logits), voicing (logit), pitch, level, effort
+y        components of the causal network and lips at position p; at        (outputs,)
+         position p - 2: components of Whisper's encoder, phones and voice
+         classes (logits), voicing (logit), pitch, level, effort
 ======== ================================================================== ==================
 
 A step uses audio up to 65 ms after the middle of position p - 2.
 
-    loss = E(causal) + E(encoder) + H(phones) / 3 + H(voice) + H(voicing) / 3
+    loss = E(causal) + E(encoder) + 3 E(lips) + H(phones) / 3 + H(voice) + H(voicing) / 3
            + |pitch| + E(level) / 5 + E(effort) / 5
 
 E is a mean squared error and H a cross-entropy. Pitch errors are in octaves. Unknown targets are
@@ -39,6 +39,7 @@ from kouxing.training.ear.targets import (
     EFFORT,
     LEVEL,
     NUM_COMPONENTS,
+    NUM_LIPS,
     PITCH,
     VOICE,
     Columns,
@@ -48,8 +49,10 @@ from kouxing.training.ear.targets import (
 NUM_INPUTS = 2 * NUM_MELS
 LOOK_AHEAD = 2  # positions; the first output has no look-ahead
 WIDTH = 384
-NUM_OTHER_OUTPUTS = 2 * NUM_COMPONENTS + len(Voice) + 4  # all but the phones
+NUM_FEATURES = 2 * NUM_COMPONENTS + NUM_LIPS  # the first outputs
+NUM_OTHER_OUTPUTS = NUM_FEATURES + len(Voice) + 4  # all but the phones
 
+_LIPS_WEIGHT = 3.0
 _PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 3, 1 / 3, 1 / 5
 
 
@@ -59,6 +62,7 @@ class Outputs:
 
     causal: Tensor  # (..., 128)
     encoder: Tensor  # (..., 128)
+    lips: Tensor  # (..., 51)
     phones: Tensor  # (..., phones) logits
     voice: Tensor  # (..., 4) logits
     voicing: Tensor  # (...,) logit
@@ -79,7 +83,8 @@ class Ear(nn.Module):
         self.entry = nn.Linear(NUM_INPUTS, width)
         self.first = nn.GRU(width, width, batch_first=True)
         self.second = nn.GRU(width, width, batch_first=True)
-        self.sizes = [NUM_COMPONENTS, NUM_COMPONENTS, num_phones, len(Voice), 1, 1, 1, 1]
+        components = [NUM_COMPONENTS, NUM_COMPONENTS, NUM_LIPS]
+        self.sizes = [*components, num_phones, len(Voice), 1, 1, 1, 1]
         self.output = nn.Linear(width, sum(self.sizes))
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -114,6 +119,7 @@ class Ear(nn.Module):
         losses = (
             _squared_error(now.causal, targets[..., self.columns.causal]),
             _squared_error(late.encoder, before[..., self.columns.encoder]),
+            _LIPS_WEIGHT * _squared_error(now.lips, targets[..., self.columns.lips]),
             _PHONES_WEIGHT * _mean(entropy, has_phones),
             cross_entropy(late.voice.flatten(0, 1), voice.flatten().long()),
             _VOICING_WEIGHT * _mean(voicing, has_phones),

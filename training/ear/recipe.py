@@ -2,7 +2,7 @@
 
 If training is interrupted, the same command resumes it. Next to the output, the folder ``.targets``
 contains the targets, and ``.checkpoint.pt`` the training state. Targets of further recordings are
-computed during training, so the first checkpoint exists after minutes.
+computed during training, so the first checkpoint exists after half an hour.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from kouxing.training.neural.network import mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, warm_up_factor
 from kouxing.training.training_set import Report, read_utterances, weights_of
 
-_FIRST_CHUNKS, _STEPS_PER_CHUNK = 8, 24  # chunks at the start; steps until the next one
+_FIRST_CHUNKS, _STEPS_PER_CHUNK = 64, 24  # chunks at the start; steps until the next one
 _RATE, _WARM_UP_STEPS = 1e-3, 200
 _VALIDATE_EVERY, _NUM_VALIDATED = 250, 3  # steps; batches
 _BACKGROUNDS = ("music", "noise", "babble")

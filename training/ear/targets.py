@@ -13,6 +13,7 @@ voice     number of a :class:`Voice`                                            
 phones    posteriors                                                            phones
 causal    principal components of the causal network's values                   128
 encoder   principal components of Whisper's encoder                             128
+lips      outputs of the lip predictor, standardized                            51
 ========= ===================================================================== ========
 
 A principal component is divided by the square root of its standard deviation, so that later
@@ -32,15 +33,22 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_floats, as_integers
 from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.shared.errors import UserError
 from kouxing.training.ear.singing import sing
-from kouxing.training.ear.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
+from kouxing.training.ear.teachers import (
+    LIP_DELAYS_S,
+    POSITION_SAMPLES,
+    TeacherOutputs,
+    Teachers,
+)
 
 Floats = NDArray[np.float32]
 Samples = NDArray[np.int16]  # 16 kHz
 
 PITCH, LEVEL, EFFORT, VOICE = range(4)  # columns
 NUM_COMPONENTS = 128
+NUM_LIPS = len(LIP_DELAYS_S) * NUM_OUTPUTS
 CHUNK_SIZE = 64  # recordings
 _NUM_FITTED = 192  # recordings that the principal components are computed from
 _SUNG_PROB = 0.25
@@ -100,6 +108,11 @@ class Columns:
         """Components of Whisper's encoder."""
         return slice(self.causal.stop, self.causal.stop + NUM_COMPONENTS)
 
+    @property
+    def lips(self) -> slice:
+        """Outputs of the lip predictor."""
+        return slice(self.encoder.stop, self.encoder.stop + NUM_LIPS)
+
 
 class TargetStore:
     """The chunks in a folder."""
@@ -135,7 +148,7 @@ class TargetStore:
         return self._pieces
 
     def _check_key(self) -> None:
-        key = hashlib.sha256(f"1 {self._seed} {self._teachers.digest}".encode())
+        key = hashlib.sha256(f"2 {self._seed} {self._teachers.digest}".encode())
         for recording in self._recordings:
             key.update(f"{recording.name} {recording.voice}\n".encode())
         path = self._folder / "key"
@@ -147,7 +160,7 @@ class TargetStore:
             )
 
     def _load_basis(self) -> dict[str, Floats]:
-        """Load the principal components, or compute them from the first recordings."""
+        """Load the bases of components and lips, or compute them from the first recordings."""
         path = self._folder / "basis.npz"
         if not path.exists():
             speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
@@ -160,6 +173,8 @@ class TargetStore:
                 values = np.concatenate([getattr(outputs, name) for outputs in all_outputs])
                 basis[f"{name}_mean"] = values.mean(axis=0)
                 basis[name] = _components_of(values - basis[f"{name}_mean"])
+            lips = np.concatenate([outputs.lips for outputs in all_outputs])
+            basis |= {"lips_mean": lips.mean(axis=0), "lips_deviation": lips.std(axis=0)}
             np.savez(path.with_suffix(".part.npz"), allow_pickle=False, **basis)
             path.with_suffix(".part.npz").replace(path)
         with np.load(path, allow_pickle=False) as file:
@@ -204,7 +219,9 @@ class TargetStore:
             voice[~self._is_audible(outputs, recording.voice)] = Voice.NONE
             scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
             components = [self._project(outputs, name) for name in ("causal", "encoder")]
-            targets = np.column_stack([*scalars, outputs.phones, *components]).astype(np.float16)
+            lips = (outputs.lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
+            rows = [*scalars, outputs.phones, *components, lips]
+            targets = np.column_stack(rows).astype(np.float16)
             kept = samples[: POSITION_SAMPLES * len(targets)]
             pieces.append(Piece(kept, targets, recording.weight))
         return pieces

@@ -1,8 +1,8 @@
-"""The teachers of the small ear: what three trained networks compute from a clean recording.
+"""The teachers of the small ear: what trained networks compute from a clean recording.
 
 The causal network and the block network come from the shipped models. Their 8-bit ONNX weights are
 converted to floats, so that PyTorch can run whole recordings. This is several times faster than the
-live networks. The third teacher is Whisper's unchanged encoder.
+live networks. The third teacher is Whisper's unchanged encoder, the fourth the lip predictor.
 
 ======== ==================================================================== =================
 symbol   meaning                                                              shape
@@ -12,6 +12,7 @@ causal   attention values of the causal network's last two layers. Position   (p
          p has seen the frames up to 2 p + 2
 encoder  positions of Whisper's encoder after layers 4 and 6, which have      (positions, 2 w)
          seen the whole recording
+lips     outputs of the lip predictor, for each of `LIP_DELAYS_S`             (positions, 51)
 phones   posteriors of the phones, of the block network                       (positions, phones)
 pitch    log2 of the pitch in Hz; NaN without voice                           (positions,)
 level    log10 of the power, relative to the recording's loudest parts        (positions,)
@@ -44,7 +45,7 @@ from kouxing.services.recognizer.acoustic.network import MAX_POSITIONS
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lip_predictor import NUM_LAYERS
+from kouxing.services.recognizer.lip_predictor import NUM_LAYERS, load_lip_predictor
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
 from kouxing.training.neural.initial_network import load_whisper
 from kouxing.training.neural.network import Layer, Network, ReadoutShape, Shape, mixed_precision
@@ -54,6 +55,7 @@ from kouxing.training.neural.teacher import WholeEncoder
 Floats = NDArray[np.float32]
 
 POSITION_SAMPLES = 320
+LIP_DELAYS_S = (0.015, 0.055, 0.155)
 _ENCODER_LAYERS = (3, 5)  # of Whisper's encoder, the first is 0
 _BLOCK_POSITIONS = 50  # of the block network; longer blocks than live cost less
 _LOW_BANDS, _HIGH_BANDS = slice(1, 27), slice(27, 69)  # below 1 kHz, and 1 to 5 kHz
@@ -67,6 +69,7 @@ class TeacherOutputs:
 
     causal: Floats
     encoder: Floats
+    lips: Floats
     phones: Floats
     pitch: Floats
     level: Floats
@@ -74,7 +77,7 @@ class TeacherOutputs:
 
 
 class Teachers:
-    """The three teachers, ready to run."""
+    """The teachers, ready to run."""
 
     def __init__(self, causal: NeuralModel, blocks: BlockModel, whisper: Path) -> None:
         sizes = causal.session.sizes
@@ -101,10 +104,11 @@ class Teachers:
         load_whisper(self._encoder, whisper)
         for network in (self._causal, self._blocks, self._readout, self._encoder):
             network.eval()
+        self._lips = load_lip_predictor()
         self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
         self._first_state = blocks.topology.first_state
         networks = causal.network.tobytes() + blocks.network.tobytes()
-        self.digest = hashlib.sha256(networks).hexdigest()
+        self.digest = hashlib.sha256(networks + self._lips.digest).hexdigest()
 
     @torch.no_grad()
     def compute_targets(self, samples: NDArray[np.int16]) -> TeacherOutputs:
@@ -115,9 +119,11 @@ class Teachers:
         power = 10 ** (4 * bands[: 2 * num_positions].reshape(num_positions, 2, -1) - 4)
         level = np.log10(power.mean(axis=(1, 2)) + _TINY_POWER)
         low, high = (power[..., part].mean(axis=(1, 2)) for part in (_LOW_BANDS, _HIGH_BANDS))
+        causal = self.causal_values(frames)
         return TeacherOutputs(
-            causal=self.causal_values(frames),
+            causal=causal,
             encoder=self._encoder.features(samples)[:num_positions].astype(np.float32),
+            lips=self.lips_of(bands[1 : 2 * num_positions + 1], causal),
             phones=self._phones(frames),
             pitch=pitch_of(samples, num_positions),
             level=(level - np.percentile(level, _LOUD_PERCENTILE)).astype(np.float32),
@@ -137,6 +143,12 @@ class Teachers:
                 self._causal(frames[:, start : start + 2 * MAX_POSITIONS + 1])
             parts.append(torch.cat(self._values, dim=-1)[0].float())
         return torch.cat(parts).numpy()
+
+    def lips_of(self, frames: Floats, causal: Floats) -> Floats:
+        """Predict lips from log-mel frames, (2 positions, 80), and the causal network's values."""
+        stream = self._lips.create_stream(LIP_DELAYS_S)
+        features = np.concatenate([frames.reshape(len(causal), -1), causal], axis=1)
+        return np.stack([stream.step(row).ravel() for row in features])
 
     def _keep_values(self, _layer: nn.Module, _inputs: object, outputs: Tensor) -> None:
         self._values.append(outputs[..., 2 * outputs.shape[-1] // 3 :])
