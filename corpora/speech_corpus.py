@@ -262,7 +262,6 @@ def _pairs(path: Path) -> Iterator[tuple[str, str]]:
             yield key, value.strip()
 
 
-CONVERSATION = Path(__file__).parent / "conversation.tsv"
 _PREFIXES = (  # of file names; they cover whole recordings and all recordings of a speaker
     "MOSS-TTSD_",
     "MOSS-TTS_reference_zh_3",

@@ -264,13 +264,14 @@ def raw_audio(
 ) -> AudioSource:
     """Read raw samples until the end of a stream, or only ``num_bytes`` bytes."""
     rate_hz, num_channels = min(raw.sample_rate_hz, MAX_RATE_HZ), raw.num_channels
+    num_mixed = min(2, num_channels)
     _check_rate(name, raw.sample_rate_hz)
     remarks: list[str] = []
     frame_bytes = raw.dtype.itemsize * num_channels
     block_bytes = frame_bytes * raw.sample_rate_hz // 50
 
     def pieces() -> Iterator[tuple[int, Samples]]:
-        guard = CancellationGuard(name, num_channels, remarks)
+        guard = CancellationGuard(name, num_mixed, remarks)
         rest, num_read, num_left = b"", 0, math.inf if num_bytes is None else num_bytes
         while num_left and (more := stream.read(int(min(block_bytes, num_left)))):
             num_left -= len(more)
@@ -283,8 +284,8 @@ def raw_audio(
         read_s, stated_s = (size / frame_bytes / rate_hz for size in (num_read, num_bytes or 0))
         remarks.extend(_cut_off(name, read_s, stated_s))
 
-    blocks = _blocks(pieces(), name, rate_hz, num_channels, BLOCK_S)
-    return AudioSource(name, rate_hz, num_channels, None, blocks, remarks)
+    blocks = _blocks(pieces(), name, rate_hz, num_mixed, BLOCK_S)
+    return AudioSource(name, rate_hz, num_mixed, None, blocks, remarks)
 
 
 def _source(

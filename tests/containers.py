@@ -86,7 +86,7 @@ class Containers:
         self._hosts = folder / "hosts"
         self._hosts.write_text(
             "127.0.0.1 localhost\n"
-            + "".join(f"{network.bound(host)} {name}\n" for name, host in names.items())
+            + "".join(f"{network.address(host)} {name}\n" for name, host in names.items())
         )
 
     def start(

@@ -74,12 +74,8 @@ class Network:
             with contextlib.suppress(UserError):  # it does not exist
                 _call("ip", "netns", "delete", namespace)
 
-    def bound(self, host: str) -> str:
-        """Return the address that services on a host bind."""
-        return self._addresses[host]
-
-    def address(self, host: str, seen_from: str) -> str:
-        """Return the address of a host as seen from another one."""
+    def address(self, host: str) -> str:
+        """Return the address of a host."""
         return self._addresses[host]
 
     def command(self, host: str, *command: str) -> list[str]:

@@ -149,7 +149,7 @@ class HostsSystem(System):
                 self._add_key(host, service, f"service:{service}")
         self._add_key(CLIENT, CLIENT, "client")
         self.key = read_key(self._state(CLIENT) / "kouxing" / f"{CLIENT}.key")
-        self.control = f"{self._control_for(CLIENT)} {self.key.control}"
+        self.control = f"{self._control_address()} {self.key.control}"
 
     def __enter__(self) -> Self:
         try:
@@ -176,15 +176,15 @@ class HostsSystem(System):
         return self._processes[self.instance_of(session, service)].pid
 
     def _start(self, host: str) -> None:
-        service, address = self._services[host], self.network.bound(host)
+        service, address = self._services[host], self.network.address(host)
         addresses = {
             variable(service, key): f"tcp://{address}:{port}"
             for key, port in PORTS[service].items()
         }
         environment = {
             "XDG_STATE_HOME": str(self._state(host)),
-            "KOUXING_CONTROL": self._control_for(host),
-            "KOUXING_ADVERTISE": self.network.address(host, CLIENT),
+            "KOUXING_CONTROL": self._control_address(),
+            "KOUXING_ADVERTISE": address,
             "KOUXING_INSECURE": "false",
         }
         command = self.network.command(host, sys.executable, "-m", f"kouxing.services.{service}")
@@ -208,8 +208,8 @@ class HostsSystem(System):
                 raise UserError(f"the services did not start within {READY_S:g} s")
             time.sleep(0.1)
 
-    def _control_for(self, host: str) -> str:
-        return f"tcp://{self.network.address('control', host)}:{PORTS['control']['control']}"
+    def _control_address(self) -> str:
+        return f"tcp://{self.network.address('control')}:{PORTS['control']['control']}"
 
     def _add_key(self, host: str, name: str, role: str) -> None:
         """Create a key on control's host and move it to another."""

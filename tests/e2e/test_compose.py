@@ -118,15 +118,15 @@ def test_containers_are_healthy_private_and_speak(
             assert time.monotonic() < end_s, containers.log(host).read_text("utf-8")
             time.sleep(0.2)
 
-    address = f"tcp://{network.bound('control')}:5550"
+    address = f"tcp://{network.address('control')}:5550"
     with network.on("client-1"), Client(control_endpoint(address, insecure=False)) as client:
         while len(services := client.status().services) < len(HOSTS) - 1:
             assert time.monotonic() < end_s, services
             time.sleep(0.2)
         told = {each for state in services for each in state.endpoints.values()}
-        check_page(told, network.bound("gateway-1"))
+        check_page(told, network.address("gateway-1"))
     for host, port in (("recognizer-1", 5560), ("synthesizer-1", 5571)):
-        assert any(each.startswith(f"tcp://{network.bound(host)}:{port} ") for each in told), told
+        assert any(each.startswith(f"tcp://{network.address(host)}:{port} ") for each in told), told
 
     speaker = start(containers, "client-1", "client", keys, "speak", str(VOWELS_FILE), "--fast")
     assert speaker.wait(60) == 0, containers.log("client-1").read_text("utf-8")

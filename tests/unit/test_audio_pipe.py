@@ -187,6 +187,15 @@ def test_reads_raw_samples_if_no_format_fits_and_says_so(monkeypatch: pytest.Mon
     assert len(np.concatenate([*source.blocks])) == 2002
 
 
+def test_a_voice_in_one_of_many_raw_channels_stays_loud(monkeypatch: pytest.MonkeyPatch) -> None:
+    channels = np.zeros((3200, 8), "<i2")
+    channels[:, 5] = 16_384 * np.sin(np.arange(3200) * 0.1)
+    source = _open(monkeypatch, channels.tobytes(), raw=RawFormat(16_000, 8), is_raw=True)
+    samples = np.concatenate([*source.blocks])
+    assert source.num_channels == samples.shape[1] == 2
+    np.testing.assert_allclose(samples.mean(axis=1) * 32_768, channels[:, 5], atol=1)
+
+
 def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
     rng = np.random.default_rng(0)
     pieces = [rng.integers(-low, low + 1, 2048) for low in (1, 2, 9, 300, 3000) for _ in range(99)]

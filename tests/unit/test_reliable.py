@@ -88,7 +88,7 @@ def test_a_new_epoch_starts_again_and_old_ones_are_ignored() -> None:
 
 
 def test_acknowledges_at_intervals_until_everything_is_acknowledged() -> None:
-    link = Link()
+    link = ReliablePair()
     link.send(1)
     link.deliver()
     assert link.receiver.tick(10.0) == math.inf
