@@ -3,8 +3,8 @@
 A heartbeat states the share of the last two seconds in which a worker's loop was busy. Sessions
 that were placed or ended since then count with the cost of one session: the highest cost measured
 recently. Every session is expected to take that much, since a silent client may start to speak at
-any moment. A worker processes the audio of all sessions together, so many sessions cost less each.
-Therefore, the cost falls quickly to the load divided by the number of sessions that speak.
+any moment. A worker processes the audio of all sessions together, so each of many sessions costs
+less. Therefore, the cost falls quickly to the load divided by the number of sessions that speak.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class WorkerLoad:
             self._unpaced_until_s = now_s + MEASURED_S
 
     def measure(self, load: float, now_s: float, num_speaking: int = 0) -> None:
-        """Use the load of a heartbeat. Silent sessions may also take a part of it."""
+        """Use the load of a heartbeat; it includes silent sessions."""
         if self._is_unpaced(now_s):
             return
         passed_s = now_s - self._measured_s

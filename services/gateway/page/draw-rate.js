@@ -60,7 +60,7 @@ export class DrawRate {
     return this.#minPeriodMs > 0;
   }
 
-  /** Draw half as many images. */
+  /** Halve the number of images. */
   halve() {
     const periodMs = this.#rests ? restingPeriodMs(this.imageMs) : this.imageMs;
     this.#minPeriodMs = 2 * Math.max(periodMs, this.#minPeriodMs, TICK_MS);

@@ -158,9 +158,9 @@ export class Playout {
   }
 
   /**
-   * Return whether data is so late that it says nothing about the usual delay. Data that was delayed
-   * by the network or by a busy page arrives in one burst whose end is on time. If more data is late,
-   * the sender paused. Then, and if media time leapt ahead, start again.
+   * Return whether data is too late to measure the usual delay. Data that was delayed by the network
+   * or by a busy page arrives in one burst whose end is on time. If more data is late, the sender
+   * paused. Then, and if media time leapt ahead, start again.
    */
   #isLate(nowMs, latenessMs, streak) {
     if (this.offsetMs === null) return false;
