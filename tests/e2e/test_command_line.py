@@ -23,7 +23,7 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.following import Stream, samples_of_file
 from tests.receivers import read_osc
-from tests.system import DEMO, LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
+from tests.system import DEMO, LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python, wait_until
 
 SENTENCE = VOWELS_FILE
 
@@ -234,18 +234,25 @@ def test_express_changes_the_face(system: System, command: Command) -> None:
             session.set_face(expressions={"joy": 1.5})
 
 
-def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -> None:
+def test_status_shows_services_and_sessions_and_writes_json(system: System, tmp_path: Path) -> None:
     figures = tmp_path / "status.json"
-    result = kouxing(
-        "status", "--json", figures, control=system.control, environment={"COLUMNS": "80"}
-    )
+    with Client(system.control) as client:
+        session = client.open_session("live")
+        session.push(bytes(32000))
+        wait_until(lambda: client.status("live").sessions[0].lateness)
+        result = kouxing(
+            "status", "--json", figures, control=system.control, environment={"COLUMNS": "80"}
+        )
     assert result.returncode == 0, result.stderr
     instances = [line.split()[0] for line in result.stdout.splitlines() if " ready " in line]
     assert {*instances} >= {"recognizer", "synthesizer"}
+    assert re.search(r"^live +open .* \d+, \d+, \d+ ms +\d\.\d s ", result.stdout, re.MULTILINE)
     assert "…" not in result.stdout
     assert max(map(len, result.stdout.splitlines())) <= 80
-    services = json.loads(figures.read_text(encoding="utf-8"))["services"]
-    assert {service["service"] for service in services} == {*KINDS}
+    report = json.loads(figures.read_text(encoding="utf-8"))
+    assert {service["service"] for service in report["services"]} == {*KINDS}
+    (state,) = (state for state in report["sessions"] if state["session"] == "live")
+    assert state["lateness"].keys() == {"p50_ms", "p95_ms", "worst_ms"}
 
 
 def test_a_command_writes_each_line_at_once() -> None:
