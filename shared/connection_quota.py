@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 MAX_CONNECTIONS = 400  # of clients; libzmq takes up to 0.1 MB for each
 MAX_SHARE = 0.75  # of them, for one key or, until the key is known, one address
+FILES_PER_CLIENT = 6  # one for a service, and four in the tarpit
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 
 
@@ -24,8 +25,8 @@ class ConnectionQuota:
 
     def __init__(self, extra_connections: int, is_service: Callable[[str], bool]) -> None:
         max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        max_clients = min(MAX_CONNECTIONS + extra_connections, (max_files - RESERVED_FILES) // 2)
-        self._max_clients = max(1, max_clients)
+        max_clients = (max_files - RESERVED_FILES) // FILES_PER_CLIENT
+        self.max_clients = max(1, min(MAX_CONNECTIONS + extra_connections, max_clients))
         self._is_service = is_service
 
     def excess(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, str]]:
@@ -35,7 +36,7 @@ class ConnectionQuota:
         the most connections before others. An owner first loses its oldest silent connection,
         then its newest one.
         """
-        if len(connections) <= MAX_SHARE * self._max_clients:
+        if len(connections) <= MAX_SHARE * self.max_clients:
             return
         services, known, silent = [], [], []
         for connection in connections:
@@ -52,8 +53,8 @@ class ConnectionQuota:
             nums[connection.owner] += 1
             places[connection] = nums[connection.owner]
         clients = known + silent
-        max_services = 2 * self._max_clients - min(len(clients), self._max_clients)
-        for group, limit in ((clients, self._max_clients), (services, max_services)):
+        max_services = 2 * self.max_clients - min(len(clients), self.max_clients)
+        for group, limit in ((clients, self.max_clients), (services, max_services)):
             group.sort(key=lambda connection: (connection.num_delivered == 0, places[connection]))
             for connection in reversed(group[limit:]):
                 yield connection, "too many connections"

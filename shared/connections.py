@@ -20,6 +20,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import zmq
 
@@ -30,6 +31,7 @@ from kouxing.shared.connection_quota import ConnectionQuota
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
+from kouxing.shared.tarpit import Tarpit
 from kouxing.shared.waker import Waker
 
 KIB, MIB = 1024, 1024 * 1024
@@ -42,6 +44,7 @@ SMALL_INCOMPLETE = 4 * KIB  # of each connection, in addition
 MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
+NEW_LOOKS = 20  # at a connection: a flood is disconnected earlier
 MAX_ENDED = 1024  # connections that a service has not noticed yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
@@ -102,6 +105,7 @@ class Connection:
         self._acknowledged = 0
         self._stalled_since_s = 0.0
         self._had_unsent = False
+        self.num_looks = 0
 
     @property
     def owner(self) -> str:
@@ -122,6 +126,7 @@ class Connection:
 
     def update(self, traffic: Traffic, now_s: float) -> None:
         """Update the figures; disconnect a peer whose message does not end."""
+        self.num_looks += 1
         if self.num_delivered != self._delivered_before:
             self._delivered_before, self._read_before = self.num_delivered, traffic.read
             self._mark = (0, self.socket.num_polls)
@@ -145,10 +150,16 @@ class Connection:
         """Return whether the peer has read nothing for a while, though data waits for it."""
         return self.unread > 0 and now_s - self._stalled_since_s > STALLED_S
 
-    def disconnect(self, reason: str, penalty_s: float = 0.0) -> None:
+    def disconnect(
+        self,
+        reason: str,
+        penalty_s: float = 0.0,
+        end: Callable[[int, int], None] | None = None,
+    ) -> None:
         """End the connection, and log the reason. Any thread may call this.
 
-        The peer's key or address cannot connect again for ``penalty_s``.
+        The peer's key or address cannot connect again for ``penalty_s``. ``end`` is by default
+        ``kernel_sockets.reset``.
         """
         if self.is_cut:
             return
@@ -156,7 +167,7 @@ class Connection:
         if penalty_s:
             self.budget.block(penalty_s)
             self.socket.limiter.save_budget(self)
-        kernel_sockets.reset(self.descriptor, self.inode)
+        (end or kernel_sockets.reset)(self.descriptor, self.inode)
         if _WARNINGS.allows(reason):
             LOG.warning("disconnected a peer at %s: %s", self.address or "?", reason)
 
@@ -239,6 +250,7 @@ class ConnectionLimiter:
         is_service: Callable[[str], bool] = lambda key: False,
     ) -> None:
         self._quota = ConnectionQuota(extra_connections, is_service)
+        self._tarpit = Tarpit(4 * self._quota.max_clients)
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
@@ -328,6 +340,7 @@ class ConnectionLimiter:
         self._arrivals.close()
         if self._thread.is_alive():
             self._thread.join()
+        self._tarpit.close()
         for socket in self._sockets:
             socket.close()
 
@@ -345,9 +358,17 @@ class ConnectionLimiter:
             for descriptor in socket.accepted():
                 self.find(descriptor, socket)
         has_ended = self._forget_ended(now_s)
-        connections = [c for c in list(self._connections.values()) if not c.is_cut]
+        self._tarpit.release(now_s)
+        connections = []
+        for connection in list(self._connections.values()):
+            if connection.is_cut:  # its peer keeps sending, or does not let libzmq read
+                kernel_sockets.reset(connection.descriptor, connection.inode)
+            else:
+                connections.append(connection)
+        hold = partial(self._tarpit.add, now_s=now_s)
         for connection, reason in self._quota.excess(connections):
-            connection.disconnect(reason)
+            # An older peer may be idle. It must reconnect, or its next messages are lost.
+            connection.disconnect(reason, end=hold if connection.num_looks < NEW_LOOKS else None)
         for connection in connections:
             connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
         _disconnect_heaviest(

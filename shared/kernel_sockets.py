@@ -91,17 +91,40 @@ def traffic_of(descriptor: int) -> Traffic:
 
 def reset(descriptor: int, inode: int) -> None:
     """Reset a connection, unless the descriptor has been reused. Any thread may call this."""
+    if (connection := _copy(descriptor, inode)) is not None:
+        with connection:
+            _shut_down(connection, socket.SHUT_RDWR)
+
+
+def hold(descriptor: int, inode: int) -> socket.socket | None:
+    """Let libzmq close a connection that stays open for its peer.
+
+    Closing the returned socket resets it. Returns None if the descriptor is closed or reused.
+    """
+    if (connection := _copy(descriptor, inode)) is not None:
+        _shut_down(connection, socket.SHUT_RD)
+        with contextlib.suppress(OSError):
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel's minimum
+    return connection
+
+
+def _copy(descriptor: int, inode: int) -> socket.socket | None:
+    """Return a socket that libzmq cannot close, None if the descriptor is closed or reused."""
+    with contextlib.suppress(OSError):
+        connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, os.dup(descriptor))
+        if inode_of(connection.fileno()) == inode:
+            return connection
+        connection.close()
+    return None
+
+
+def _shut_down(connection: socket.socket, how: int) -> None:
+    """Make libzmq close a connection. Closing the last descriptor resets it."""
     with contextlib.suppress(OSError):  # closed already
-        copy = os.dup(descriptor)  # libzmq cannot close the copy
-        try:
-            if inode_of(copy) == inode:
-                with _borrow_socket(copy) as connection:
-                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-                    connection.shutdown(socket.SHUT_RDWR)
-                    while connection.recv_into(_SINK, 0, _DISCARD):  # or libzmq would read it
-                        pass
-        finally:
-            os.close(copy)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        connection.shutdown(how)
+        while connection.recv_into(_SINK, 0, _DISCARD):  # or libzmq would read it
+            pass
 
 
 def _request(descriptor: int, request: int) -> int:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from kouxing.evaluation.system.attackers import connected, frame
-from kouxing.shared import connections
+from kouxing.shared import connection_quota, connections, tarpit
 from kouxing.shared.bus import Bus
 from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS
 from kouxing.shared.sockets import MAX_DROPPED, Poller, Received, Socket
@@ -132,6 +132,18 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
     frame_ = FapFrame(session="s", values=b"\0" * 272, mask=b"\0" * 9)
     faps.send(frame_)
     assert honest.wait(LIMIT_S)
+
+
+def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection_quota, "MAX_CONNECTIONS", 4)
+    monkeypatch.setattr(tarpit, "HOLD_S", 600.0)
+    with contextlib.ExitStack() as stack:
+        with Bus() as bus:
+            audio = bus.bind_router(LOCAL, "audio")
+            peers = [stack.enter_context(connected(port_of(audio))) for _ in range(6)]
+            wait_until(lambda: len(bus._limiter) == 3)  # three quarters for one address
+            assert not any(has_ended(peer) for peer in peers)
+        wait_until(lambda: all(has_ended(peer) for peer in peers))
 
 
 def is_cut(connection: socket.socket, bound: Socket, num_looks: int = 500) -> bool:

@@ -13,6 +13,7 @@ from kouxing.shared.budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, Budget
 from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
     MAX_QUEUED,
+    NEW_LOOKS,
     NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
     TRIMS_S,
@@ -20,6 +21,7 @@ from kouxing.shared.connections import (
     ConnectionLimiter,
 )
 from kouxing.shared.kernel_sockets import Traffic
+from kouxing.shared.tarpit import GAP_S, HOLD_S
 
 
 class Scene:
@@ -30,8 +32,10 @@ class Scene:
         self.addresses: dict[int, str] = {}
         self.traffic: dict[int, Traffic] = {}
         self.ended: set[int] = set()
+        self.held: dict[int, mock.Mock] = {}
         patch.setattr(kernel_sockets, "inode_of", lambda d: None if d in self.ended else d)
         patch.setattr(kernel_sockets, "reset", lambda d, _inode: self.ended.add(d))
+        patch.setattr(kernel_sockets, "hold", self.hold)
         patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 5560)
         patch.setattr(kernel_sockets, "address_of", lambda d: self.addresses.get(d, "loopback"))
         patch.setattr(kernel_sockets, "traffic_of", lambda d: self.traffic.get(d, Traffic()))
@@ -44,6 +48,11 @@ class Scene:
         self.socket.port = 5560
         self.socket.accepted = lambda: iter(())  # type: ignore[method-assign]
         self.enforce_limits = self.limiter.enforce_limits
+
+    def hold(self, descriptor: int, _inode: int) -> mock.Mock:
+        self.ended.add(descriptor)
+        self.held[descriptor] = mock.Mock()
+        return self.held[descriptor]
 
     def deliver(self, descriptor: int, key: str = "") -> Connection:
         return cast(Connection, self.socket.deliver(descriptor, key))
@@ -138,6 +147,44 @@ def test_services_can_use_the_places_of_clients(scene: Scene) -> None:
         scene.deliver(number, f"key {number}")
     scene.enforce_limits(0.0)
     assert len(scene.limiter.connections_to(scene.socket)) == 17
+
+
+def test_surplus_peers_learn_later_that_they_are_disconnected(scene: Scene) -> None:
+    for number in range(9):
+        scene.deliver(number, "key")
+    scene.enforce_limits(0.0)
+    for time_s, num_closed in ((HOLD_S - 0.1, 0), (HOLD_S, 1), (HOLD_S + GAP_S, 2)):
+        scene.enforce_limits(time_s)
+        assert sum(held.close.called for held in scene.held.values()) == num_closed
+
+
+def test_the_oldest_of_too_many_surplus_peers_may_return(scene: Scene) -> None:
+    for number in range(7 + 4 * 10 + 1):
+        scene.deliver(number, "key")
+    scene.enforce_limits(0.0)
+    scene.enforce_limits(0.05)
+    assert [held.close.called for held in scene.held.values()] == [True] + [False] * 40
+
+
+def test_an_idle_surplus_peer_can_reconnect_at_once(scene: Scene) -> None:
+    scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
+    for number in range(10):
+        scene.limiter.find(number, scene.socket)
+    for look in range(NEW_LOOKS):
+        scene.enforce_limits(float(look))
+    scene.deliver(10, "talker")
+    scene.enforce_limits(float(NEW_LOOKS))
+    assert scene.ended == {0}
+    assert not scene.held
+
+
+def test_resets_a_surplus_peer_that_keeps_sending(scene: Scene) -> None:
+    for number in range(8):
+        scene.deliver(number, "key")
+    scene.enforce_limits(0.0)
+    scene.ended.clear()  # libzmq still reads
+    scene.enforce_limits(0.05)
+    assert scene.ended == set(scene.held)
 
 
 def test_silent_connections_make_room(scene: Scene) -> None:
