@@ -279,13 +279,16 @@ def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser
         import('/node_modules/kouxing-client/puppet.js').then(async ({ loadPuppet }) => {
           const puppet = await loadPuppet('vrm.vrm');
           const eye = puppet.scene.getObjectByName('rightEye');
-          return [[['lookLeft', 'lookUp'], [1, 0.5]], [['eyeLookInLeft', 'eyeLookOutRight'], [1, 0]]].map(
-            ([names, weights]) => {
-              puppet.pose(weights, names);
-              puppet.update(0.02);
-              const [x, y] = eye.rotation.clone().reorder('YXZ');
-              return [x, y].map((angle) => angle * 180 / Math.PI);
-            });
+          const turn = (names, weights) => {
+            puppet.pose(weights, names);
+            puppet.update(0.02);
+            const [x, y] = eye.rotation.clone().reorder('YXZ');
+            return [x, y].map((angle) => angle * 180 / Math.PI);
+          };
+          return [
+            turn(['lookLeft', 'lookUp'], [1, 0.5]),
+            turn(['eyeLookInLeft', 'eyeLookOutRight'], [1, 0]),
+          ];
         })
     """
     up_left, right = faces.evaluate(script)
