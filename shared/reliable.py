@@ -21,6 +21,7 @@ RESEND_AFTER_S = 0.5
 MAX_RESENT = 200  # messages at a time; more would delay a busy receiver further
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
 ACKNOWLEDGE_INTERVAL_S = 0.05  # between acknowledgements of a tick
+MAX_UNACKNOWLEDGED_S = 0.1  # usually, the tick after another message is earlier
 
 
 class ReliableSender:
@@ -83,7 +84,7 @@ class ReliableReceiver:
         self._epoch = -1
         self._last = 0
         self._acknowledged = 0
-        self._acknowledge_due_s = 0.0
+        self._acknowledged_s = -math.inf
         self._peer = NO_PEER
 
     def receive(self, message: Message, sender: Peer) -> bool:
@@ -111,10 +112,13 @@ class ReliableReceiver:
 
         Return when to call this again, unless another message arrives before.
         """
-        if self._last > self._acknowledged and now_s >= self._acknowledge_due_s:
-            self._acknowledge_due_s = now_s + ACKNOWLEDGE_INTERVAL_S
-            self.acknowledge()
-        return self._acknowledge_due_s if self._last > self._acknowledged else math.inf
+        if self._last == self._acknowledged:
+            return math.inf
+        if now_s < self._acknowledged_s + ACKNOWLEDGE_INTERVAL_S:
+            return self._acknowledged_s + MAX_UNACKNOWLEDGED_S
+        self._acknowledged_s = now_s
+        self.acknowledge()
+        return math.inf
 
     def acknowledge(self) -> None:
         """Send an acknowledgement to the sender of the last message, if there was a message."""

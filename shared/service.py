@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from kouxing.shared.prometheus import MetricsServer
 
 TICK_S = 0.01  # between ticks, at least
+FOLLOW_UP_S = 0.03  # from a tick to the next if messages arrived too early for one
 HEARTBEAT_S = 0.25  # between heartbeats with sessions
 IDLE_HEARTBEAT_S = 1.0  # after a heartbeat without sessions
 SESSIONS_PER_HEARTBEAT = 16  # of a worker, so that a heartbeat's cost does not grow
@@ -263,7 +264,9 @@ class Service(MessageLoop):
         self.resync_with_control()
         now_s = time.monotonic()
         if sockets or self.waker.clear():
-            self._tick_due_s = min(self._tick_due_s, self._ticked_s + TICK_S)
+            is_early = now_s < self._ticked_s + TICK_S
+            next_tick_s = self._ticked_s + FOLLOW_UP_S if is_early else now_s
+            self._tick_due_s = min(self._tick_due_s, next_tick_s)
         if now_s >= self._tick_due_s:
             self._ticked_s = now_s
             due_s = min((callback() for callback in tuple(self.tick_callbacks)), default=math.inf)

@@ -46,7 +46,7 @@ MAX_QUEUED_S = 60.0  # of live audio, above which it waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # for further audio of a session that is late, in total
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
-SESSION_TICK_S = 0.02  # between ticks while a session is open
+SESSION_TICK_S = 0.04  # between ticks while a session is open
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
@@ -417,14 +417,17 @@ class RecognizerService(Service):
         """Send new results to the subscribers, the synthesizer and control.
 
         Subscribers are first: a new recognizer does not repeat results that the synthesizer has.
+        The synthesizer wakes up once if all its messages are sent together.
         """
         now_s = time.monotonic()
-        for result in session.new_results(self._recognizer):
+        results = session.new_results(self._recognizer)
+        for result in results:
             published = session.published_message(result)
             if published is not None:
                 session.replay.send(published, now_s)
                 if isinstance(result, SpeechChange):
                     self.send_to_control(published)
+        for result in results:
             if not isinstance(result, Waveform):
                 session.link.send(message_of(result), now_s)
 
