@@ -14,8 +14,6 @@ from bisect import bisect_left
 from collections import Counter, deque
 from pathlib import Path
 
-import numpy as np
-
 WINDOW = 1000  # number of newest values that percentiles are computed from
 PERCENTS = (50, 95, 99)
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits
@@ -74,9 +72,9 @@ class Metrics:
             result[f"{name}_per_s"] = (value - self._last_counts[name]) / passed_s
         self._last_s, self._last_counts = now_s, self.counts.copy()
         for name, latency in self.distributions.items():
-            percentiles = np.percentile(latency.newest, PERCENTS).tolist()
-            for percent, value in zip(PERCENTS, percentiles, strict=True):
-                result[f"{name}_p{percent}"] = value
+            ordered = sorted(latency.newest)
+            for percent in PERCENTS:
+                result[f"{name}_p{percent}"] = ordered[percent * (len(ordered) - 1) // 100]
         return result
 
 
