@@ -45,8 +45,7 @@ export class Lateness {
     const lateMs = isLive ? Math.max(0, differenceMs - this.#differences.min) : 0;
     this.#recent.add(nowMs, lateMs);
     const isLate = lateMs > LATE_MS;
-    if (!isLive) this.isBehind = false;
-    if (!isLive || isLate === this.isBehind) this.#agreedMs = nowMs;
+    if (isLate === this.isBehind) this.#agreedMs = nowMs;
     this.#agreedMs ??= nowMs;
     const waitMs = isLate ? SHOWN_AFTER_MS : OVER_AFTER_MS;
     if (nowMs - this.#agreedMs >= waitMs) this.isBehind = isLate;

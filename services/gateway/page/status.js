@@ -166,7 +166,7 @@ export class StatusBar {
     const isStalled = this.#wasLive && session !== null && session === speech.session;
     const isInterrupted = isMicrophoneInterrupted || isStalled;
     player.lateness.update(nowMs, isLive && session !== null);
-    const { isBehind, recentMs } = player.lateness;
+    const isBehind = isLive && player.lateness.isBehind;
     const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
     element("status").dataset.state = state;
     element("status").title = session === null ? "" : say("sessionName", { name: session });
@@ -177,7 +177,7 @@ export class StatusBar {
     const isAudible = isLive && sound.state === "on";
     const soundMs = isAudible ? playout.delayMs : null;
     const frameMs = isAudible ? playout.frameWaitMs : null;
-    const delay = isBehind ? secondsText(recentMs) : delayText(voiceToImageMs, soundMs);
+    const delay = isBehind ? secondsText(player.lateness.recentMs) : delayText(voiceToImageMs, soundMs);
     setText(element("delay"), isLive ? delay : "");
     setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
     senders.frameWaitMs = frameMs;
