@@ -31,7 +31,7 @@ from kouxing.shared.connection_quota import ConnectionQuota
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
-from kouxing.shared.tarpit import Tarpit
+from kouxing.shared.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.waker import Waker
 
 KIB, MIB = 1024, 1024 * 1024
@@ -93,6 +93,7 @@ class Connection:
         self.key = ""  # of the peer; known when its first message is delivered
         self.budget = Budget()
         self.num_delivered = 0  # messages
+        self.num_looks = 0
         self.topics: set[bytes] = set()
         self.is_cut = False
         self.undelivered = 0  # bytes since the last delivered message
@@ -105,7 +106,6 @@ class Connection:
         self._acknowledged = 0
         self._stalled_since_s = 0.0
         self._had_unsent = False
-        self.num_looks = 0
 
     @property
     def owner(self) -> str:
@@ -250,7 +250,7 @@ class ConnectionLimiter:
         is_service: Callable[[str], bool] = lambda key: False,
     ) -> None:
         self._quota = ConnectionQuota(extra_connections, is_service)
-        self._tarpit = Tarpit(4 * self._quota.max_clients)
+        self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
         self._sockets: list[LimitedSocket] = []

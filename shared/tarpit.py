@@ -12,6 +12,7 @@ from collections import deque
 
 from kouxing.shared import kernel_sockets
 
+MAX_HELD = 1600
 HOLD_S = 2.0  # at least
 GAP_S = 0.005  # between two resets: those who are reset together would return together
 

@@ -136,6 +136,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
 
 def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection_quota, "MAX_CONNECTIONS", 4)
+    monkeypatch.setattr(connections, "NEW_LOOKS", 10**6)
     monkeypatch.setattr(tarpit, "HOLD_S", 600.0)
     with contextlib.ExitStack() as stack:
         with Bus() as bus:
