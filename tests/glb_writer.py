@@ -102,3 +102,15 @@ def read_chunks(path: Path) -> tuple[dict[str, Any], bytearray]:
     num_bytes, kind = struct.unpack_from("<I4s", data, 20 + size)
     assert (kind, num_bytes) == (b"BIN\0", len(data) - 28 - size)
     return json.loads(data[20 : 20 + size]), bytearray(data[28 + size :])
+
+
+def add_accessor(
+    document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int
+) -> int:
+    """Append an accessor; return its number."""
+    document["bufferViews"].append({"byteOffset": len(binary), "byteLength": array.nbytes})
+    view = len(document["bufferViews"]) - 1
+    accessor = {"bufferView": view, "componentType": component, "type": kind, "count": len(array)}
+    document["accessors"].append(accessor)
+    binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    return len(document["accessors"]) - 1

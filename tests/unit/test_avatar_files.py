@@ -11,13 +11,15 @@ from typing import Any
 import DracoPy
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.scene import load_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
-from tests.glb_writer import read_chunks, write_chunks, write_glb
+from tests.glb_writer import add_accessor, read_chunks, write_chunks, write_glb
+from tests.heads import neutral_faps
 from tests.meshes import meshes
 
 JAW, AA = (shapes.basis[shapes.names.index(n)] for shapes, n in ((ARKIT, "jawOpen"), (VRM, "aa")))
@@ -149,7 +151,7 @@ def vowels(version: int) -> Callable[[dict[str, Any], bytearray], None]:
             return
         old = {"aa": "a", "ih": "i", "ou": "u", "ee": "e", "oh": "o"}
         groups = [
-            {"name": "any", "presetName": old[name], "binds": bound}
+            {"name": "any", "presetName": old.get(name, name), "binds": bound}
             for name, bound in binds.items()
         ]
         document["extensions"] = {"VRM": {"blendShapeMaster": {"blendShapeGroups": groups}}}
@@ -169,6 +171,71 @@ def test_a_vrm_with_five_vowels_speaks(original: Head, tmp_path: Path, version: 
     assert error(head, original, AA) < 0.1
     assert error(head, original, OCULUS.basis[OCULUS.names.index("ou")]) < 0.1
     assert head.deform(AA)[head.part("skin").vertices][:, 2].max() > 0  # it looks along z
+
+
+def eye_bones(
+    version: int, eyes: NDArray[np.float32]
+) -> Callable[[dict[str, Any], bytearray], None]:
+    """Attach the eyes of a VRM to bones at these places."""
+
+    def change(document: dict[str, Any], binary: bytearray) -> None:
+        vowels(version)(document, binary)
+        count = len(document["nodes"])
+        bones = {"head": count, "leftEye": count + 1, "rightEye": count + 2}
+        roots = (
+            document["nodes"][-1]["children"] if version == 0 else document["scenes"][0]["nodes"]
+        )
+        roots.append(bones["head"])
+        document["nodes"].append({"name": "h", "children": [count + 1, count + 2]})
+        document["nodes"] += [{"translation": eye} for eye in eyes.tolist()]
+        matrices = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
+        matrices[:, 3, :3] = -eyes  # column-major
+        inverse = add_accessor(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
+        document["skins"] = [{"joints": [count + 1, count + 2], "inverseBindMatrices": inverse}]
+        for node in document["nodes"][:count]:
+            if (name := node.get("name", "")).startswith("eye_"):
+                attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
+                rows = document["accessors"][attributes["POSITION"]]["count"]
+                joints = np.tile(np.array([name == "eye_right", 0, 0, 0], "u1"), (rows, 1))
+                weights = np.tile(np.array([1, 0, 0, 0], "<f4"), (rows, 1))
+                attributes["JOINTS_0"] = add_accessor(document, binary, joints, "VEC4", 5121)
+                attributes["WEIGHTS_0"] = add_accessor(document, binary, weights, "VEC4", 5126)
+                node |= {"skin": 0, "name": name.replace("eye", "ball")}
+        listed = [{"bone": bone, "node": node} for bone, node in bones.items()]
+        if version == 0:
+            document["extensions"]["VRM"] |= {
+                "humanoid": {"humanBones": listed},
+                "firstPerson": {"lookAtTypeName": "Bone"},
+            }
+        else:
+            named = {bone: {"node": node} for bone, node in bones.items()}
+            document["extensions"]["VRMC_vrm"] |= {
+                "humanoid": {"humanBones": named},
+                "lookAt": {"type": "bone"},
+            }
+
+    return change
+
+
+@pytest.mark.parametrize("version", [0, 1])
+@pytest.mark.parametrize("fap", ["yaw_l_eyeball", "pitch_l_eyeball", "yaw_r_eyeball"])
+def test_eye_bones_of_a_vrm_turn_the_eyes(
+    original: Head, tmp_path: Path, version: int, fap: str
+) -> None:
+    names = ("aa", "ih", "ou", "ee", "oh", "blinkLeft", "blinkRight")
+    shapes = {name: VRM.basis[VRM.names.index(name)] for name in names}
+    path = write_glb(tmp_path / "my.vrm", meshes(original, shapes))
+    head = load_head(str(edit(path, eye_bones(version, original.eye_centers))))
+    faps = neutral_faps(**{fap: 15_000})
+    eye = "left" if "_l_" in fap else "right"
+    turned, wanted = (
+        (model.deform(faps) - model.vertices)[model.part(part).vertices]
+        for model, part in ((head, f"ball_{eye}"), (original, f"eye_{eye}"))
+    )
+    scale = np.linalg.norm(np.diff(head.eye_centers, axis=0)) / np.linalg.norm(
+        np.diff(original.eye_centers, axis=0)
+    )
+    assert np.linalg.norm(turned / scale - wanted) < 0.2 * np.linalg.norm(wanted)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from kouxing.services.driver.render.scene import camera, load_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
-from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
+from tests.glb_writer import Mesh, add_accessor, read_chunks, write_chunks, write_glb
 from tests.heads import neutral_faps
 from tests.meshes import meshes
 
@@ -120,15 +120,15 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_pat
     document["scenes"][0]["nodes"].append(count)
     matrices = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
     matrices[0, 3, 1] = 1.0  # column-major: the bind pose cancels the position of the hips
-    accessor = add(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
+    accessor = add_accessor(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
     document["skins"] = [{"joints": [count, count + 2], "inverseBindMatrices": accessor}]
     for node in document["nodes"][:count]:
         attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
         rows = document["accessors"][attributes["POSITION"]]["count"]
         joints, weights = np.zeros((rows, 4), "u1"), np.zeros((rows, 4), "<f4")
         joints[:, 0], weights[:, 0] = node["name"] != "garment", 1
-        attributes["JOINTS_0"] = add(document, binary, joints, "VEC4", 5121)
-        attributes["WEIGHTS_0"] = add(document, binary, weights, "VEC4", 5126)
+        attributes["JOINTS_0"] = add_accessor(document, binary, joints, "VEC4", 5121)
+        attributes["WEIGHTS_0"] = add_accessor(document, binary, weights, "VEC4", 5126)
         node["skin"] = 0
     write_chunks(path, document, binary)
     head = read_glb(path)
@@ -139,16 +139,6 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_pat
 
 
 # --- broken files ---------------------------------------------------------------------------------
-
-
-def add(document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int) -> int:
-    """Append an accessor; return its number."""
-    document["bufferViews"].append({"byteOffset": len(binary), "byteLength": array.nbytes})
-    view = len(document["bufferViews"]) - 1
-    accessor = {"bufferView": view, "componentType": component, "type": kind, "count": len(array)}
-    document["accessors"].append(accessor)
-    binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
-    return len(document["accessors"]) - 1
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ MAX_PIECES = 2_000
 MAX_SHIFTS = 20_000_000  # displacements of all morph targets
 MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
+_LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes by ARKit's shapes
 
 
 def read_pieces(glb: Glb) -> list[Primitive]:
@@ -112,6 +113,14 @@ def find_bones(glb: Glb) -> dict[int, str]:
     return {number: word for number, word in enumerate(words) if word in ("head", "neck")}
 
 
+def _turns_eyes(glb: Glb) -> bool:
+    """Return whether a VRM turns its eyes by bones, not by expressions."""
+    extensions = glb.json.get("extensions", {})
+    old = extensions.get("VRM", {}).get("firstPerson", {}).get("lookAtTypeName")
+    new = extensions.get("VRMC_vrm", {}).get("lookAt", {}).get("type")
+    return bool(old == "Bone" or new == "bone")
+
+
 Binds = list[tuple[str, int, float]]  # name of an expression, target, weight
 
 
@@ -171,6 +180,8 @@ def _piece(
         raise BadGlbError("the attributes of a mesh have different lengths")
     shapes = _shapes(glb, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
+    if weight is not None and _turns_eyes(glb):
+        shapes = _looks(glb, node["skin"], attributes, places, vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
             raise BadGlbError("a coordinate or color is not finite or very large")
@@ -268,7 +279,38 @@ def _skinned(
     which, weights = attributes["JOINTS_0"].astype(np.int64), attributes["WEIGHTS_0"]
     if which.shape != weights.shape or (which.size and which.max() >= len(joints)):
         raise BadGlbError("a mesh refers to a missing joint")
-    weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
+    weights = _normalized(weights)
     share = np.array([turn_shares.get(joint, 0.0) for joint in joints])
     placed = np.einsum("vk,vkij->vij", weights, bones[which])
     return placed, (weights * share[which]).sum(axis=1) if turn_shares else None
+
+
+def _normalized(weights: Float64) -> Float64:
+    """Return weights (V, n) of joints whose sum is 1."""
+    normalized: Float64 = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
+    return normalized
+
+
+def _looks(
+    glb: Glb,
+    skin: object,
+    attributes: dict[str, Float64],
+    places: dict[int, Float64],
+    vertices: Float64,
+) -> dict[str, Float64]:
+    """Return the displacements (V, 3) that the eye bones cause, as ARKit's shapes by name."""
+    joints, bones = glb.item("skins", skin)["joints"], find_bones(glb)
+    is_old = "VRM" in glb.json["extensions"]  # version 0 looks along -z
+    weights = _normalized(attributes["WEIGHTS_0"])
+    shapes = {}
+    for side, outward in (("Left", 1.0), ("Right", -1.0)):
+        is_eye = np.array([bones.get(joint) == f"{side.lower()}Eye" for joint in joints])
+        share = (weights * is_eye[attributes["JOINTS_0"].astype(np.int64)]).sum(axis=1)
+        if not share.any():
+            continue
+        center = places[joints[int(is_eye.argmax())]][:3, 3]
+        arm = share[:, None] * (vertices - center)
+        out, down = (_LOOK_RAD[name] for name in ("Out", "Down"))
+        shapes[f"eyeLookOut{side}"] = outward * out * np.cross([0, 1, 0], arm)
+        shapes[f"eyeLookDown{side}"] = (-down if is_old else down) * np.cross([1, 0, 0], arm)
+    return shapes
