@@ -44,8 +44,8 @@ def write_tracks(
             assert isinstance(video, av.VideoStream)
             video.width = video.height = 32
             video.pix_fmt = "yuv420p"
-        # FFmpeg's encoder of SBC has no default bit rate.
-        encoding = {"b": "128k"} if codec == "sbc" else {}
+        # These encoders of FFmpeg have no default bit rate.
+        encoding = {"b": "128k"} if codec in ("sbc", "wmav2") else {}
         streams = [
             container.add_stream(codec, rate=rate_hz, layout="mono", options=encoding)
             for _ in tracks

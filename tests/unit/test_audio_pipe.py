@@ -45,7 +45,12 @@ CODECS = {  # of formats that soundfile cannot write
     **{"aac": "aac", "m4a": "aac", "webm": "libopus", "ts": "aac", "avi": "pcm_s16le"},
     **{"m2ts": "pcm_bluray", "rm": "ac3", "voc": "pcm_s16le", "nut": "mp2", "wv": "wavpack"},
     **{"latm": "aac", "sbc": "sbc", "sf": "pcm_s16le", "wtv": "mp2", "sox": "pcm_s32le"},
-    **{"mmf": "adpcm_yamaha", "ast": "pcm_s16be_planar", "amr": "libopencore_amrnb"},
+    **{
+        "mmf": "adpcm_yamaha",
+        "ast": "pcm_s16be_planar",
+        "amr": "libopencore_amrnb",
+        "wma": "wmav2",
+    },
 }
 RATES_HZ = {"amr": 8_000, "mmf": 8_000, "sbc": 16_000}
 
