@@ -17,6 +17,7 @@ from pathlib import Path
 WINDOW = 1000  # number of newest values that percentiles are computed from
 PERCENTS = (50, 95, 99)
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits
+_STATM = Path("/proc/self/statm")
 _ARENA_MAX = -8  # glibc's M_ARENA_MAX, a parameter of mallopt
 
 
@@ -81,7 +82,7 @@ class Metrics:
 def memory_mb() -> float:
     """Return the memory of this process in MiB; on systems other than Linux, its maximum so far."""
     try:
-        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+        pages = int(_STATM.read_text("ascii").split()[1])
     except OSError:
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
