@@ -1,11 +1,8 @@
-"""The overload policy: on a busy machine, a live session gives up results to stay live.
+"""The overload policy: on a busy machine, a live session skips old audio to stay live.
 
-A session is *behind* if late audio waits to be processed. Then it gives up, in this order:
-
-1. Phones of the audio that waits. The lips do not need them.
-2. The audio itself, in one cut. The session continues with the newest audio.
-
-A recorded session gives up nothing: it takes longer instead.
+A session is *behind* if late audio waits to be processed. If it stays too far behind, it skips the
+waiting audio in one cut and continues with the newest audio. An unpaced session skips nothing: it
+takes longer instead.
 
 Audio is *late* by the time since it was due. Each piece of audio is due when the sender would have
 sent it in real time. So audio that waited in a socket while this process was stopped is late,
@@ -15,22 +12,11 @@ although it was just received. Audio that a client sends ahead of the clock is n
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 
-SAVING_BEHIND_S = 0.1  # a session that is further behind gives up phones
-RESTORE_AFTER_S = 3.0  # without falling so far behind, after which it has phones again
 MAX_LATE_FOR_S = 0.4  # a session may be further behind than its limit for this time
 REPORT_INTERVAL_S = 1.0  # between reports about one session
 CATCH_UP_S = 1.5  # for a session that moved
 ADAPTED = 0.1  # part of the lateness that is forgotten if the newest audio is just as late
-
-
-class Relief(IntEnum):
-    """What a session gives up; each level includes the ones before it."""
-
-    NOTHING = 0
-    PHONES = 1
-    AUDIO = 2  # now: everything but the newest
 
 
 class Overload:
@@ -45,11 +31,10 @@ class Overload:
     """
 
     def __init__(self, max_behind_s: float, start_s: float = -math.inf) -> None:
-        self.skipped_s = 0.0  # duration of the audio that was given up
+        self.skipped_s = 0.0  # duration of the audio that was skipped
         self._max_behind_s = max_behind_s
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: when it arrives
-        self._saved_at_s = -math.inf  # when the session was last so far behind that it saves
         self._late_since_s = math.inf  # when it exceeded its limit
         self._reported_s, self._report_due_s = 0.0, -math.inf  # part of skipped_s; next report
 
@@ -77,13 +62,13 @@ class Overload:
         if self._due_s is not None:
             self._due_s += ADAPTED * max(0.0, now_s - self._due_s)
 
-    def update(self, waiting_s: float, now_s: float) -> Relief:
-        """Return what the session gives up now.
+    def update(self, waiting_s: float, now_s: float) -> bool:
+        """Return whether the session must now skip all audio but the newest.
 
         ``waiting_s`` is the duration of the audio after the oldest piece that is not processed.
         """
         if now_s < self._start_s:
-            return Relief.NOTHING
+            return False
         late_s = self._late_s(waiting_s, now_s)
         behind_s = min(waiting_s, late_s)
         if behind_s <= self._max_behind_s:
@@ -91,13 +76,11 @@ class Overload:
         else:  # if this process was stopped, the session was late before
             since_s = now_s - (late_s - self._max_behind_s)
             self._late_since_s = min(since_s, self._late_since_s)
-        if now_s - self._late_since_s > MAX_LATE_FOR_S:
-            self._saved_at_s, self._late_since_s = now_s, math.inf
-            self.skipped_s += waiting_s
-            return Relief.AUDIO
-        if behind_s > min(SAVING_BEHIND_S, self._max_behind_s):
-            self._saved_at_s = now_s
-        return Relief.PHONES if now_s < self._saved_at_s + RESTORE_AFTER_S else Relief.NOTHING
+        if now_s - self._late_since_s <= MAX_LATE_FOR_S:
+            return False
+        self._late_since_s = math.inf
+        self.skipped_s += waiting_s
+        return True
 
     def take_report_s(self, now_s: float) -> float:
         """Return the duration of the audio skipped since the last report, at most once a second."""

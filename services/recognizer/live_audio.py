@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
-from kouxing.shared.overload import Overload, Relief
+from kouxing.shared.overload import Overload
 
 
 class LiveAudio:
@@ -42,14 +42,14 @@ class LiveAudio:
         """Return whether even the newest chunk is late, so more audio should have arrived."""
         return bool(self._chunks) and self.overload.is_late(now_s)
 
-    def relieve(self, now_s: float) -> Relief:
-        """Return what the session gives up; drop audio that is too old."""
-        relief = self.overload.update(self._waiting_s, now_s)
-        if relief is Relief.AUDIO:
+    def skip_old(self, now_s: float) -> bool:
+        """Drop audio that is too old; return whether there was any."""
+        has_skipped = self.overload.update(self._waiting_s, now_s)
+        if has_skipped:
             self._num_samples = len(self._chunks[-1][1])
             while len(self._chunks) > 1:
                 self._chunks.popleft()
-        return relief
+        return has_skipped
 
     def take(self, max_s: float) -> Iterator[Chunk]:
         """Yield chunks from the front, up to a total duration."""

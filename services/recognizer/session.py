@@ -17,7 +17,7 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
-from kouxing.shared.overload import CATCH_UP_S, Overload, Relief
+from kouxing.shared.overload import CATCH_UP_S, Overload
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange, Waveform
 from kouxing.shared.replay import Replay
 from kouxing.shared.sockets import Socket
@@ -159,7 +159,7 @@ class RecognizerSession:
 
     def accept_waveform(self, max_s: float, now_s: float) -> None:
         """Pass queued audio to the stream, up to a duration. Skip audio that is too old."""
-        has_skipped = self.audio.relieve(now_s) is Relief.AUDIO
+        has_skipped = self.audio.skip_old(now_s)
         for media_time, samples in self.audio.take(max_s):
             if has_skipped:
                 self.stream.skip_to(media_time)

@@ -37,7 +37,7 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import MAX_TURN_S, Handler
-from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S, Overload, Relief
+from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S, Overload
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SoundEvent
 from kouxing.shared.phones.final_time import FinalTime
@@ -104,7 +104,7 @@ class _SynthesizerSession:
                 waiting_s += max(0.0, event.time_s - known_s)
             if isinstance(event, events.Progress | AudioSkipped):
                 known_s = event.time_s
-        if self.overload.update(waiting_s, now_s) is Relief.AUDIO:
+        if self.overload.update(waiting_s, now_s):
             self.face.skip_to(self.newest_s)
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
