@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.driver import recordings
+from kouxing.services.driver import poses, recordings
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
@@ -107,7 +107,11 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
         recorder.join()
 
 
-def test_shows_one_session_while_recording_another(stage: Stage) -> None:
+def test_shows_one_session_while_recording_another(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(poses, "FADE_S", 1e-9)  # on a quick machine, the face would fade in
+    monkeypatch.setattr(poses, "STALL_S", 60.0)  # on a busy one, it would fade out
     stage.start("filmed", record=True)
     stage.start("other")
     seen = set()
