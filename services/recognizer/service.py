@@ -65,7 +65,7 @@ class RecognizerService(Service):
         self._max_behind_s = config.max_behind_s
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
-        self._ticked_s = time.monotonic()
+        self._stalls_checked_s = time.monotonic()
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio", role="client")
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones", self._on_joined)
@@ -205,7 +205,7 @@ class RecognizerService(Service):
 
     def _report_stalled(self, now_s: float) -> None:
         """Report live clients that send no audio to their synthesizers."""
-        tick_s, self._ticked_s = min(now_s - self._ticked_s, MAX_TICK_S), now_s
+        tick_s, self._stalls_checked_s = min(now_s - self._stalls_checked_s, MAX_TICK_S), now_s
         if self._has_live_audio or self._audio.wait(0.0):
             return
         for session in self._sessions.values():
