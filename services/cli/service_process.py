@@ -24,7 +24,6 @@ from kouxing.shared.service import (
 POLL_S = 0.5  # between two checks of a process
 SILENT_S = 1.0  # a loop that sends no heartbeat for longer may hang
 HANG_S = 5.0  # for longer: it hangs
-MAX_STOPPED_S = 12.0  # a stopped process that continues is live sooner than a new one
 
 
 class ServiceProcess(subprocess.Popen[bytes]):
@@ -65,7 +64,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
 
     def read_heartbeats(self) -> None:
         """Update what is known about the process. Call this about every ``POLL_S``."""
-        self._silence.update(time.monotonic(), self._waited_s(), is_stopped=self._is_stopped())
+        self._silence.update(time.monotonic(), self._waited_s())
         with contextlib.suppress(BlockingIOError):
             if pulses := os.read(self._pulse, 65536):
                 self.restart_silence()
@@ -76,19 +75,16 @@ class ServiceProcess(subprocess.Popen[bytes]):
     @property
     def is_silent(self) -> bool:
         """Whether a heartbeat is missing."""
-        silence = self._silence
-        return silence.stopped_s > 0.0 or silence.duration_s > SILENT_S + self._idle_s
+        return self._silence.duration_s > SILENT_S + self._idle_s
 
     def restart_silence(self) -> None:
         """Wait for a heartbeat as long as if there had just been one."""
-        self._silence.duration_s = self._silence.stopped_s = 0.0
+        self._silence.duration_s = 0.0
 
     @property
     def hangs(self) -> bool:
-        """Whether the service's loop hangs, or the process does not continue after SIGSTOP."""
-        silence = self._silence
-        loop_hangs = silence.duration_s > self._hang_limit_s + self._idle_s
-        return self.is_ready and (loop_hangs or silence.stopped_s > MAX_STOPPED_S)
+        """Whether the service's loop hangs, or the process is stopped."""
+        return self.is_ready and self._silence.duration_s > self._hang_limit_s + self._idle_s
 
     def _waited_s(self) -> float:
         """Return how long the main thread was ready but got no processor; 0 if unknown."""
@@ -98,32 +94,20 @@ class ServiceProcess(subprocess.Popen[bytes]):
             return 0.0
         return int(waited_ns) / 1e9
 
-    def _is_stopped(self) -> bool:
-        """Return whether the process was stopped by SIGSTOP; False if unknown."""
-        try:
-            state = Path(f"/proc/{self.pid}/stat").read_text("utf-8").rpartition(")")[2].split()[0]
-        except (OSError, IndexError):
-            return False
-        return state == "T"
-
 
 class SilenceMeter:
     """Measures the time in which a loop could run but sent no heartbeat, in seconds."""
 
     def __init__(self, now_s: float) -> None:
         self.duration_s = 0.0
-        self.stopped_s = 0.0  # time in which it was stopped
         self._stall = StallDetector(now_s, limit_s=2 * POLL_S)  # of the caller
         self._waited_s = 0.0
 
-    def update(self, now_s: float, waited_s: float, *, is_stopped: bool) -> None:
+    def update(self, now_s: float, waited_s: float) -> None:
         """Add the time since the last call.
 
         ``waited_s`` is the total time in which the loop was ready but got no processor.
         """
         elapsed_s, waited_s = self._stall.elapsed_s(now_s), max(waited_s, self._waited_s)
-        if is_stopped:
-            self.stopped_s += elapsed_s
-        else:
-            self.duration_s += max(0.0, elapsed_s - (waited_s - self._waited_s))
+        self.duration_s += max(0.0, elapsed_s - (waited_s - self._waited_s))
         self._waited_s = waited_s
