@@ -143,7 +143,7 @@ def read_clips(
 
 
 def read_clip(path: Path) -> LipClip:
-    """Read one clip by the path of one of its files; UserError if it cannot be read."""
+    """Read the clip that a file belongs to; UserError if it cannot be read."""
     if path.suffix not in (".json", ".flac", ".csv"):
         raise UserError(f"{path}: not a clip; give the .json file that kouxing track wrote")
     clip = _read_clip(path.with_suffix(".json"), None, any_license=True)
@@ -156,7 +156,7 @@ def _read_clip(
 ) -> LipClip | None:
     """Read a clip; None if it is in another language."""
     with check_content(path, "a clip"):
-        # NaN is a statistic of a clip without enough frames; nothing here reads it
+        # a statistic of a clip with too few frames is NaN; this function does not use it
         about = parse_json(read_text(path, _MAX_BYTES), allow_nan=True)
         clip_language = str(about.get("language", "zh"))[:2]
         if language not in (None, clip_language):

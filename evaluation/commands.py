@@ -58,7 +58,7 @@ LookAhead = Annotated[
 ]
 Sounds = Annotated[
     list[Path] | None,
-    typer.Option(help="Folder of sounds; the held-out ones are used. Default: synthesized."),
+    typer.Option(help="Folder of sounds; only held-out ones are used. Default: synthesized."),
 ]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
 Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
@@ -84,7 +84,7 @@ def recognizer(
     """Compare phone and viseme errors and delays of acoustic models.
 
     The speech is clean, disturbed by noise, music, other voices, a room or a telephone band, and
-    grouped by speaking rate. The JSON file also contains the figures by speaker and of other output
+    grouped by speaking rate. The JSON file also contains figures by speaker and for other output
     rules.
     """
     from kouxing.corpora.speech_corpus import RowErrors
@@ -129,9 +129,9 @@ def voice(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure voice activity: the share of time in which it is on, by kind of audio.
+    """Measure the share of time with voice activity, by kind of audio.
 
-    The audio is speech, clean and disturbed, the held-out sounds, and synthesized voices and
+    The audio consists of clean and disturbed speech, held-out sounds, and synthesized voices and
     noises.
     """
     from kouxing.corpora.speech_corpus import RowErrors
@@ -443,12 +443,12 @@ def busy(
         typer.Option(min=0, max=100, help="Number of busy programs; repeatable. Default: 0, 2, 6."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each load.")] = 30.0,
-    after: Annotated[float, typer.Option(min=1.0, help="Seconds of speech after it.")] = 15.0,
+    after: Annotated[float, typer.Option(min=1.0, help="Seconds of speech after a load.")] = 15.0,
     picture: Annotated[Path | None, typer.Option(help="Plot the lateness (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure how late a live face is while other programs keep the processor busy.
+    """Measure the lateness of a live face while other programs keep the processor busy.
 
     Also measures the processor time and the wake-ups of each service. Needs Linux.
     """

@@ -37,12 +37,12 @@ def _head_names() -> list[str]:
 
 
 def sheets(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
-    """Return the files for the docs, ``heads.webp`` and ``faces.webp``, and what draws them."""
+    """Return the functions that draw the files for the docs, ``heads.webp`` and ``faces.webp``."""
     return {folder / "heads.webp": _draw_heads, folder / "faces.webp": _draw_visemes}
 
 
 def choices(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
-    """Return the files for the page, ``head-NAME.webp``, and what draws them."""
+    """Return the functions that draw the files for the page, ``head-NAME.webp``."""
     return {
         folder / f"head-{name}.webp": partial(_picture, name, _REST, _CHOICE_PX)
         for name in _head_names()
@@ -50,7 +50,7 @@ def choices(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
 
 
 def save(path: Path, image: Image.Image) -> None:
-    """Write a picture; raises ``UserError`` if this is impossible."""
+    """Write a picture. Raises ``UserError`` if it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         image.save(path, quality=85)

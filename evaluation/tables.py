@@ -17,7 +17,7 @@ def percent(rate: float | None, form: str = ".1f") -> str:
 
 
 def letters_of(names: Sequence[str]) -> tuple[dict[str, str], str]:
-    """Return a letter for each of several models, because a path is too long for a column.
+    """Return a letter for each of several models, because paths are too long for a column.
 
     The second value explains the letters. A single model needs no letter.
     """

@@ -73,7 +73,7 @@ def available_port_environment(settings: Settings) -> dict[str, str]:
                 if not setting.is_default:
                     raise UserError(
                         f"{kind.name}.{key}: {problem}; choose another port,"
-                        " or none to use a free one"
+                        " or omit it to use a free one"
                     )
             environment[variable(kind.name, key)] = free[variable(kind.name, key)]
     return environment
@@ -104,7 +104,7 @@ def kind_of(name: str) -> str:
 
 
 def _port_problem(host: str, port: int) -> str:
-    """Return why a port cannot be bound, empty if it can."""
+    """Return the reason why a port cannot be bound; empty if it can be bound."""
     host = "" if host in WILDCARDS else host.strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:

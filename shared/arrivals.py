@@ -13,8 +13,8 @@ if sys.platform == "linux":
     class Arrivals:
         """Ends a wait when data arrives at one of the added descriptors.
 
-        Only new data counts, whether libzmq has read it or not. The kernel removes a descriptor
-        that is closed.
+        Only new data ends a wait, whether or not libzmq has read it. The kernel removes closed
+        descriptors.
         """
 
         def __init__(self) -> None:
@@ -23,7 +23,7 @@ if sys.platform == "linux":
             self.add(self._waker.descriptor)
 
         def add(self, descriptor: int) -> None:
-            """Wait also for this descriptor. Any thread may call this."""
+            """Add a descriptor to wait for. Any thread may call this."""
             with contextlib.suppress(OSError):  # closed, or added before
                 self._epoll.register(descriptor, select.EPOLLIN | select.EPOLLET)
 
@@ -38,7 +38,7 @@ if sys.platform == "linux":
 else:
 
     class Arrivals:
-        """Other systems do not report arrivals, so no wait takes any time."""
+        """Returns from every wait at once, because this system does not report arrivals."""
 
         def add(self, descriptor: int) -> None:
             """Do nothing."""

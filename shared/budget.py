@@ -1,4 +1,4 @@
-"""How much work a peer may cause."""
+"""The budget that limits the work that a peer causes."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Callable
 
 BUDGET = 5000.0  # of a connection
 BUDGET_PER_S = 500.0
-MIN_BUDGET = 100.0  # of a new connection: enough for an honest client of a key that was misused
+MIN_BUDGET = 100.0  # of a new connection: enough for an honest client that shares a misused key
 
 
 class Budget:
-    """How much work a peer may still cause; it recovers with time."""
+    """The work that a peer may still cause. The budget recovers with time."""
 
     def __init__(self, left: float = BUDGET, clock: Callable[[], float] = time.monotonic) -> None:
         self._left, self._clock, self._since_s = left, clock, clock()
 
     @property
     def left(self) -> float:
-        """What may be spent now; negative after too much was spent."""
+        """The remaining budget; negative if the peer overspent."""
         return min(BUDGET, self._left + (self._clock() - self._since_s) * BUDGET_PER_S)
 
     def spend(self, cost: float) -> None:

@@ -124,7 +124,7 @@ class Bus:
         return Reach.REFUSED if is_refused else Reach.UNREACHABLE
 
     def wake_on_connections(self, waker: Waker) -> None:
-        """Wake the caller's loop when a connection has ended, or a message does not."""
+        """Wake the caller's loop when a connection ends, or while a message is incomplete."""
         self._limiter.waker = waker
 
     def drop(self, socket: Socket, *, linger_s: float = 1.0) -> None:

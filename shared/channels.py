@@ -13,11 +13,11 @@ _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 
 
 class CancellationGuard:
-    """Replaces the mix by the loudest channel while the mix has too little of it.
+    """Replaces the mix with the loudest channel while this channel is too weak in the mix.
 
-    This happens if a microphone's cable inverts one channel of two, if the mix of a film leaves out
-    a channel, or if one channel of nine has the only voice. The mix of other recordings is returned
-    unchanged. ``name`` is the sound's, for the remark that is added to ``remarks``.
+    There are three causes. A microphone cable inverts one of two channels. The mix of a film leaves
+    out a channel. Only one of nine channels contains a voice. Other mixes are returned unchanged.
+    ``name`` is the name of the sound in the remark that is added to ``remarks``.
     """
 
     def __init__(self, name: str, num_channels: int, remarks: list[str]) -> None:
@@ -31,7 +31,7 @@ class CancellationGuard:
     def mix(self, channels: Samples, mixed: Samples) -> Samples:
         """Return ``mixed`` or the loudest of ``channels``, with ``num_channels`` columns."""
         lost_share = _LOST_SHARE
-        if mixed.shape[1] != self._num_channels:  # not mixed yet, or the sound changed
+        if mixed.shape[1] != self._num_channels:  # not mixed yet, or the format changed
             lost_share = _LOST_SHARE_OF_AVERAGE
             mixed = mixed.mean(axis=1, keepdims=True).repeat(self._num_channels, axis=1)
         if channels.shape[1] == 1 or len(channels) == 0:
@@ -53,7 +53,7 @@ class CancellationGuard:
         if not self._has_remarked:
             self._has_remarked = True
             self._remarks.append(
-                f"{self._name}: the mix of all channels loses the sound of one;"
+                f"{self._name}: mixing all channels would lose the sound of one;"
                 f" only channel {loudest + 1} is used"
             )
         return channels[:, [loudest] * self._num_channels]

@@ -1,4 +1,4 @@
-"""How many connections a process allows, and which ones end if there are more."""
+"""Limits the number of connections of a process, and chooses the connections to end."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ if TYPE_CHECKING:
     from kouxing.shared.connections import Connection
 
 MAX_CONNECTIONS = 400  # of clients; libzmq takes up to 0.1 MB for each
-MAX_SHARE = 0.75  # of them, for one key or, until the key is known, one address
-FILES_PER_CLIENT = 6  # one for a service, and four in the tarpit
+MAX_SHARE = 0.75  # of them, for one key; until the key is known, for one address
+FILES_PER_CLIENT = 6  # its own, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 
 
 class ConnectionQuota:
     """Limits the connections of clients and of services.
 
-    Clients have ``MAX_CONNECTIONS`` and ``extra_connections``. Services have the same number, and
-    those that clients do not use. ``is_service`` returns whether a key belongs to a service.
+    The limit of clients is ``MAX_CONNECTIONS`` plus ``extra_connections``. The limit of services is
+    the same number plus the connections that clients do not use. ``is_service`` returns whether a
+    key belongs to a service.
     """
 
     def __init__(self, extra_connections: int, is_service: Callable[[str], bool]) -> None:
@@ -30,11 +31,11 @@ class ConnectionQuota:
         self._is_service = is_service
 
     def excess(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, str]]:
-        """Yield the connections that must end, and the reason.
+        """Yield the connections that must end, with the reason.
 
-        ``connections`` start with the oldest one. Silent ones end first, those of the owner with
-        the most connections before others. An owner first loses its oldest silent connection,
-        then its newest one.
+        ``connections`` start with the oldest one. Silent connections end first, and among them
+        those of the owner with the most connections. An owner first loses its oldest silent
+        connection, then its newest one.
         """
         if len(connections) <= MAX_SHARE * self.max_clients:
             return
@@ -47,18 +48,18 @@ class ConnectionQuota:
             else:
                 known.append(connection)
         silent.reverse()
-        places: dict[Connection, int] = {}  # of each connection among those of its owner, from 1
+        ranks: dict[Connection, int] = {}  # among the connections of the same owner, from 1
         nums: Counter[str] = Counter()
         for connection in (*services, *known, *silent):
             nums[connection.owner] += 1
-            places[connection] = nums[connection.owner]
+            ranks[connection] = nums[connection.owner]
         clients = known + silent
         max_services = 2 * self.max_clients - min(len(clients), self.max_clients)
         for group, limit in ((clients, self.max_clients), (services, max_services)):
-            group.sort(key=lambda connection: (connection.num_delivered == 0, places[connection]))
+            group.sort(key=lambda connection: (connection.num_delivered == 0, ranks[connection]))
             for connection in reversed(group[limit:]):
                 yield connection, "too many connections"
             for connection in group[:limit]:
-                if places[connection] > MAX_SHARE * limit:
+                if ranks[connection] > MAX_SHARE * limit:
                     owner = "key" if connection.key else "address"
                     yield connection, f"its {owner} has too many connections"

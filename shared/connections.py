@@ -1,12 +1,12 @@
 """Limits on the connections to the sockets that a process binds.
 
 libzmq limits the size of a message part and the length of a queue. It does not limit the number
-of connections, the number of parts of a message (it keeps all of them until the last one arrives),
-or how fast a peer sends. So a thread looks at every connection within 50 ms after data arrives,
-and at least once a second. It compares the bytes that the kernel received (Linux only) with the
-messages that were delivered. While some are not, it looks 20 times a second. It disconnects a peer
-that exceeds a limit; libzmq then frees the peer's memory. An honest client is never disconnected,
-however fast or slow: its queue fills up, libzmq stops reading, and the client waits.
+of connections, the number of parts of a message, or the rate of a peer. It keeps all parts of a
+message until the last one arrives. So a thread checks every connection within 50 ms after data
+arrives, and at least once a second. It compares the bytes that the kernel received (Linux only)
+with the delivered messages. While messages are undelivered, it checks 20 times a second. It
+disconnects a peer that exceeds a limit. libzmq then frees the peer's memory. An honest client is
+never disconnected, at any speed: its queue fills up, libzmq stops reading, and the client waits.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from kouxing.shared.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.waker import Waker
 
 KIB, MIB = 1024, 1024 * 1024
-CHECK_INTERVAL_S = 0.05  # between two looks at all connections, while data arrives
-MAX_INTERVAL_S = 1.0  # the same without data
+CHECK_INTERVAL_S = 0.05  # between two checks of all connections, while data arrives
+MAX_INTERVAL_S = 1.0  # between two checks without new data
 RECEIVE_BUFFER = 256 * KIB  # of the kernel, which doubles it
 MAX_UNDELIVERED = 24 * MIB  # of all connections
 MAX_INCOMPLETE = MIB  # of all connections: 16 audio messages on slow links
@@ -44,8 +44,8 @@ SMALL_INCOMPLETE = 4 * KIB  # of each connection, in addition
 MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
-NEW_LOOKS = 20  # at a connection: a flood is disconnected earlier
-MAX_ENDED = 1024  # connections that a service has not noticed yet
+NEW_LOOKS = 20  # checks in which a connection is new; a flood is disconnected earlier
+MAX_ENDED = 1024  # ended connections that a service has not handled yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
@@ -367,7 +367,7 @@ class ConnectionLimiter:
                 connections.append(connection)
         hold = partial(self._tarpit.add, now_s=now_s)
         for connection, reason in self._quota.excess(connections):
-            # An older peer may be idle. It must reconnect, or its next messages are lost.
+            # An older peer may be idle. It must reconnect at once, or its next messages are lost.
             connection.disconnect(reason, end=hold if connection.num_looks < NEW_LOOKS else None)
         for connection in connections:
             connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
@@ -381,14 +381,14 @@ class ConnectionLimiter:
         _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
         self._has_undelivered = any(connection.undelivered for connection in connections)
         if self.waker is not None and (has_ended or self._has_undelivered):
-            self.waker.wake()  # the loop receives what is complete, and learns what has ended
+            self.waker.wake()  # the loop handles complete messages and ended connections
         if self._trims_s and now_s >= self._trims_s[0]:
             del self._trims_s[0]
             self._num_ended = 0
             trim_heap()
 
     def _forget_ended(self, now_s: float) -> bool:
-        """Forget the connections that have ended; return whether there are any."""
+        """Forget ended connections; return whether any connection has ended."""
         ended = [c for c in list(self._connections.values()) if not _exists(c)]
         for connection in ended:
             del self._connections[connection.inode]

@@ -24,7 +24,7 @@ def install_command(package: str) -> str:
 
 @contextlib.contextmanager
 def naming_option(option: str, key: str, *, is_given: bool) -> Iterator[None]:
-    """Let errors about a configuration key name the option, if that has set the key."""
+    """Replace a configuration key in errors with the option that has set it, if it was given."""
     try:
         yield
     except UserError as error:

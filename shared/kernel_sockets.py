@@ -97,9 +97,10 @@ def reset(descriptor: int, inode: int) -> None:
 
 
 def hold(descriptor: int, inode: int) -> socket.socket | None:
-    """Let libzmq close a connection that stays open for its peer.
+    """Let libzmq close a connection, but keep it open for the peer.
 
-    Closing the returned socket resets it. Returns None if the descriptor is closed or reused.
+    Closing the returned socket resets the connection. Returns None if the descriptor is closed or
+    reused.
     """
     if (connection := _copy(descriptor, inode)) is not None:
         _shut_down(connection, socket.SHUT_RD)
@@ -109,7 +110,7 @@ def hold(descriptor: int, inode: int) -> socket.socket | None:
 
 
 def _copy(descriptor: int, inode: int) -> socket.socket | None:
-    """Return a socket that libzmq cannot close, None if the descriptor is closed or reused."""
+    """Return a copy that libzmq cannot close, None if the descriptor is closed or reused."""
     with contextlib.suppress(OSError):
         connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, os.dup(descriptor))
         if inode_of(connection.fileno()) == inode:
@@ -119,7 +120,7 @@ def _copy(descriptor: int, inode: int) -> socket.socket | None:
 
 
 def _shut_down(connection: socket.socket, how: int) -> None:
-    """Make libzmq close a connection. Closing the last descriptor resets it."""
+    """Make libzmq close a connection, which is reset when its last descriptor is closed."""
     with contextlib.suppress(OSError):  # closed already
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         connection.shutdown(how)

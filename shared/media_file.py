@@ -34,7 +34,7 @@ _MIN_MISSING_S = 0.1  # of a track that is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
 _TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
-# Without avi: its duration includes gaps that its packets leave out.
+# AVI is not in this list, because its duration includes gaps without packets.
 _HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|flv|caf|ape|tta|wv|au|w64")
 
 

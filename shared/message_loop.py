@@ -33,7 +33,7 @@ class MessageLoop:
         self.current_session = ""
         self._warning_limit = RateLimit()
         self._poller = Poller()
-        self.waker = self._poller.waker  # ends each `wait` until it is cleared
+        self.waker = self._poller.waker  # once woken, it ends every `wait` until it is cleared
         bus.wake_on_connections(self.waker)
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
         self._paused: set[Socket] = set()

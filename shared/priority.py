@@ -1,4 +1,4 @@
-"""How the system schedules a process that must be in time."""
+"""Scheduling of processes that must be in time."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import contextlib
 import os
 from pathlib import Path
 
-NICENESS = -10  # enough for several times the processor time of an ordinary program
+NICENESS = -10  # gives several times the processor share of an ordinary program
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 AUTOGROUP = Path("/proc/self/autogroup")
 
 
 def use_one_thread() -> None:
-    """Let numerical libraries use one thread: more need more time in total.
+    """Limit numerical libraries to one thread, because more threads need more time in total.
 
-    Call this before they are imported.
+    Call this before importing them.
     """
     os.environ.update(ONE_THREAD)
 
 
 def raise_priority() -> None:
-    """Let this process run before ordinary programs, if the system allows it.
+    """Raise the priority of this process above ordinary programs, if the system allows it.
 
-    Call this before other threads start. Linux shares the processor among sessions first
-    (autogroup), so a process that leads its session also raises the session.
+    Call this before other threads start. Linux first divides the processor among process sessions
+    (autogroups). A process that leads its session therefore also raises the session's priority.
     """
     if not hasattr(os, "setpriority"):  # Windows
         return

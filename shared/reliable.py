@@ -20,8 +20,8 @@ from kouxing.shared.wire.speech import Acknowledge
 RESEND_AFTER_S = 0.5
 MAX_RESENT = 200  # messages at a time; more would delay a busy receiver further
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
-ACKNOWLEDGE_INTERVAL_S = 0.05  # between acknowledgements of a tick
-MAX_UNACKNOWLEDGED_S = 0.1  # usually, the tick after another message is earlier
+ACKNOWLEDGE_INTERVAL_S = 0.05  # minimum time between acknowledgements by ``tick``
+MAX_UNACKNOWLEDGED_S = 0.1  # usually, another message causes an earlier tick
 
 
 class ReliableSender:
@@ -108,9 +108,9 @@ class ReliableReceiver:
         return True
 
     def tick(self, now_s: float) -> float:
-        """Acknowledge what has arrived since the last acknowledgement, if it is time.
+        """Acknowledge newly received messages, if this is due.
 
-        Return when to call this again, unless another message arrives before.
+        Returns the time of the next call, unless another message arrives earlier.
         """
         if self._last == self._acknowledged:
             return math.inf

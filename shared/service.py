@@ -48,8 +48,8 @@ from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSes
 if TYPE_CHECKING:
     from kouxing.shared.prometheus import MetricsServer
 
-TICK_S = 0.01  # between ticks, at least
-FOLLOW_UP_S = 0.03  # from a tick to the next if messages arrived too early for one
+TICK_S = 0.01  # minimum time between ticks
+FOLLOW_UP_S = 0.03  # time between two ticks if a message arrived within ``TICK_S``
 HEARTBEAT_S = 0.25  # between heartbeats with sessions
 IDLE_HEARTBEAT_S = 1.0  # after a heartbeat without sessions
 SESSIONS_PER_HEARTBEAT = 16  # of a worker, so that a heartbeat's cost does not grow
@@ -60,12 +60,12 @@ FIRST_REPLY_S = 3.0  # the same at startup
 LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0
 HAND_OVER_S = 3.0  # time for control to move the sessions of a stopping worker
-MAX_LATE_S = 5.0  # of a heartbeat; a later service is not healthy
-EXIT_AFTER_S = 15.0  # if a heartbeat is later, a health check ends the process
+MAX_LATE_S = 5.0  # delay of a heartbeat above which a service is not healthy
+EXIT_AFTER_S = 15.0  # delay of a heartbeat above which a health check ends the process
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id; the underscore: not a setting
 _BUILD = version("kouxing")
 PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
-IDLE_PULSE = b"-"  # such a byte, for a heartbeat without sessions
+IDLE_PULSE = b"-"  # the byte for a heartbeat without sessions
 
 
 class Service(MessageLoop):
@@ -112,9 +112,9 @@ class Service(MessageLoop):
         """Prepare the main loop; called once, before the service registers."""
 
     def on_tick(self, now_s: float) -> float:
-        """Do the work that is due; return when more is due, unless a message arrives before.
+        """Do the work that is due; return when more work is due.
 
-        This is called after messages and other events, but at most every ``TICK_S``.
+        The service also calls this after messages and other events, but at most every ``TICK_S``.
         """
         return math.inf
 
@@ -174,7 +174,7 @@ class Service(MessageLoop):
         self.send_to_control(Event(session=session, name=name, detail=detail[:2000]))
 
     def report_skipped(self, session: str, skipped_s: float) -> None:
-        """Count and report the duration of skipped audio of a live session, unless it is 0."""
+        """Count and publish the duration of a live session's skipped audio, unless it is 0."""
         if skipped_s > 0.0:
             self.metrics.count("skipped_audio_ms", round(1e3 * skipped_s))
             self.publish_event(EventName.AUDIO_SKIPPED, session, f"{skipped_s:.2f} s")

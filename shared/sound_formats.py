@@ -64,7 +64,7 @@ def is_sound(begin: bytes) -> bool:
 
 
 def unprobed_format(begin: bytes) -> str | None:
-    """Return FFmpeg's name of a format that FFmpeg recognizes only by the file's name."""
+    """Return FFmpeg's name of a format that FFmpeg recognizes only by the file extension."""
     return "sbc" if begin.startswith(b"\x9c") and is_sound(begin) else None
 
 

@@ -1,7 +1,7 @@
-"""Keeps connections open that libzmq has closed, so that their peers do not reconnect at once.
+"""Holds connections open after libzmq has closed them, so that peers do not reconnect at once.
 
-A ZeroMQ peer reconnects 0.1 s after its connection has ended, and each handshake takes this process
-0.5 ms. A thousand surplus peers would thus delay the messages of all others.
+A ZeroMQ peer reconnects 0.1 s after its connection has ended. Each handshake costs this process
+0.5 ms, so a thousand surplus peers would delay the messages of all other peers.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from collections import deque
 from kouxing.shared import kernel_sockets
 
 MAX_HELD = 1600
-HOLD_S = 2.0  # at least
-GAP_S = 0.005  # between two resets: those who are reset together would return together
+HOLD_S = 2.0  # minimum time
+GAP_S = 0.005  # between two resets; peers that are reset together would reconnect together
 
 
 class Tarpit:
-    """Holds up to ``capacity`` connections, and resets them later one after another."""
+    """Holds up to ``capacity`` connections, and later resets them one by one."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._held: deque[tuple[float, socket.socket]] = deque()  # with the time of the reset
 
     def add(self, descriptor: int, inode: int, now_s: float) -> None:
-        """Hold a connection, which libzmq then closes, unless the peer keeps sending."""
+        """Hold a connection. libzmq then closes it, unless the peer keeps sending."""
         held = kernel_sockets.hold(descriptor, inode)
         if held is not None:
             last_s = self._held[-1][0] if self._held else 0.0
             self._held.append((max(now_s + HOLD_S, last_s + GAP_S), held))
 
     def release(self, now_s: float) -> None:
-        """Reset the connections that are due, and the oldest ones of too many."""
+        """Reset the connections that are due, and the oldest ones above the capacity."""
         while self._held and (self._held[0][0] <= now_s or len(self._held) > self._capacity):
             self._held.popleft()[1].close()
 

@@ -18,7 +18,7 @@ class Waker:
 
     def wake(self) -> None:
         """Make the descriptor readable. Any thread or signal handler may call this."""
-        with contextlib.suppress(BlockingIOError):  # it is readable already
+        with contextlib.suppress(BlockingIOError):  # already readable
             os.write(self._write_end, b".")
 
     def clear(self) -> bool:

@@ -241,7 +241,7 @@ def ear_report(
     sounds: Sounds,
     clips: Clips,
 ) -> None:
-    """Measure the voice classes and the lips of a small ear on held-out audio.
+    """Measure the voice classes and the lip features of a small ear on held-out audio.
 
     ``kouxing evaluate voice`` measures the voice activity of the recognizer.
     """

@@ -13,7 +13,7 @@ import { chooseSet, findShapes } from "./shape-names.js";
 const UNREADABLE = { DRACOLoader: "KHR_draco_mesh_compression", KTX2: "KHR_texture_basisu" }; // by words of three.js
 const VIEW_HEIGHT = 1.6; // of the camera's view, relative to the face
 const VRM_FACE_M = 0.24;
-// Degrees by which the eyes turn at weight 1, and the shapes of the sets "vrm" and "arkit".
+// Rotation of the eyes at weight 1, degrees, and the shapes of the sets "vrm" and "arkit".
 const LOOKS = {
   left: [24.6, "lookLeft", "eyeLookOutLeft", "eyeLookInRight"],
   right: [24.6, "lookRight", "eyeLookInLeft", "eyeLookOutRight"],
@@ -144,7 +144,7 @@ function vrmAvatar(vrm, meshes) {
   };
 }
 
-/** Turn the eyes of a VRM that has bones for them instead of expressions. */
+/** Rotate the eyes of a VRM that has eye bones instead of expressions. */
 function turnEyes(lookAt, weightOf) {
   const degrees = ([most, shape, ...parts]) =>
     most * (weightOf.get(shape) ?? parts.reduce((sum, part) => sum + (weightOf.get(part) ?? 0) / parts.length, 0));

@@ -4,8 +4,8 @@ All random numbers have fixed seeds, so that figures can be reproduced.
 
 ====================  ==========================================================================
 noise 10 dB           pink noise, 10 dB below the speech level
-music 10 dB           held-out music of a folder of sounds, or synthesized music, likewise
-babble 10 dB          six parts of the recordings at once, likewise
+music 10 dB           held-out music of a folder of sounds, or synthesized music, at this level
+babble 10 dB          six parts of the recordings at once, at this level
 room                  echoes that fall by 60 dB in 0.5 s (noise with an exponential envelope, Polack
                       1988), together as loud as the direct sound
 telephone             300 to 3400 Hz, Butterworth of order 8
@@ -43,9 +43,9 @@ _TINY = 1e-9
 def disturbances_for(
     references: Sequence[Reference], music: Samples, names: Sequence[str] = ()
 ) -> dict[str, Disturb]:
-    """Return clean speech and the disturbances with these names, by default all.
+    """Return clean speech and the disturbances with the given names, by default all.
 
-    The babble consists of these recordings.
+    The babble is mixed from ``references``.
     """
     step = len(references) // _MAX_BABBLE_RECORDINGS + 1
     others = babble([reference.read_audio() for reference in references[::step]])
@@ -63,19 +63,19 @@ def disturbances_for(
 def check_conditions(names: Sequence[str]) -> None:
     """Raise UserError if a name is not one of ``CONDITIONS``."""
     if unknown := [name for name in names if name not in CONDITIONS]:
-        raise UserError(f"no condition {unknown[0]!r}; choose from: {', '.join(CONDITIONS)}")
+        raise UserError(f"unknown condition {unknown[0]!r}; choose from: {', '.join(CONDITIONS)}")
 
 
 def music_from(sounds: Sequence[Sound]) -> Samples:
-    """Return the held-out music, or synthesized music if there are no ``sounds``.
+    """Return the held-out music, or synthesized music if ``sounds`` is empty.
 
-    Raises UserError if none of the sounds is held-out music.
+    Raises UserError if the sounds contain no held-out music.
     """
     if not sounds:
         return synthetic_sounds.music(_MUSIC_S)
     pieces = [as_floats(sound.samples) for sound in held_out(sounds, "music")]
     if not pieces:
-        raise UserError("no held-out music to measure with; give more of it with --sounds")
+        raise UserError("the sounds contain no held-out music; add more music to --sounds")
     return np.concatenate([_to_equal_level(piece) for piece in pieces])
 
 

@@ -48,7 +48,7 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import CONSOLE
 
-# The paper's rule, and one for fewer errors. They are measured in clean speech.
+# the paper's rule and a rule with fewer errors, which are measured in clean speech
 RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))
 CHUNK_SAMPLES = 160  # 10 ms, as live audio arrives
 HYPOTHESES = ("offline", "first", "final")
@@ -66,7 +66,7 @@ class Recognition:
 
 
 class Score:
-    """Errors and delays in one kind of audio."""
+    """Accumulates errors and delays in one kind of audio."""
 
     def __init__(self, inventory: PhoneInventory) -> None:
         self._inventory = inventory
@@ -155,10 +155,10 @@ def evaluate_recognizer(
     *,
     rules: Sequence[OutputRuleConfig] = RULES,
 ) -> dict[str, Any]:
-    """Measure a model; return JSON figures.
+    """Measure a model; return figures for a JSON file.
 
-    In the figures, ``speech`` has the scores with ``rule``, by disturbance and by speaking rate.
-    ``rules`` has the scores in clean speech with the other ``rules``.
+    ``speech`` in the figures contains the scores with ``rule``, by disturbance and speaking rate.
+    ``rules`` contains the scores of the other ``rules`` in clean speech.
     """
     speech: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
     by_rule: dict[str, Score] = defaultdict(lambda: Score(model.inventory))

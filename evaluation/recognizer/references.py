@@ -1,4 +1,4 @@
-"""The recordings of a corpus with the times of their phones, and their speaking rates.
+"""The recordings of a corpus with aligned phones and speaking rates.
 
 The speaking rate is the number of syllables per second of phones, without pauses.
 """
@@ -32,7 +32,7 @@ RATE_NAMES = (
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A recording of a corpus, and the phones of its text, without silence."""
+    """A recording of a corpus and the aligned phones of its text, without silence."""
 
     utterance: Utterance
     phones: list[Phone]
@@ -51,7 +51,7 @@ class Reference:
 def align_corpus(
     model: AcousticModel, corpus: Path, split: str, errors: RowErrors, audio: Path | None = None
 ) -> list[Reference]:
-    """Find the phones of one split of a corpus in the model's language.
+    """Align the recordings of one split of a corpus in the model's language.
 
     ``errors`` receives the rows that cannot be used. Raises UserError if the split has no usable
     recording.

@@ -19,7 +19,7 @@ Figures = Mapping[str, Any]  # result of evaluate_recognizer
 
 
 def print_figures(results: Mapping[str, Figures], split: str, console: Console) -> None:
-    """Print one table. ``results`` has the figures by the name of the model."""
+    """Print one table. ``results`` contains the figures of each model by its name."""
     letters, legend = letters_of(list(results))
     first = next(iter(results.values()))
     print_table(
@@ -59,10 +59,10 @@ def _cells(score: Figures) -> list[str]:
 
 
 def draw_delay_curve(results: Sequence[Figures], path: Path) -> None:
-    """Plot the errors of both hypotheses in clean speech over the median delay of the first.
+    """Plot the errors of both hypotheses in clean speech over the first hypothesis's median delay.
 
-    The results have the model's name as ``acoustic``. Those of one model, with several look-aheads,
-    are adjacent. Raises UserError if the picture cannot be written.
+    ``acoustic`` of each result is the name of the model. The results of one model, with several
+    look-aheads, are adjacent. Raises UserError if the picture cannot be written.
     """
     figure = new_figure(11.0, 4.5)
     for axes, kind in zip(figure.subplots(1, 2), ("phone", "viseme"), strict=True):

@@ -27,7 +27,7 @@ from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 Samples = NDArray[np.float32]  # (n,), 16 kHz, in [-1, 1]
 _TWELFTH = 2 ** (1 / 12)
 
-_FORMANTS_HZ = {  # of a man
+_FORMANTS_HZ = {  # of a male voice
     "a": (850, 1250, 2600, 3500),
     "o": (550, 850, 2500, 3400),
     "e": (500, 1150, 2450, 3400),
@@ -86,7 +86,7 @@ def varying_noise(seconds: float) -> Samples:
 
 
 def keyboard(seconds: float) -> Samples:
-    """Return strokes on a keyboard: a click down and a weaker one up."""
+    """Return keyboard strokes. Each has a click and a weaker click on release."""
     rng = np.random.default_rng(3)
     out = np.zeros(round((seconds + 1) * SAMPLE_RATE_HZ))
     at_s = 0.2
@@ -153,7 +153,7 @@ def _vowel(
     rng: np.random.Generator,
     vibrato: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Synthesize a vowel; ``size`` multiplies the formants, ``vibrato`` is in semitones."""
+    """Synthesize a vowel. ``size`` scales the formants; ``vibrato`` is in semitones."""
     num_samples = round(seconds * SAMPLE_RATE_HZ)
     time_s = np.arange(num_samples) / SAMPLE_RATE_HZ
     knots = rng.normal(0, _JITTER, round(10 * seconds) + 2)

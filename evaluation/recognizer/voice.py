@@ -1,11 +1,11 @@
-"""Voice activity of the recognizer: the share of time in which it is on, by kind of audio.
+"""Measures the recognizer's voice activity: the share of time with activity, by kind of audio.
 
-The audio passes through a live recognizer in slices of 20 ms. A slice counts with the state that
-the recognizer has reported (``SpeechChange``) when the slice is processed. So the share includes
-the delays of the decision, such as the half second before speech ends.
+The audio passes through a live recognizer in slices of 20 ms. The state of a slice is the newest
+state that the recognizer has reported (``SpeechChange``) after processing the slice. The share
+therefore includes the delays of the detector, such as the half second before speech ends.
 
 - Speech: the recordings of a corpus, with 2 s of silence before and after each, clean and with
-  music or babble. Forced alignment of the text finds the phones; only phones are voice.
+  music or babble. Forced alignment of the text finds the phones. Only phones count as a voice.
 - Held-out recordings of a folder of sounds (:mod:`kouxing.corpora.sounds`).
 - Synthesized sounds (:mod:`~kouxing.evaluation.recognizer.synthetic_sounds`).
 """
@@ -47,7 +47,7 @@ _KINDS = {"singing": True, "laughter": False, "breath": False, "music": False, "
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Recordings of one kind, each with the slices that have a voice."""
+    """Recordings of one kind of audio, each with a mask of the slices with a voice."""
 
     kind: str
     recordings: Sequence[tuple[Samples, Mask]]
@@ -59,7 +59,7 @@ def materials_of(
     music: Samples,
     sounds: Sequence[Sound],
 ) -> Iterator[Material]:
-    """Read, disturb and synthesize the audio, one kind after the other.
+    """Read, disturb and synthesize the audio, one kind at a time.
 
     ``music`` accompanies the melodies.
     """
@@ -102,10 +102,10 @@ def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
 def evaluate_voice(
     models: Mapping[str, AcousticModel], materials: Iterable[Material]
 ) -> dict[str, dict[str, Any]]:
-    """Measure voice activity; return JSON figures by model and kind of audio.
+    """Measure voice activity; return figures for a JSON file, by model and kind of audio.
 
-    They have the seconds with and without a voice, and the share of each in which voice activity is
-    on; None without such audio.
+    The figures contain the seconds with and without a voice, and the share of each with voice
+    activity. The share is None without such audio.
     """
     results: dict[str, dict[str, Any]] = {name: {} for name in models}
     for material in track(materials, "voice activity", console=CONSOLE, transient=True):
@@ -124,7 +124,7 @@ def evaluate_voice(
 
 
 def voice_activity(model: AcousticModel, samples: Samples) -> Mask:
-    """Return the state of the live recognizer after each slice of a recording, (n,)."""
+    """Return the voice activity that the live recognizer reports after each slice, (n,)."""
     recognizer = Recognizer(model)
     stream = recognizer.create_stream()
     is_active = False
@@ -140,7 +140,7 @@ def voice_activity(model: AcousticModel, samples: Samples) -> Mask:
 
 
 def print_voice(results: Mapping[str, Figures], title: str, console: Console) -> None:
-    """Print one table with all models. ``results`` has the figures by the name of the model."""
+    """Print one table for all models. ``results`` contains the figures of each model by name."""
     letters, legend = letters_of(list(results))
     print_table(
         console,

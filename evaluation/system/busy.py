@@ -1,9 +1,9 @@
-"""Measure how late a live face is while other programs keep the processor busy.
+"""Measures the lateness of a live face while other programs keep the processor busy.
 
-One client speaks in a loop. Busy programs run for a while, each in a session of its own, as desktop
-programs do: Linux shares the processor among sessions first. The face's *lateness* is the time
-since the audio of the newest frame was due, beyond its median before the load. So it also grows
-while no frame arrives.
+One client streams speech in a loop. Busy programs run for a while. Each has its own process
+session, like a desktop program, because Linux first divides the processor among these sessions. The
+*lateness* of the face is the time since the audio of the newest frame was due, minus its median
+before the load. The lateness therefore also grows while no frame arrives.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
-LATE_S = 0.3  # a face that is later is behind
-RECOVERED_S = 0.05  # lateness of a face that has recovered
-STEADY_S = 1.0  # and stays so for this time
-QUIET_S = 5.0  # before the load
-STEP_S = 0.02  # between two values of the lateness
+LATE_S = 0.3  # lateness above which the face is behind
+RECOVERED_S = 0.05  # maximum lateness of a face that has recovered
+STEADY_S = 1.0  # time for which the lateness must stay at or below this maximum
+QUIET_S = 5.0  # measured time before the load
+STEP_S = 0.02  # interval of the lateness values
 _PROC = Path("/proc")
 _COLUMNS = 10  # seconds in a row of the table
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What a service used per second."""
+    """Resources that a service used per second."""
 
     cpu_cores: float
     wake_ups: float  # of all threads
@@ -58,7 +58,7 @@ class Run:
 
     num_programs: int
     quiet_median_s: float  # from the audio of a frame to its arrival, before the load
-    late_s: list[float]  # beyond that, every STEP_S from the start of the load
+    late_s: list[float]  # lateness, every STEP_S from the start of the load
     load_s: float  # duration of the load
     missing: float  # fraction of the frames that never arrived
 
@@ -120,7 +120,7 @@ def measure(
     after_s: float,
     console: Console,
 ) -> Busy:
-    """Start all services, and speak while busy programs run; once for each number of programs.
+    """Start all services, and speak while each number of busy programs runs.
 
     Raises ``UserError`` if a file is not audio, or the services cannot start.
     """
@@ -145,7 +145,7 @@ def measure(
 
 @contextlib.contextmanager
 def _speaker(client: Client, text: NDArray[np.float32]) -> Iterator[tuple[Crowd, float]]:
-    """Open a session and speak for a moment; yield the speaker, and the time."""
+    """Open a session and speak for a moment; yield the speaker and the time reached."""
     crowd = Crowd(client, text, 1)
     if not crowd.spoken:
         raise UserError(f"control rejects the session: {', '.join(crowd.refusals)}")
@@ -181,7 +181,7 @@ def _run(
 
 
 def _frames(spoken: Spoken) -> list[tuple[float, float]]:
-    """Return when the audio of each frame was due and when the frame arrived, in order."""
+    """Return, for each frame in order, when its audio was due and when the frame arrived."""
     arrived_s = spoken.arrived_s.copy()  # another thread adds frames
     return sorted(
         (spoken.start_s + to_seconds(media_time), at_s) for media_time, at_s in arrived_s.items()
@@ -191,7 +191,7 @@ def _frames(spoken: Spoken) -> list[tuple[float, float]]:
 def _ages_s(
     frames: Sequence[tuple[float, float]], from_s: float, until_s: float
 ) -> NDArray[np.float64]:
-    """Return the age of the newest frame every ``STEP_S``: the time since its audio was due."""
+    """Return the time since the audio of the newest frame was due, every ``STEP_S``."""
     due_s, arrived_s = np.array(frames).T
     order = np.argsort(arrived_s)
     newest_s = np.maximum.accumulate(due_s[order])
@@ -217,7 +217,7 @@ def _busy_programs(num: int) -> Iterator[None]:
 
 
 def _usage(processes: Mapping[str, int], action: Callable[[], None]) -> dict[str, Usage]:
-    """Return what each service uses while an action runs."""
+    """Return the resources that each service uses while an action runs."""
     started_s = time.monotonic()
     before = {name: _used(process) for name, process in processes.items()}
     action()
@@ -234,7 +234,7 @@ def _usage(processes: Mapping[str, int], action: Callable[[], None]) -> dict[str
 
 
 def _used(process_id: int) -> tuple[float, int]:
-    """Return the CPU seconds of a process, and how often its threads woke up.
+    """Return the CPU seconds of a process and the number of wake-ups of its threads.
 
     Raises ``UserError`` if the system has no /proc, or the process has ended.
     """
@@ -245,7 +245,7 @@ def _used(process_id: int) -> tuple[float, int]:
             for thread in (_PROC / str(process_id) / "task").iterdir()
         ]
     except OSError as error:
-        text = f"cannot read the processor time of a service: {error}; this needs Linux"
+        text = f"cannot read the processor time of a service: {error}; run this command on Linux"
         raise UserError(text) from None
     wake_ups = sum(
         int(line.split()[1])
@@ -257,7 +257,7 @@ def _used(process_id: int) -> tuple[float, int]:
 
 
 def show(busy: Busy, console: Console) -> None:
-    """Print the lateness by second, the summary, and what the services use."""
+    """Print the lateness by second, a summary, and the resources that each service uses."""
     for run in busy.runs:
         rows = run.worst_by_second_s
         print_table(

@@ -179,7 +179,7 @@ def _time_phones(
         phones = time_text(*recording)
         ratio = speech_ratio(*recording)
         if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
-            print_mismatch(source, f"the speech has {ratio:.1f} times the text's usual duration")
+            print_mismatch(source, f"the speech is {ratio:.1f} times the text's usual duration")
         return phones
     model = load_live_model()
     if transcript is None:

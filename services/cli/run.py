@@ -163,7 +163,7 @@ def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
 
 
 def _entered(context: contextlib.AbstractContextManager[None]) -> contextlib.ExitStack:
-    """Enter a context; return what closes it."""
+    """Enter a context; return a stack whose ``close`` leaves it."""
     stack = contextlib.ExitStack()
     stack.enter_context(context)
     return stack

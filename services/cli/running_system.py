@@ -61,9 +61,9 @@ def starting(on_wait: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reserve(folder: Path) -> Iterator[None]:
-    """Keep other systems out of the folder for logs and videos while this one runs.
+    """Lock the folder for logs and videos while this system runs.
 
-    Raises ``UserError`` if another system uses it. If it cannot be used, nothing is reserved.
+    Raises ``UserError`` if another system uses the folder. An unusable folder is not locked.
     """
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
@@ -75,7 +75,7 @@ def reserve(folder: Path) -> Iterator[None]:
             except BlockingIOError:
                 raise UserError(
                     f"{folder}: another kouxing writes its logs and videos to this folder; stop it,"
-                    " or add --set driver.out=FOLDER"
+                    " or choose another folder with --set driver.out=FOLDER"
                 ) from None
         yield
 

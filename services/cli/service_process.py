@@ -22,8 +22,8 @@ from kouxing.shared.service import (
 )
 
 POLL_S = 0.5  # between two checks of a process
-SILENT_S = 1.0  # a loop that sends no heartbeat for longer may hang
-HANG_S = 5.0  # for longer: it hangs
+SILENT_S = 1.0  # without a heartbeat; a loop that is silent for longer may hang
+HANG_S = 5.0  # without a heartbeat; a loop that is silent for longer hangs
 
 
 class ServiceProcess(subprocess.Popen[bytes]):
@@ -59,15 +59,15 @@ class ServiceProcess(subprocess.Popen[bytes]):
             os.close(write_end)
         self._hang_limit_s = hang_limit_s
         self._silence = SilenceMeter(time.monotonic())
-        self._idle_s = 0.0  # by which the next heartbeat may be later
+        self._idle_s = 0.0  # extra time until the next heartbeat of a service without sessions
         self.is_ready = False  # it has sent a heartbeat
 
     def read_heartbeats(self) -> None:
-        """Update what is known about the process. Call this about every ``POLL_S``."""
+        """Update the state of the process. Call this about every ``POLL_S``."""
         self._silence.update(time.monotonic(), self._waited_s())
         with contextlib.suppress(BlockingIOError):
             if pulses := os.read(self._pulse, 65536):
-                self.restart_silence()
+                self.reset_silence()
                 self.is_ready = True
                 is_idle = pulses.endswith(IDLE_PULSE)
                 self._idle_s = IDLE_HEARTBEAT_S - HEARTBEAT_S if is_idle else 0.0
@@ -77,8 +77,8 @@ class ServiceProcess(subprocess.Popen[bytes]):
         """Whether a heartbeat is missing."""
         return self._silence.duration_s > SILENT_S + self._idle_s
 
-    def restart_silence(self) -> None:
-        """Wait for a heartbeat as long as if there had just been one."""
+    def reset_silence(self) -> None:
+        """Restart the timeout, as after a heartbeat."""
         self._silence.duration_s = 0.0
 
     @property
@@ -87,7 +87,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         return self.is_ready and self._silence.duration_s > self._hang_limit_s + self._idle_s
 
     def _waited_s(self) -> float:
-        """Return how long the main thread was ready but got no processor; 0 if unknown."""
+        """Return how long the main thread has waited for a processor; 0 if unknown."""
         try:
             waited_ns = Path(f"/proc/{self.pid}/schedstat").read_text("ascii").split()[1]
         except (OSError, IndexError):
@@ -100,13 +100,13 @@ class SilenceMeter:
 
     def __init__(self, now_s: float) -> None:
         self.duration_s = 0.0
-        self._stall = StallDetector(now_s, limit_s=2 * POLL_S)  # of the caller
+        self._stall = StallDetector(now_s, limit_s=2 * POLL_S)  # detects stalls of the caller
         self._waited_s = 0.0
 
     def update(self, now_s: float, waited_s: float) -> None:
         """Add the time since the last call.
 
-        ``waited_s`` is the total time in which the loop was ready but got no processor.
+        ``waited_s`` is the total time in which the loop waited for a processor.
         """
         elapsed_s, waited_s = self._stall.elapsed_s(now_s), max(waited_s, self._waited_s)
         self.duration_s += max(0.0, elapsed_s - (waited_s - self._waited_s))

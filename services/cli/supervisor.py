@@ -130,8 +130,8 @@ class Supervisor:
         for process in processes:
             process.read_heartbeats()
         if len(processes) > 1 and all(process.is_silent for process in processes):
-            for process in processes:  # all were stopped: none of them hangs
-                process.restart_silence()
+            for process in processes:  # all were stopped, so none of them hangs
+                process.reset_silence()
         for name, process in list(self._processes.items()):
             status = process.poll()
             if status is None:

@@ -1,4 +1,4 @@
-"""The lifecycle of sessions: starts, announces, moves and ends them.
+"""Starts, announces, moves and ends sessions.
 
 Each step is sent to the services and the client of the session, and is published as an event.
 """
@@ -21,14 +21,14 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode
 
 START_TIMEOUT_S = 5.0
-MOVE_TIMEOUT_S = 20.0  # after which a session without a worker is closed
+MOVE_TIMEOUT_S = 20.0  # time without a worker after which a session is closed
 
 
 class Lifecycle:
-    """The lifecycle of control's sessions.
+    """Manages the lifecycle of control's sessions.
 
-    ``commands`` is the socket to services and clients, ``events`` the publisher, and
-    ``events_address`` its address for clients.
+    ``commands`` is the socket for services and clients. ``events`` is the publisher of events, and
+    ``events_address`` the publisher's address for clients.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Lifecycle:
         self._move_repeats = MoveRepeats()
 
     def on_tick(self, now_s: float) -> float:
-        """Repeat moves, and find sessions that wait too long; return when the next move is due."""
+        """Repeat move messages and check timeouts; return when the next repetition is due."""
         for moved in self._move_repeats.due(now_s):
             record = self._sessions.get(moved.session)
             if record is not None and record.epoch == moved.epoch:
@@ -73,10 +73,10 @@ class Lifecycle:
             self._commands.send(message, to=self._registry[instance].peer)
 
     def announce_if_started(self, record: SessionRecord) -> None:
-        """Tell the client that its session is open or has moved, once the services serve it.
+        """Notify the client that its session is open or has moved, once all services are ready.
 
-        A new session waits for the observers, so that they miss nothing. A session that moved
-        does not: its client still has audio to resend.
+        A new session waits for the observers, so that they miss nothing. A moved session does not
+        wait for them, because its client still has audio to resend.
         """
         if record.lost:
             return
@@ -89,7 +89,7 @@ class Lifecycle:
             self._announce_move(record)
 
     def move(self, record: SessionRecord) -> None:
-        """Move a session to other workers, if some are free."""
+        """Move a session to other workers if any are free."""
         if self._sessions.move(record, time.monotonic()):
             self.send_start(record, record.waiting_for - record.deferred)
 
@@ -155,7 +155,7 @@ class Lifecycle:
         self._move_repeats.add(moved, time.monotonic())
 
     def _stop_waiting(self, record: SessionRecord) -> None:
-        """Continue without observers that did not start a session; end it without a worker."""
+        """Continue without the missing observers. If a worker is missing, end the session."""
         missing = record.missing_workers
         if not missing:
             record.waiting_for.clear()

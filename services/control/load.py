@@ -4,7 +4,7 @@ A heartbeat states the share of the last two seconds in which a worker's loop wa
 that were placed or ended since then count with the cost of one session: the highest cost measured
 recently. Every session is expected to take that much, since a silent client may start to speak at
 any moment. A worker processes the audio of all sessions together, so each of many sessions costs
-less. Therefore, the cost falls quickly to the load divided by the number of sessions that speak.
+less. The cost therefore falls quickly to the load divided by the number of speaking sessions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MIN_SESSIONS = 2  # never refused; on a busy machine every session seems to be e
 MEASURED_S = 2.0  # period over which a worker measures its load
 DEFAULT_COST = 0.25  # of a session, until it is measured; true for a slow machine
 COST_HALF_LIFE_S = 60.0  # of the highest measured cost
-SPEAKING_HALF_LIFE_S = 4.0  # while all sessions that speak cost less
+SPEAKING_HALF_LIFE_S = 4.0  # of the cost, while the speaking sessions cost less than that
 RETRY_AFTER_S = 5.0  # for a client that is refused
 
 
@@ -54,7 +54,7 @@ class WorkerLoad:
             self._unpaced_until_s = now_s + MEASURED_S
 
     def measure(self, load: float, now_s: float, num_speaking: int = 0) -> None:
-        """Use the load of a heartbeat; it includes silent sessions."""
+        """Update the cost from the load in a heartbeat. The load includes silent sessions."""
         if self._is_unpaced(now_s):
             return
         passed_s = now_s - self._measured_s

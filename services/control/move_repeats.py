@@ -24,7 +24,7 @@ class MoveRepeats:
 
     @property
     def due_s(self) -> float:
-        """When the next message must be repeated."""
+        """Time at which the next message must be repeated."""
         return self._heap[0][0] if self._heap else math.inf
 
     def due(self, now_s: float) -> Iterator[SessionMoved]:

@@ -49,7 +49,7 @@ class Registry:
 
     def __init__(self, lost_after_s: float) -> None:
         self._services: dict[str, ServiceRecord] = {}
-        # the others by their newest heartbeat, oldest first, with and without sessions
+        # services except control, oldest heartbeat first: with and without sessions
         self._busy: OrderedDict[str, ServiceRecord] = OrderedDict()
         self._idle: OrderedDict[str, ServiceRecord] = OrderedDict()
         self._usual_limit_s = self._limit_s = lost_after_s
@@ -107,7 +107,7 @@ class Registry:
     def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float, num_speaking: int = 0) -> None:
         """Register a service, or record its newest heartbeat.
 
-        ``num_speaking`` is the number of the service's sessions in which somebody speaks.
+        ``num_speaking`` is the number of the service's speaking sessions.
         """
         instance = heartbeat.instance
         record = self._services.get(instance)
@@ -123,7 +123,7 @@ class Registry:
         record.state, record.metrics = heartbeat.state, heartbeat.metrics
         self._busy.pop(instance, None)
         self._idle.pop(instance, None)
-        if record.peer != NO_PEER:  # this is not control itself
+        if record.peer != NO_PEER:  # NO_PEER is control itself
             (self._busy if heartbeat.sessions else self._idle)[instance] = record
         if heartbeat.role == "worker":
             self.load(instance).measure(heartbeat.load, now_s, num_speaking)
@@ -271,7 +271,7 @@ class Registry:
         return now_s - self._paused_s - self._services[instance].heartbeat_s
 
     def overdue_s(self) -> float:
-        """Return when the oldest heartbeat will be too old."""
+        """Return the time at which the oldest heartbeat becomes too old."""
         oldest = (
             (next(iter(services.values())), max_age_s)
             for services, max_age_s in self._max_ages_s()
@@ -293,7 +293,7 @@ class Registry:
         return overdue
 
     def _max_ages_s(self) -> Iterable[tuple[Mapping[str, ServiceRecord], float]]:
-        """Return services, oldest heartbeat first, and the maximum age of their heartbeats."""
+        """Return services with and without sessions, oldest heartbeat first, and the age limit."""
         return (
             (self._busy, self._limit_s),
             (self._idle, self._limit_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),

@@ -52,9 +52,9 @@ from kouxing.shared.wire.session import (
 from kouxing.shared.wire.speech import Speech
 
 STOPPED = "stopped"  # reason for a service that shut down
-CHECK_S = 0.5  # between looks at waiting sessions and the list of keys
-MAX_PAUSE_S = 0.1  # of a tick after it was due; anything longer is control's own delay
-# Events that a service may publish
+CHECK_S = 0.5  # interval of checking waiting sessions and the list of keys
+MAX_PAUSE_S = 0.1  # delay of a tick; any longer delay was caused by control itself
+# events that a service may publish
 SERVICE_EVENTS = (EventName.AUDIO_SKIPPED, EventName.ERROR, EventName.RECORDED)
 
 
@@ -74,7 +74,7 @@ class ControlService(Service):
         self._faults = Faults()
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
-        self._keys_version = (0, 0)  # whose revoked keys have no sessions
+        self._keys_version = (0, 0)  # of the list whose revoked keys have no sessions
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._sleep_s = 0.0  # planned time until the next tick
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
@@ -160,7 +160,7 @@ class ControlService(Service):
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
             if known.announced and known.next_sequence == 1:  # its token may have been lost
-                self._lifecycle.end(known, "its client was disconnected before it was told")
+                self._lifecycle.end(known, "its client was disconnected before the answer arrived")
                 known = None
         if known is not None and not known.announced:
             return None  # the services are starting

@@ -45,7 +45,7 @@ class SessionRecord:
     next_sequence: int = 1  # first audio message that a new recognizer would need
     resume_sequence: int | None = None  # first one to resend; None: the recognizer stays
     media_time: int = 0  # its phones are final up to here
-    lateness: Lateness | None = None  # of its frames in the last 10 s
+    lateness: Lateness | None = None  # of the session's frames in the last 10 s
     skipped_s: dict[str, float] = field(default_factory=dict)  # by instance
 
     @property

@@ -92,7 +92,7 @@ class Sessions:
         return list(self._pending.values())
 
     def num_speaking(self, instance: str) -> int:
-        """Return in how many sessions of a worker somebody speaks."""
+        """Return the number of a worker's sessions with speech at the moment."""
         return sum(record.speaking for record in self._of_worker.get(instance, {}).values())
 
     def participants(self, record: SessionRecord) -> set[str]:

@@ -42,7 +42,7 @@ class View:
             self._virtual_camera = VirtualCamera(renderer, config.frame_rate_hz)
             LOG.info("the virtual camera is %s", self._virtual_camera.device)
         elif self._window is None:
-            load_head(config.head)  # an unknown head is an error even if nothing shows it
+            load_head(config.head)  # an unknown head is an error even without an output
 
     @property
     def is_live(self) -> bool:
@@ -73,7 +73,7 @@ def _open_window(config: DriverConfig, on_switch: Callable[[int], None]) -> Wind
     # glfw starts processes on import
     from kouxing.services.driver.render.window import Window  # noqa: PLC0415
 
-    head = load_head(config.head, "coarse")  # live, smooth motion matters more than outlines
+    head = load_head(config.head, "coarse")  # smooth motion matters more than outlines
     try:
         return Window(
             head,

@@ -52,8 +52,8 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Phone, Speech
 
-STATUS_INTERVAL_S = 1.0  # between requests of the status
-STATUS_TIMEOUT_S = 3.0  # the same without an answer, or without viewers
+STATUS_INTERVAL_S = 1.0  # between status requests
+STATUS_TIMEOUT_S = 3.0  # between status requests without an answer, or without viewers
 MISSING_S = 3.0  # until a missing service is reported; after a restart control waits for services
 CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes less
 
@@ -144,7 +144,7 @@ class GatewayService(Service):
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Run HTTP until messages arrive or the time has passed."""
-        # The descriptors are edge-triggered: they do not show messages beyond a full batch.
+        # The descriptors are edge-triggered: they do not signal messages beyond a full batch.
         timer = self._loop.call_later(0.0 if super().wait(0) else timeout_s, self._loop.stop)
         self._is_waiting = True
         self._loop.run_forever()
@@ -184,7 +184,7 @@ class GatewayService(Service):
         self._runner.close()
 
     def send_to_control(self, message: Message) -> None:
-        """Send a message to control; this may hide that another one has arrived."""
+        """Send a message to control, then read its messages: sending may reset the descriptor."""
         super().send_to_control(message)
         self._on_input()
 

@@ -24,8 +24,8 @@ from kouxing.shared.wire.face import FaceSettings
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
-SEND_BUFFER_BYTES = 32 * 1024  # in the kernel, for a slow viewer; about half a second
-PAUSE_S = 0.2  # without a frame, until a viewer needs the face at rest
+SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
+PAUSE_S = 0.2  # time without a frame after which a viewer gets the face at rest
 _SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -132,7 +132,7 @@ class Viewers:
         self._put_shapes(viewers, MessageKind.SHAPES, "weights", epoch, media_time, faps)
 
     def show_rest(self, face: RestingFace, now_s: float) -> None:
-        """Send the face at rest to the viewers whose face no session moves."""
+        """Send the face at rest to viewers without recent frames of a session."""
         viewers = [viewer for viewer in self._viewers if now_s > viewer.moved_s + PAUSE_S]
         if not viewers:
             return
@@ -276,7 +276,7 @@ class Viewers:
 
 
 def _limit_send_buffers(request: web.Request) -> None:
-    """Let messages for a slow viewer wait in its queue, which drops old ones."""
+    """Limit the buffers of a slow viewer, so that its queue fills up and drops old messages."""
     if (transport := request.transport) is not None:
         transport.set_write_buffer_limits(WRITE_BUFFER_BYTES)
         raw = transport.get_extra_info("socket")

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_CLIENTS = 16
 SDP = "application/sdp"
 MAX_COMMANDS = 100  # queued, for one client
-MAX_BUFFERED_BYTES = 16 * 1024  # of a data channel; above it messages wait in the viewer's queue
+MAX_BUFFERED_BYTES = 16 * 1024  # of a data channel; more messages stay in the viewer's queue
 BUFFER_CHECK_S = 0.02
 MISSING = (
     "this gateway has no WebRTC; install it where the gateway runs: pip install 'kouxing[webrtc]'\n"

@@ -1,4 +1,4 @@
-"""The audio of one live session that waits to be decoded."""
+"""The audio of one live session that is queued for decoding."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class LiveAudio:
         return bool(self._chunks) and self.overload.is_late(now_s)
 
     def skip_old(self, now_s: float) -> bool:
-        """Drop audio that is too old; return whether there was any."""
+        """Skip audio that is too old; return whether any was skipped."""
         has_skipped = self.overload.update(self._waiting_s, now_s)
         if has_skipped:
             self._num_samples = len(self._chunks[-1][1])

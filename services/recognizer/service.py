@@ -41,9 +41,9 @@ from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge
 
 MAX_BATCH_S = 0.3  # of audio that is decoded together
-MIN_PART_S, MAX_PART_S = 0.02, 0.06  # of it, of each live session
-MAX_QUEUED_S = 60.0  # of live audio, above which it waits at the clients
-READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # for further audio of a session that is late, in total
+MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
+MAX_QUEUED_S = 60.0  # of live audio; further audio waits at the clients
+READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, and in total
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # between ticks while a session is open
@@ -97,7 +97,7 @@ class RecognizerService(Service):
         self.register(self._phones, {})
 
     def step(self, timeout_s: float) -> None:
-        """Read what has arrived, then decode a part of the audio of all live sessions together.
+        """Read new messages, then decode some audio of all live sessions together.
 
         If no live audio is left, decode some unpaced audio. More unpaced audio waits in its socket,
         and then at the sender.
@@ -320,7 +320,7 @@ class RecognizerService(Service):
         return sum(session.audio.duration_s for session in self._sessions.values())
 
     def _read_late_audio(self) -> None:
-        """After a stall, read all audio that has arrived, so that one cut is enough."""
+        """After a stall, read all received audio, so that it can be skipped in one cut."""
         end_s = time.monotonic() + MAX_READ_S
         while not self._is_live_blocked and (now_s := time.monotonic()) < end_s:
             late = [one.audio for one in self._sessions.values() if one.audio.is_outdated(now_s)]
@@ -417,7 +417,7 @@ class RecognizerService(Service):
         """Send new results to the subscribers, the synthesizer and control.
 
         Subscribers are first: a new recognizer does not repeat results that the synthesizer has.
-        The synthesizer wakes up once if all its messages are sent together.
+        All messages for the synthesizer are sent together, so that it wakes up only once.
         """
         now_s = time.monotonic()
         results = session.new_results(self._recognizer)

@@ -158,7 +158,7 @@ class RecognizerSession:
         return aligned if len(aligned[1]) else None
 
     def accept_waveform(self, max_s: float, now_s: float) -> None:
-        """Pass queued audio to the stream, up to a duration. Skip audio that is too old."""
+        """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old."""
         has_skipped = self.audio.skip_old(now_s)
         for media_time, samples in self.audio.take(max_s):
             if has_skipped:
@@ -190,7 +190,7 @@ class RecognizerSession:
         self.acknowledge_due_s = min(self.acknowledge_due_s or due_s, due_s)
 
     def acknowledge_if_due(self, now_s: float) -> None:
-        """Report to the client which audio it need not resend."""
+        """Acknowledge audio that the client need not resend, if this is due."""
         if self.acknowledge_due_s is None or now_s < self.acknowledge_due_s:
             return
         self.acknowledge_due_s, self.acknowledged_s = None, now_s

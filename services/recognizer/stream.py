@@ -105,7 +105,7 @@ class SpeechStream:
         self._segments[-1].accept_waveform(samples)
 
     def skip_to(self, media_time: int) -> None:
-        """Continue with the audio at a media time, as after a gap that gets no frames."""
+        """Continue at a media time, as after a gap. The skipped time gets no frames."""
         self._segments[-1].input_finished()
         self._start_at(media_time)
         self._segments[-1].scorer.add_event(AudioSkipped(time_s=to_seconds(media_time)))

@@ -43,5 +43,5 @@ class SynthesizerConfig(FaceConfig):
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
     max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
-    """Seconds that a live face may be behind. If it is further behind for 0.4 s, frames are
-    skipped."""
+    """Seconds that a live face may be behind. If it exceeds this limit for 0.4 s, it skips
+    frames."""

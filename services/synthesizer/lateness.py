@@ -1,8 +1,9 @@
-"""How late the frames of a live session are sent.
+"""Measures the lateness of the frames of a live session.
 
 A live client sends audio in real time. The clock minus the media time of a frame is therefore
 constant for frames in time, and greater for late frames. Frames are compared with the earliest one
-of the last 10 s: clocks differ, and a client may lose audio, so older frames prove nothing.
+of the last 10 s. Older frames are useless for this, because clocks drift and a client may lose
+audio.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ WINDOW_S = 10.0  # as in services/gateway/page/lateness.js
 
 
 class LatenessMeter:
-    """The lateness of one session's newest frames. Times are in seconds."""
+    """Measures the lateness of one session's newest frames. Times are in seconds."""
 
     def __init__(self) -> None:
-        self._sent: deque[tuple[float, float]] = deque()  # times; clock minus media time
+        self._sent: deque[tuple[float, float]] = deque()  # when sent; clock minus media time
 
     def add(self, times_s: Iterable[float], now_s: float) -> None:
-        """Record that frames of these media times are sent now."""
+        """Record that frames with these media times are sent now."""
         self._sent.extend((now_s, now_s - time_s) for time_s in times_s)
         self._drop_old(now_s)
 
@@ -29,7 +30,7 @@ class LatenessMeter:
         self._sent.clear()
 
     def percentiles_ms(self, now_s: float) -> tuple[float, float, float] | None:
-        """Return median, 95th percentile and maximum of the last 10 s; None without frames."""
+        """Return the median, 95th percentile and maximum of the last 10 s, None without frames."""
         self._drop_old(now_s)
         differences_s = sorted(difference_s for _, difference_s in self._sent)
         if not differences_s:

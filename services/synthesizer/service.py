@@ -61,7 +61,7 @@ from kouxing.shared.wire.speech import (
 RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
 MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
-DROP_INTERVAL_S = 1.0  # between removals of frames for stopped subscribers
+DROP_INTERVAL_S = 1.0  # between searches for subscribers that stopped reading
 MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
 EXPRESSIONS = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
@@ -91,13 +91,13 @@ class _SynthesizerSession:
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
         self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
         self.overload = Overload(max_behind_s)
-        self.newest_s = 0.0  # media time up to which audio is known
+        self.newest_s = 0.0  # media time of the newest received event
         self.finished = False
         self.lateness = LatenessMeter()
         self.shapes: list[str] = []  # shape sets to publish
 
     def skip_if_behind(self, now_s: float) -> None:
-        """Make no frames but the newest, if the session is too far behind."""
+        """Skip all frames except the newest if the session is too far behind."""
         waiting_s, known_s = 0.0, math.inf
         for event in self.queue:
             if isinstance(event, events.Progress):
@@ -261,7 +261,7 @@ class SynthesizerService(Service):
         return now_s if busy else due_s
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Return how far each session's phones are final, and how late its frames are."""
+        """Return, for each session, the end of its final phones, its lateness and skipped time."""
         now_s = time.monotonic()
         inputs = {}
         for name, session in self._sessions.items():
@@ -276,7 +276,7 @@ class SynthesizerService(Service):
         return inputs
 
     def gauges(self) -> dict[str, float]:
-        """Return the lateness of the session that is latest."""
+        """Return the lateness of the session with the greatest lateness."""
         now_s = time.monotonic()
         measured = [session.lateness.percentiles_ms(now_s) for session in self._sessions.values()]
         latest = max(filter(None, measured), key=itemgetter(-1), default=(0.0, 0.0, 0.0))

@@ -71,7 +71,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AudioSkipped:
-    """The recognizer was too slow; it has skipped the audio before ``time_s``."""
+    """The recognizer was too slow and skipped the audio before ``time_s``."""
 
     time_s: float
 

@@ -58,7 +58,7 @@ class SessionInput:
     sequence: Count = 0  # newest audio message that a recognizer in its place would not need
     media_time: Samples = 0  # the session's phones are final up to here
     lateness: Lateness | None = None  # of a synthesizer's frames; None: no live frames
-    skipped_s: Seconds = 0.0  # audio that was too old because the service was too slow, in total
+    skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

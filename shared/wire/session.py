@@ -65,7 +65,7 @@ class SessionFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lateness:
-    """How late the frames of the last 10 s left the synthesizer of a live session."""
+    """Lateness of the frames that left a live session's synthesizer in the last 10 s."""
 
     p50_ms: Milliseconds
     p95_ms: Milliseconds
@@ -169,7 +169,7 @@ class SessionState:
     workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
     facts: SessionFacts
     lateness: Lateness | None = None  # None: not live, or no frames in the last 10 s
-    skipped_s: Seconds = 0.0  # audio that was too old on a busy machine, in total
+    skipped_s: Seconds = 0.0  # total duration of the audio skipped on a busy machine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

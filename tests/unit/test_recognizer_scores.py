@@ -80,7 +80,9 @@ def test_evaluates_a_corpus_with_bad_rows(tmp_path: Path) -> None:
         assert any(reason in line for line in reasons), reason
     with pytest.raises(UserError, match="'nothing'"):
         align_corpus(model, tmp_path, "nothing", RowErrors())
-    with pytest.raises(UserError, match="no condition 'rain'; choose from: clean, noise 10 dB"):
+    with pytest.raises(
+        UserError, match="unknown condition 'rain'; choose from: clean, noise 10 dB"
+    ):
         check_conditions(["clean", "rain"])
 
 

@@ -96,7 +96,7 @@ def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> No
     speech = held_vowels()[0]
     power = np.mean((add_sound(speech, music, 10.0) - speech) ** 2) / np.mean(speech**2)
     assert 10 * np.log10(power) == pytest.approx(-10, abs=0.1)
-    with pytest.raises(UserError, match="no held-out music to measure with"):
+    with pytest.raises(UserError, match="the sounds contain no held-out music"):
         music_from([sound for sound in sounds if not sound.is_held_out])
 
 

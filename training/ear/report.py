@@ -1,8 +1,8 @@
-"""Measures the classes of the small ear, and compares its lips with the causal network's.
+"""Measures the voice classes of the small ear, and compares its lip features with others.
 
-Voice: the share of time in which the ear finds a voice, laughter or singing. The block network's
+Voice: the share of time in which the ear detects a voice, laughter or singing. The block network's
 phones in the clean recording define "inside" and "outside" speech. ``kouxing evaluate voice``
-measures the recognizer's decision, which follows from these classes.
+measures the voice activity that the recognizer derives from these classes.
 
 Lips: the correlation of the lip opening with a linear prediction from the last 160 ms. The
 prediction uses audio up to 55 ms after the lip position. It is trained on clips of other speakers,
@@ -115,7 +115,7 @@ def report_ear(path: Path, sources: Sources, *, whisper: Path, console: Console)
 def _mix_with(sounds: Sequence[Sound], kind: str, snr_db: float) -> Disturb:
     others = [sound.samples for sound in held_out(sounds, kind)]
     if not others:
-        raise UserError(f"no held-out {kind} to measure with; give more of it with --sounds")
+        raise UserError(f"the sounds contain no held-out {kind}; add more {kind} to --sounds")
 
     def disturb(samples: Floats) -> Floats:
         rng = np.random.default_rng(len(samples))

@@ -1,4 +1,4 @@
-"""The teachers of the small ear: what trained networks compute from a clean recording.
+"""The teachers of the small ear: trained networks that compute its targets from clean recordings.
 
 The causal network and the block network come from the shipped models. Their 8-bit ONNX weights are
 converted to floats, so that PyTorch can run whole recordings. This is several times faster than the

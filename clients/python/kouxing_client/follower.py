@@ -147,9 +147,9 @@ class Follower:
         self._subscribe()
 
     def tick(self) -> float:
-        """Subscribe again, or close the old connection, if it is time; return when to call again.
+        """Resubscribe or close the old connection, if due; return the time of the next call.
 
-        Call this also after every message.
+        Also call this after every message.
         """
         now_s = self._transport.now_s
         if now_s >= self._close_old_due_s:

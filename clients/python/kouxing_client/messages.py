@@ -196,7 +196,7 @@ class SessionFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class Lateness:
-    """How late the frames of the last 10 s of a live session were."""
+    """Lateness of a live session's frames in the last 10 s."""
 
     p50_ms: float
     p95_ms: float
@@ -218,7 +218,7 @@ class SessionState:
     """instance at each endpoint"""
     facts: SessionFacts
     lateness: Lateness | None = None
-    """None: not live, or no frames in the last 10 s"""
+    """None if the session is not live, or had no frames in the last 10 s"""
     skipped_s: float = 0.0
     """duration of the audio that was skipped on a busy machine"""
 

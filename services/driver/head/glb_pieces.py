@@ -24,7 +24,7 @@ MAX_PIECES = 2_000
 MAX_SHIFTS = 20_000_000  # displacements of all morph targets
 MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
-_LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes by ARKit's shapes
+_LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes at full weight of ARKit's shapes
 
 
 def read_pieces(glb: Glb) -> list[Primitive]:
@@ -113,8 +113,8 @@ def find_bones(glb: Glb) -> dict[int, str]:
     return {number: word for number, word in enumerate(words) if word in ("head", "neck")}
 
 
-def _turns_eyes(glb: Glb) -> bool:
-    """Return whether a VRM turns its eyes by bones, not by expressions."""
+def _uses_eye_bones(glb: Glb) -> bool:
+    """Return whether a VRM rotates its eyes with bones, not with expressions."""
     extensions = glb.json.get("extensions", {})
     old = extensions.get("VRM", {}).get("firstPerson", {}).get("lookAtTypeName")
     new = extensions.get("VRMC_vrm", {}).get("lookAt", {}).get("type")
@@ -180,8 +180,8 @@ def _piece(
         raise BadGlbError("the attributes of a mesh have different lengths")
     shapes = _shapes(glb, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
-    if weight is not None and _turns_eyes(glb):
-        shapes = _looks(glb, node["skin"], attributes, places, vertices) | shapes
+    if weight is not None and _uses_eye_bones(glb):
+        shapes = _eye_look_shapes(glb, node["skin"], attributes, places, vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
             raise BadGlbError("a coordinate or color is not finite or very large")
@@ -286,19 +286,19 @@ def _skinned(
 
 
 def _normalized(weights: Float64) -> Float64:
-    """Return weights (V, n) of joints whose sum is 1."""
+    """Scale the joint weights (V, n) of each vertex to a sum of 1."""
     normalized: Float64 = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
     return normalized
 
 
-def _looks(
+def _eye_look_shapes(
     glb: Glb,
     skin: object,
     attributes: dict[str, Float64],
     places: dict[int, Float64],
     vertices: Float64,
 ) -> dict[str, Float64]:
-    """Return the displacements (V, 3) that the eye bones cause, as ARKit's shapes by name."""
+    """Return ARKit's eye shapes by name: the displacements (V, 3) by rotations of the eye bones."""
     joints, bones = glb.item("skins", skin)["joints"], find_bones(glb)
     is_old = "VRM" in glb.json["extensions"]  # version 0 looks along -z
     weights = _normalized(attributes["WEIGHTS_0"])

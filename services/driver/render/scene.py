@@ -79,7 +79,7 @@ def background(text: str) -> Background:
 
 
 def open_renderer(config: DriverConfig, context: moderngl.Context | None = None) -> Renderer:
-    """Open a renderer for the driver's videos; ``context`` is that of a window.
+    """Open a renderer for the driver's videos. ``context`` is the OpenGL context of a window.
 
     Raises ``UserError`` if OpenGL cannot start, or a setting is invalid.
     """

@@ -23,7 +23,7 @@ export function socketUrl(path, fields) {
   return `${scheme}://${location.host}${pathOf(path, fields)}`;
 }
 
-/** Return whether the gateway runs on this computer, as far as the page's URL shows. */
+/** Return whether the page's URL shows that the gateway runs on this computer. */
 export function isThisComputer() {
   return ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
 }

@@ -29,7 +29,7 @@ export class DrawRate {
   #tookMs = 0;
   #numImages = 0;
   #visibleMs = -Infinity; // when the last image became visible
-  #minPeriodMs = 0; // between two images, by the user's choice
+  #minPeriodMs = 0; // time between two images that the user has chosen
   #shownMs = 0; // for how long an image is visible
   #delays = new SlidingWindow(WINDOW_MS); // until images were visible, ms
 
@@ -51,7 +51,7 @@ export class DrawRate {
     return nowMs - this.#startMs >= Math.max(periodMs, this.#minPeriodMs) - TOLERANCE_MS;
   }
 
-  /** Whether the user may halve the number of images, again. */
+  /** Whether the user can halve the image rate, or halve it again. */
   get canHalve() {
     return this.#minPeriodMs < MAX_SHOWN_MS;
   }
@@ -60,7 +60,7 @@ export class DrawRate {
     return this.#minPeriodMs > 0;
   }
 
-  /** Halve the number of images. */
+  /** Halve the image rate. */
   halve() {
     const periodMs = this.#rests ? restingPeriodMs(this.imageMs) : this.imageMs;
     this.#minPeriodMs = 2 * Math.max(periodMs, this.#minPeriodMs, TICK_MS);
@@ -95,7 +95,7 @@ export class DrawRate {
   }
 }
 
-/** Return the time between two images of which each takes a time, with a pause after each, ms. */
+/** Return the time between two images, ms: the drawing time and the pause after it. */
 function restingPeriodMs(tookMs) {
   return tookMs + Math.min(tookMs, Math.max(PERIOD_MS - tookMs, MIN_REST_MS));
 }

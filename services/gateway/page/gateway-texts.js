@@ -28,7 +28,7 @@ const CHINESE = {
   "the file cannot be read after {read} s; export it again": "{read} 秒之后无法读取，请重新导出",
   "cannot be read to its end: {reason}": "无法读到结尾，请重新导出",
   "damaged near {place} s; the damaged part is silent": "{place} 秒附近已损坏，损坏部分无声",
-  "the mix of all channels loses the sound of one; only channel {channel} is used": "各声道混合后会丢失其中一个声道的声音，只用第 {channel} 声道",
+  "mixing all channels would lose the sound of one; only channel {channel} is used": "如混合所有声道，会丢失其中一个声道的声音，因此只用第 {channel} 声道",
   "{share} of the samples are clipped; record at a lower level": "{share} 的采样过载失真，请降低录音音量",
   "{rate} Hz is too low for speech; use {least} Hz or more": "采样率 {rate} Hz 太低，请用 {least} Hz 以上",
   "NaN or infinite samples near {place} s; export the file again, for example as 16-bit PCM":

@@ -150,7 +150,7 @@ export class Head {
     return { left: radToDeg(view.theta - front.theta), up: radToDeg(view.phi - front.phi) };
   }
 
-  /** Decides how many images are drawn. */
+  /** The object that decides when images are drawn. */
   get drawRate() {
     return this.#drawRate;
   }

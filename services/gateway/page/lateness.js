@@ -1,4 +1,4 @@
-// How far a live stream is behind, and whether the page says so. Time is injected.
+// Measures how far a live stream is behind, and decides whether the page shows it. Time is injected.
 
 import { SlidingWindow } from "./sliding-window.js";
 import { SAMPLES_PER_MS } from "./playout.js";
@@ -7,14 +7,14 @@ const WINDOW_MS = 10000; // as in services/synthesizer/lateness.py
 const LATE_MS = 300;
 const MIN_SKIP_MS = 100;
 const MAX_SKIP_MS = 10000; // a longer gap is a pause of the client
-const SHOWN_AFTER_MS = 1000; // of late frames
-const OVER_AFTER_MS = 2000; // of frames in time
-const RECENT_MS = 1000; // window of the lateness that is shown
+const SHOWN_AFTER_MS = 1000; // time with late frames
+const OVER_AFTER_MS = 2000; // time without late frames
+const RECENT_MS = 1000; // window of the displayed lateness
 
 /**
  * The lateness of the newest frame. A live client sends audio in real time. The arrival of a frame
  * minus its media time is therefore constant for frames in time, and greater for late frames. Frames
- * are compared with the earliest one of the last 10 s: clocks differ, and a client may lose audio.
+ * are compared with the earliest one of the last 10 s, because clocks drift and a client may lose audio.
  */
 export class Lateness {
   isBehind = false; // whether frames have been late for some time
@@ -24,8 +24,8 @@ export class Lateness {
   #agreedMs = null; // when the frames last agreed with isBehind
 
   /**
-   * Record the arrival of a frame. Media time stands still while the client sends no audio. It leaps
-   * if a busy machine skips frames, so that the face does not fall further behind.
+   * Record the arrival of a frame. Media time stands still while the client sends no audio. Media time
+   * leaps if a busy machine skips frames to stay live.
    */
   frameArrived(nowMs, mediaTime) {
     const stepMs = (mediaTime - this.#newest) / SAMPLES_PER_MS;
@@ -51,7 +51,7 @@ export class Lateness {
     if (nowMs - this.#agreedMs >= waitMs) this.isBehind = isLate;
   }
 
-  /** The greatest lateness of the last second, ms. */
+  /** The maximum lateness of the last second, ms. */
   get recentMs() {
     return this.#recent.percentile(1);
   }

@@ -17,12 +17,12 @@ const WINDOW_MS = 10000; // of the percentiles; long enough to ignore a single h
 const MIN_FRAMES = 20; // before the percentile is used
 const JUMP_MS = 300; // restart if the stream is late or early by more than this
 const LATE_MS = 100; // and late for this long; less than the delay, so that no sound is lost
-const EARLY_MS = 300; // or early for this long
+const EARLY_MS = 300; // or if the stream is early for this long
 const START_MS = 300; // in which the earliest arrival sets the offset
 const MAX_BEHIND_MS = 3000; // restart at once if media time leaps ahead by more than this
 const MAX_FRAMES = 1000;
 
-/** For how long a condition has held. Time is injected. */
+/** Measures how long a condition has held. Time is injected. */
 class Streak {
   #sinceMs = null;
 
@@ -30,7 +30,7 @@ class Streak {
     return this.#sinceMs !== null;
   }
 
-  /** Take the condition at a time; return for how long it has held without a break, ms. */
+  /** Update the condition; return how long it has held without interruption, ms. */
   update(nowMs, holds) {
     this.#sinceMs = holds ? (this.#sinceMs ?? nowMs) : null;
     return holds ? nowMs - this.#sinceMs : 0;
@@ -49,7 +49,7 @@ class Streak {
  * The drift of the network and of the clocks moves the target. The offset glides towards the target
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
  * half of it is corrected at once, every half second. So one bad second does not cause a leap. After a
- * stall, the delayed data arrives in a burst. It is not measured, so that the page is live at its end.
+ * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
  */
 export class Playout {
   isAudible = true;
@@ -159,8 +159,8 @@ export class Playout {
 
   /**
    * Return whether data is too late to measure the usual delay. Data that was delayed by the network
-   * or by a busy page arrives in one burst whose end is on time. If more data is late, the sender
-   * paused. Then, and if media time leapt ahead, start again.
+   * or by a busy page arrives in one burst whose end is on time. If later data is also late, the
+   * sender paused. Start again after a pause, or if media time leapt ahead.
    */
   #isLate(nowMs, latenessMs, streak) {
     if (this.offsetMs === null) return false;

@@ -111,7 +111,7 @@ export class Stage {
     this.showDrawing();
   }
 
-  /** Show how the head is drawn, if that is not at full quality, and what can be changed. */
+  /** Show a quality below the full one, and the buttons that change the image rate. */
   showDrawing() {
     if (this.#head === null) return;
     element("fewer-pictures").hidden = !this.#head.drawRate.canHalve;

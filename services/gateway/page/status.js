@@ -22,7 +22,7 @@ export class GatewayState {
   /** Whether the gateway refused the first connection, although it served this page. */
   isRefused = false;
 
-  /** Whether the first connection is being made. */
+  /** Whether the page is connecting for the first time. */
   get isStarting() {
     return !this.wasConnected && !this.isRefused;
   }
@@ -47,8 +47,8 @@ export class GatewayState {
 }
 
 /**
- * Return the state, a key of TEXTS. It also colors the status light. isInterrupted: our microphone
- * should be live.
+ * Return the state, a key of TEXTS. The state also sets the color of the status light.
+ * isInterrupted: this page's microphone should be live.
  */
 export function stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted }) {
   if (!isConnected) return isStarting ? "connecting" : "disconnected";
@@ -65,7 +65,7 @@ export function delayText(voiceMs, soundMs) {
   return soundMs === null ? "" : say("soundDelay", { ms: roundToTens(soundMs) });
 }
 
-/** Return the text of a delay of seconds; tenths are enough, and change less often. */
+/** Return the text of a delay in seconds, with tenths: more digits would change too often. */
 export function secondsText(ms) {
   return say("seconds", { seconds: (ms / 1000).toFixed(1) });
 }

@@ -1,4 +1,4 @@
-"""Reads bopomofo (zhuyin), the phonetic letters of Taiwan, as pinyin."""
+"""Converts bopomofo (zhuyin), the phonetic letters of Taiwan, to pinyin."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _SYLLABLE = re.compile("(˙?)(?=[ㄅ-ㄩ])([ㄅ-ㄙ]?)([ㄧㄨㄩ]?[ㄚ-ㄦ]?)([
 
 
 def read_bopomofo(text: str, spell: Callable[[tuple[str, ...]], str]) -> str:
-    """Replace the syllables in bopomofo by pinyin; ``spell`` spells the phones of a syllable."""
+    """Convert syllables in bopomofo to pinyin. ``spell`` spells the phones of a syllable."""
     return _SYLLABLE.sub(lambda match: _spell(match, spell), text)
 
 
 def _spell(match: re.Match[str], spell: Callable[[tuple[str, ...]], str]) -> str:
     neutral, initial, final, tone = match.groups()
     phone = _FINALS.get(final) if final else _WITHOUT_FINAL.get(initial)
-    if phone is None:  # no syllable
+    if phone is None:  # not a syllable
         return match[0]
     if final == "ㄨㄥ" and not initial:
         phone = "ueng"

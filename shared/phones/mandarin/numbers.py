@@ -1,7 +1,7 @@
-"""Reads the numbers, dates, times and units of Chinese texts as words.
+"""Converts the numbers, dates, times and units of Chinese texts to words.
 
-wetext reads most of them. It takes every number pair that may be a month and a day for a date, and
-other pairs for a subtraction. So these are rewritten first:
+wetext converts most of them. But it reads every pair that may be a month and a day as a date, and
+other pairs as subtractions. Such pairs are therefore rewritten first:
 
 - 12-25 is a range, 25-12 and 比分12-25 are scores. Dates have a year or a zero: 2024-12-25, 02-05.
 - 12.25 is a decimal.
@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import re
 
-# Numbers are read sentence by sentence: time and memory grow with the square of the length.
+# wetext gets one sentence at a time: its time and memory grow with the square of the length.
 _SENTENCE = re.compile(
     r"[^。！？]{1,500}(?![^。！？])[。！？]*|.{1,500}(?<!\d)|.{1,500}", re.DOTALL
 )
 _HALF_WIDTH = str.maketrans("０１２３４５６７８９．％￥", "0123456789.%¥")
 _PHONE_NUMBER = re.compile(r"(?<!\d)(1\d\d) (\d{4}) (\d{4})(?!\d)")
 _DIGITS = str.maketrans("0123456789", "零一二三四五六七八九")
-# Two numbers with a hyphen, but not a date (with a year, or 02-05), a time or a telephone number.
+# Two numbers with a hyphen that are not a date (2024-12, 02-05), a time or a telephone number.
 _RANGE = (
     r"(比[分数]\D{0,3})?(?<![\d.:/-])(?!(?:19|20)\d\d-(?:0?[1-9]|1[0-2])(?!\d)|0\d-)"
     r"(\d+(?:\.\d+)?)-(?=(\d+(?:\.\d+)?)(?![\d.:/-]| *=)"
@@ -36,7 +36,7 @@ def unambiguous_numbers(text: str) -> str:
 
 
 def numbers_as_words(text: str) -> str:
-    """Replace numbers, dates, times and units by their reading: 3.5% -> 百分之三点五."""
+    """Convert numbers, dates, times and units to words: 3.5% -> 百分之三点五."""
     return "".join(map(_read_sentence, _SENTENCE.findall(text)))
 
 

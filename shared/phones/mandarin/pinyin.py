@@ -167,12 +167,12 @@ def write(spelling: str) -> str:
 
 
 def transcribe(text: str) -> Transcript:
-    """Convert a text to syllables: characters with numbers and dates, or else pinyin or bopomofo.
+    """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
 
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
-    dropped: letters among characters, and unknown syllables of pinyin. Joined syllables without
-    tones (``nihao``) are split only if most letters are pinyin, because words of other languages
-    may look the same.
+    dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
+    (``nihao``) are split only if most letters are pinyin, because words of other languages may look
+    the same.
 
     Examples
     --------
@@ -221,13 +221,13 @@ def _split_word(word: str) -> list[str]:
 
 
 def _split_toneless(word: str) -> list[str]:
-    """Split a pinyin word without tones (``nihao``, ``tiananmen``); empty: impossible.
+    """Split a pinyin word without tones (``nihao``, ``tiananmen``). Empty if this is impossible.
 
-    A split in which no later syllable starts with a, o or e is better.
+    Prefers a split in which only the first syllable may start with a, o or e.
     """
     word = _plain(word)
     for later_starts in ("", "aoeê"):
-        splits: dict[int, list[str]] = {len(word): []}  # of the rest from a place
+        splits: dict[int, list[str]] = {len(word): []}  # of the rest of the word, by its start
         for place in range(min(len(word), _MAX_WORD_LETTERS) - 1, -1, -1):
             if place and word[place] in "aoeê" and not later_starts:
                 continue

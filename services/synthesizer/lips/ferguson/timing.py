@@ -40,7 +40,7 @@ _NOISE_COST_S = 0.1  # noise duration that costs 1 more
 _MAX_MERGED = 4
 _ONSET_SLICES = 7  # duration of a hissing consonant
 MAX_SYLLABLES = 5000
-# Of read and synthesized speech, 0.5 to 1.25. Outside these limits, the text is not what was said.
+# Read and synthesized speech has ratios of 0.5 to 1.25. Outside these limits, the text is wrong.
 MIN_SPEECH_RATIO = 0.4
 MAX_SPEECH_RATIO = 2.0
 
@@ -83,7 +83,7 @@ def time_text(
 def speech_ratio(
     slices: Sequence[Progress], syllables: Sequence[Syllable], table: PhoneTable
 ) -> float:
-    """Return the duration of the speech in a recording, relative to that of its text."""
+    """Return the duration of the speech divided by the usual duration of the text."""
     return _speech_ratio(segment_speech(slices), _typical_durations(syllables, table).sum())
 
 

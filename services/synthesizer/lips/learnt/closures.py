@@ -68,7 +68,7 @@ class ClosureRule:
         return self.sound + sound + phones - unsupported * (apart + narrow)
 
 
-# columns of middle, left and right of a lip; the outer lip follows the inner one
+# columns of the middle, left and right points of a lip; the outer lip moves with the inner lip
 _UPPER, _UPPER_OUTER, _LOWER, _LOWER_OUTER = (
     np.array([MOUTH_FAPS.index(fap) for fap in faps])
     for faps in ((4, 8, 9), (51, 55, 56), (5, 10, 11), (52, 57, 58))
