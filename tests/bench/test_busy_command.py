@@ -15,7 +15,7 @@ from tests.system import VOWELS_FILE
 
 
 def _run(late_s: list[tuple[float, float]], load_s: float) -> Run:
-    """Make a run from durations and the lateness in each of them."""
+    """Make a run from pairs of a duration and its lateness."""
     values = [late for lasts_s, late in late_s for _ in range(round(lasts_s / STEP_S))]
     return Run(num_programs=1, quiet_median_s=0.1, late_s=values, load_s=load_s, missing=0.0)
 

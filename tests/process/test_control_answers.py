@@ -63,7 +63,7 @@ def test_a_service_can_refuse_a_session(stage: Stage) -> None:
 
 
 class ControlProxy:
-    """Forwards connections to control; a proxy that is not open holds what arrives."""
+    """Forwards connections to control. A proxy that is not open holds the received data."""
 
     def __init__(self, port: int) -> None:
         self._port = port

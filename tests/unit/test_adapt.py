@@ -74,7 +74,7 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
             run(track_app, tmp_path / f"{name}.mp4", "-o", tmp_path / "out")
 
 
-def test_a_file_that_is_not_a_clip_is_named(tmp_path: Path) -> None:
+def test_names_a_file_that_is_not_a_clip(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"notes.txt: not a clip; give the .json file"):
         run(adapt_app, tmp_path / "notes.txt", "-o", tmp_path / "me.mouth")
 

@@ -128,7 +128,7 @@ def test_one_peer_cannot_take_all_connections(scene: Scene, key: str) -> None:
     assert [connection.is_cut for connection in made] == [False] * 7 + [True] * 2
 
 
-def test_clients_cannot_take_the_places_of_services_or_of_other_keys(scene: Scene) -> None:
+def test_clients_cannot_use_connections_of_services_or_other_keys(scene: Scene) -> None:
     honest = [scene.deliver(1, "service"), scene.deliver(2, "laptop")]
     for number in range(10, 40):
         scene.deliver(number, f"flood {number % 2}")
@@ -139,7 +139,7 @@ def test_clients_cannot_take_the_places_of_services_or_of_other_keys(scene: Scen
     assert len(scene.limiter.connections_to(scene.socket)) == 10 + 2
 
 
-def test_services_can_use_the_places_of_clients(scene: Scene) -> None:
+def test_services_can_use_connections_that_clients_do_not_use(scene: Scene) -> None:
     services = [scene.deliver(number, "service") for number in range(20)]
     scene.enforce_limits(0.0)
     assert [connection.is_cut for connection in services] == [False] * 15 + [True] * 5
@@ -149,7 +149,7 @@ def test_services_can_use_the_places_of_clients(scene: Scene) -> None:
     assert len(scene.limiter.connections_to(scene.socket)) == 17
 
 
-def test_surplus_peers_learn_later_that_they_are_disconnected(scene: Scene) -> None:
+def test_surplus_peers_are_disconnected_later(scene: Scene) -> None:
     for number in range(9):
         scene.deliver(number, "key")
     scene.enforce_limits(0.0)
@@ -158,7 +158,7 @@ def test_surplus_peers_learn_later_that_they_are_disconnected(scene: Scene) -> N
         assert sum(held.close.called for held in scene.held.values()) == num_closed
 
 
-def test_the_oldest_of_too_many_surplus_peers_may_return(scene: Scene) -> None:
+def test_resets_the_oldest_surplus_peers_above_the_capacity(scene: Scene) -> None:
     for number in range(7 + 4 * 10 + 1):
         scene.deliver(number, "key")
     scene.enforce_limits(0.0)

@@ -1,4 +1,4 @@
-"""How late the frames of a live session are; the time is injected."""
+"""Lateness of the frames of a live session, with injected time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Stream:
         self._speed = speed  # of media time
 
     def run(self, duration_s: float, late_s: float = 0.0) -> None:
-        """Send frames, each late by the same time."""
+        """Send frames that are all late by the same time."""
         for _ in range(round(duration_s / STEP_S)):
             self.now_s += STEP_S
             self._time_s += STEP_S * self._speed
@@ -32,7 +32,7 @@ class Stream:
         return percentiles_ms
 
 
-def test_frames_are_late_by_what_they_exceed_the_earliest_frame() -> None:
+def test_measures_lateness_relative_to_the_earliest_frame() -> None:
     stream = Stream()
     assert stream.meter.percentiles_ms(stream.now_s) is None, "no frames"
     stream.run(9.0)
@@ -62,7 +62,7 @@ def test_the_clocks_of_client_and_host_may_differ(speed: float) -> None:
     assert max(stream.late_ms()) < 3.0
 
 
-def test_a_pause_of_the_audio_is_no_lateness() -> None:
+def test_a_pause_of_the_audio_does_not_count_as_lateness() -> None:
     stream = Stream()
     stream.run(1.0)
     stream.now_s += 5.0

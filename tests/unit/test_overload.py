@@ -45,11 +45,11 @@ def test_a_fast_service_skips_nothing() -> None:
     assert session.overload.skipped_s == 0.0
 
 
-def test_a_slow_service_skips_what_it_cannot_process() -> None:
+def test_a_slow_service_skips_audio_that_it_cannot_process() -> None:
     session = Session()
     assert any(session.run(30.0, speed=0.5))
     assert session.overload.skipped_s == pytest.approx(0.5 * 30.0, abs=1.0)
-    session.run(1.0, speed=3.0)  # what still waits
+    session.run(1.0, speed=3.0)  # the remaining queued audio
     assert not any(session.run(4.0, speed=3.0))
 
 
@@ -62,7 +62,7 @@ def test_is_never_far_behind_for_long() -> None:
     assert max(behind_s) < MAX_BEHIND_S + MAX_LATE_FOR_S
 
 
-def test_skips_what_arrived_while_the_process_was_stopped() -> None:
+def test_skips_audio_that_arrived_while_the_process_was_stopped() -> None:
     session = Session()
     session.run(2.0, speed=3.0)
     session.now_s += 10.0

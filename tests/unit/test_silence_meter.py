@@ -8,7 +8,7 @@ from kouxing.services.cli.service_process import POLL_S, SilenceMeter
 
 
 @pytest.mark.parametrize("waiting", [0.0, 0.5, 1.0])
-def test_time_without_a_processor_is_no_silence(waiting: float) -> None:
+def test_time_without_a_processor_does_not_count_as_silence(waiting: float) -> None:
     meter = SilenceMeter(0.0)
     for number in range(1, 21):
         meter.update(POLL_S * number, waiting * POLL_S * number)

@@ -1,4 +1,4 @@
-"""Shares of voice activity, and the sounds behind them."""
+"""Shares of time with voice activity, and the sounds that they are measured with."""
 
 import io
 from pathlib import Path
