@@ -10,6 +10,8 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.following import Stream, samples_of_file
 from tests.receivers import read_osc
-from tests.system import DEMO, LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python, wait_until
+from tests.system import DEMO, LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
 
 SENTENCE = VOWELS_FILE
 
@@ -238,11 +240,17 @@ def test_status_shows_services_and_sessions_and_writes_json(system: System, tmp_
     figures = tmp_path / "status.json"
     with Client(system.control) as client:
         session = client.open_session("live")
-        session.push(bytes(32000))
-        wait_until(lambda: client.status("live").sessions[0].lateness)
-        result = kouxing(
-            "status", "--json", figures, control=system.control, environment={"COLUMNS": "80"}
-        )
+        with ThreadPoolExecutor() as executor:
+            running = executor.submit(
+                kouxing,
+                *("status", "--json", figures),
+                control=system.control,
+                environment={"COLUMNS": "80"},
+            )
+            while not running.done():
+                session.push(bytes(640))  # 20 ms
+                time.sleep(0.02)
+        result = running.result()
     assert result.returncode == 0, result.stderr
     instances = [line.split()[0] for line in result.stdout.splitlines() if " ready " in line]
     assert {*instances} >= {"recognizer", "synthesizer"}

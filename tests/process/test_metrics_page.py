@@ -18,7 +18,8 @@ from tests.raw_bytes import pour
 from tests.system import CHAIN, ROOT, VOWELS_FILE, System, free_port
 
 ELSEWHERE = {  # metrics of other services, or of what does not happen here
-    *("frames_missed", "videos", "video_seconds", "repeated", "other_epoch", "too_early")
+    *("frames_missed", "videos", "video_seconds", "repeated", "other_epoch", "too_early"),
+    "skipped_audio_seconds",
 }
 SUFFIXES = ("_total", "_bucket", "_count", "_sum")
 

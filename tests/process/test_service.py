@@ -25,6 +25,7 @@ from kouxing.shared.service import (
     Service,
 )
 from kouxing.shared.service_kind import ServiceKind
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import Progress, Speech
@@ -84,7 +85,12 @@ def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: Slow) -> N
 
 def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: Slow) -> None:
     waits: list[float] = []
-    slow.wait = lambda timeout_s: waits.append(timeout_s) or []  # type: ignore[method-assign]
+
+    def wait(timeout_s: float) -> list[Socket]:
+        waits.append(timeout_s)
+        return []
+
+    slow.wait = wait  # type: ignore[method-assign]
     slow.step(60.0)
     assert waits == [0.0], "the first tick and heartbeat are due"
     slow._heartbeat_due_s = time.monotonic() + 30.0
@@ -194,10 +200,12 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
         time.sleep(HEARTBEAT_S + RESYNC_AFTER_S + 0.1)
         worker.happened.append("input")
 
+    def on_tick(_now_s: float) -> float:
+        worker.happened.append("tick")
+        return math.inf
+
     worker._handlers[worker.input][Progress] = stall
-    monkeypatch.setattr(
-        worker, "on_tick", lambda _now_s: worker.happened.append("tick") or math.inf
-    )
+    monkeypatch.setattr(worker, "on_tick", on_tick)
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
         run_until(worker, lambda: "input" in worker.happened)

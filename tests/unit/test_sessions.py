@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -68,7 +69,7 @@ class System:
         opening = OpenSession(session=name, request="r", **fields)  # type: ignore[arg-type]
         return self.sessions.open(opening, client, 0.0)
 
-    def report(self, record: SessionRecord, instance: str, **fields: int) -> None:
+    def report(self, record: SessionRecord, instance: str, **fields: Any) -> None:
         """Record a heartbeat about a session."""
         heartbeat = worker(instance.partition("-")[0], instance)
         sessions = {record.name: SessionInput(**fields)}

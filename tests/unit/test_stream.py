@@ -84,7 +84,7 @@ def test_skips_to_newer_audio() -> None:
     stream.stream.skip_to(40_000)
     outputs += stream.feed(SAMPLES, 40_000) + stream.finish()
     skips = [number for number, event in enumerate(outputs) if isinstance(event, AudioSkipped)]
-    assert [outputs[number].time_s for number in skips] == [2.5]
+    assert [skip.time_s for skip in of_kind(AudioSkipped, outputs)] == [2.5]
     before, after = outputs[: skips[0]], outputs[skips[0] :]
     assert all(phone.final for phone in {p.index: p for p in of_kind(Phone, before)}.values())
     assert min(phone.onset_s for phone in of_kind(Phone, after)) >= 2.5

@@ -119,5 +119,6 @@ def test_a_slow_synthesizer_skips_frames(service: Watched, monkeypatch: pytest.M
     service.on_tick(now_s)
     assert not service._sessions["gap"].queue
     first, newest = service.frames("gap")[before], service.frames("gap")[-1]
-    assert first.media_time == newest.media_time == to_samples(20.0 - service.facts.delay_ms / 1e3)
+    newest_s = 20.0 - SynthesizerConfig().delay_ms / 1e3
+    assert first.media_time == newest.media_time == to_samples(newest_s)
     assert service.session_inputs()["gap"].skipped_s == pytest.approx(14.7)

@@ -61,7 +61,8 @@ def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(voice, "voice_activity", first_half)
     masks = np.array([[True, True, True, False], [True, False, False, False]])
     pieces = [(np.zeros(4, np.float32), mask) for mask in masks]
-    materials = [Material("mixed", pieces), Material("voice", [(np.zeros(2), np.full(2, True))])]
+    voiced = (np.zeros(2, np.float32), np.full(2, True))
+    materials = [Material("mixed", pieces), Material("voice", [voiced])]
     results = evaluate_voice({"one": load_model(model_path("gmm"))}, materials)
     shares = results["one"]["mixed"]
     assert shares["voice"] == {"seconds": pytest.approx(0.08), "on": 0.75}

@@ -225,6 +225,8 @@ def _split_toneless(word: str) -> list[str]:
 
     Prefers a split in which only the first syllable may start with a, o or e.
     """
+    if re.search(r"\d", _with_tone_digit(word)):  # a typing error
+        return []
     word = _plain(word)
     for later_starts in ("", "aoeê"):
         splits: dict[int, list[str]] = {len(word): []}  # of the rest of the word, by its start
