@@ -52,7 +52,7 @@ def families(system: System) -> dict[str, list[Metric]]:
 
 def _heartbeats(client: Client) -> float:
     (control,) = (state for state in client.status().services if state.service == "control")
-    return control.metrics["in_heartbeat"]
+    return control.metrics.get("in_heartbeat", 0.0)  # control's own heartbeat has them
 
 
 def _page(port: int) -> str:
