@@ -266,7 +266,7 @@ def show(busy: Busy, console: Console) -> None:
             "largest lateness of each second, ms",
             ("from s", *(f"+{second}" for second in range(_COLUMNS))),
             (
-                [str(at), *(f"{1e3 * late_s:.0f}" for late_s in rows[at : at + _COLUMNS])]
+                [str(at), *(f"{max(0.0, 1e3 * late_s):.0f}" for late_s in rows[at : at + _COLUMNS])]
                 for at in range(0, len(rows), _COLUMNS)
             ),
         )
