@@ -15,19 +15,18 @@ import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.lip_models import lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
-from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
@@ -37,28 +36,22 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import MAX_TURN_S, Handler
-from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S, Overload
+from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.phones import events
-from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SoundEvent
-from kouxing.shared.phones.final_time import FinalTime
+from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.reliable import ReliableReceiver
-from kouxing.shared.replay import Replay
 from kouxing.shared.service import Service
-from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of, is_report
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode, Lateness, SessionFacts
 from kouxing.shared.wire.speech import (
-    Acknowledge,
     AudioState,
     NewestFrame,
     Progress,
 )
 
-RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
 MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
 DROP_INTERVAL_S = 1.0  # between searches for subscribers that stopped reading
@@ -66,64 +59,6 @@ MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
 EXPRESSIONS = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
-
-
-class _SynthesizerSession:
-    """A session: its face, and its position in the streams of messages."""
-
-    def __init__(
-        self,
-        start: StartSession,
-        face: FaceAnimator,
-        input_socket: Socket,
-        publisher: Socket,
-        max_behind_s: float,
-    ) -> None:
-        self.start = start
-        self.replay = Replay(publisher, time.monotonic())
-        self.face = face
-        self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledge)
-        self.epoch_in = 0  # epoch of the newest message from the recognizer; 0 before the first
-        self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
-        self.sequence_out = 0
-        self.newest: FapFrame | None = None
-        self.final = FinalTime()
-        self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
-        self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
-        self.overload = Overload(max_behind_s)
-        self.newest_s = 0.0  # media time of the newest received event
-        self.finished = False
-        self.lateness = LatenessMeter()
-        self.shapes: list[str] = []  # shape sets to publish
-
-    def skip_if_behind(self, now_s: float) -> None:
-        """Skip all frames except the newest if the session is too far behind."""
-        waiting_s, known_s = 0.0, math.inf
-        for event in self.queue:
-            if isinstance(event, events.Progress):
-                waiting_s += max(0.0, event.time_s - known_s)
-            if isinstance(event, events.Progress | AudioSkipped):
-                known_s = event.time_s
-        if self.overload.update(waiting_s, now_s):
-            self.face.skip_to(self.newest_s)
-
-    def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
-        """Continue after the newest frame of another synthesizer."""
-        self.sequence_out = num_frames
-        self.face.resume(to_seconds(media_time), num_frames, faps)
-
-    @property
-    def media_time(self) -> int:
-        """Media time of the newest frame, samples at 16 kHz."""
-        return self.newest.media_time if self.newest is not None else 0
-
-    def _acknowledge(self) -> Acknowledge:
-        if (frame := self.newest) is None:
-            return Acknowledge()
-        newest = NewestFrame(
-            sequence=frame.sequence, media_time=frame.media_time, values=frame.values
-        )
-        return Acknowledge(newest_frame=newest)
 
 
 class SynthesizerService(Service):
@@ -138,7 +73,7 @@ class SynthesizerService(Service):
         self.facts = SessionFacts(
             frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lip_model=config.lips
         )
-        self._sessions: dict[str, _SynthesizerSession] = {}
+        self._sessions: dict[str, SynthesizerSession] = {}
         self._turn = 0  # round robin of sessions with queued events
         self._dropped_s = 0.0  # last removal of frames for stopped subscribers
         self._input = self.bus.bind_router(
@@ -163,7 +98,7 @@ class SynthesizerService(Service):
         if session is None or session.start.token != start.token:
             settings = self._known_settings(start.session, start.face)
             face = self._new_face(start, settings)
-            session = _SynthesizerSession(
+            session = SynthesizerSession(
                 start, face, self._input, self._faps, self._config.max_behind_s
             )
             session.shapes = settings.shapes or []
@@ -296,7 +231,7 @@ class SynthesizerService(Service):
             self._end(session)
         return True
 
-    def _relax(self, session: _SynthesizerSession, now_s: float) -> None:
+    def _relax(self, session: SynthesizerSession, now_s: float) -> None:
         # a stalled process does not make all missed frames
         session.relax_at_s = max(session.relax_at_s, now_s - MAX_CATCH_UP_S)
         num_frames = int((now_s - session.relax_at_s) * self.frame_rate_hz)
@@ -327,7 +262,7 @@ class SynthesizerService(Service):
             self._queue_event(session, message)
 
     def _enter_epoch(
-        self, session: _SynthesizerSession, message: SpeechMessage, newest_frame: NewestFrame | None
+        self, session: SynthesizerSession, message: SpeechMessage, newest_frame: NewestFrame | None
     ) -> None:
         """Continue a face with another recognizer, or after another synthesizer's frames."""
         if session.epoch_in:
@@ -342,7 +277,7 @@ class SynthesizerService(Service):
             session.overload.restart(time.monotonic() + CATCH_UP_S)
         session.epoch_in = message.epoch
 
-    def _admit(self, message: SpeechMessage, sender: Peer) -> _SynthesizerSession | None:
+    def _admit(self, message: SpeechMessage, sender: Peer) -> SynthesizerSession | None:
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
@@ -359,7 +294,7 @@ class SynthesizerService(Service):
             return session
         return None
 
-    def _queue_event(self, session: _SynthesizerSession, message: SpeechMessage) -> None:
+    def _queue_event(self, session: SynthesizerSession, message: SpeechMessage) -> None:
         event = event_of(message)
         language = session.start.facts.language or DEFAULT_LANGUAGE
         if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
@@ -378,7 +313,7 @@ class SynthesizerService(Service):
         if len(session.queue) == 1:
             self._make_frames(session)
 
-    def _make_frames(self, session: _SynthesizerSession) -> None:
+    def _make_frames(self, session: SynthesizerSession) -> None:
         """Publish the frames of queued events, up to ``MAX_BURST_S``."""
         num_left = max(1, round(MAX_BURST_S * self.frame_rate_hz))
         if session.start.paced:
@@ -404,7 +339,7 @@ class SynthesizerService(Service):
 
     # --- out -------------------------------------------------------------------------------------
 
-    def _end(self, session: _SynthesizerSession) -> None:
+    def _end(self, session: SynthesizerSession) -> None:
         session.finished = True
         session.sequence_out += 1
         end = EndOfFaps(
@@ -416,7 +351,7 @@ class SynthesizerService(Service):
         session.replay.send(end, time.monotonic())
         LOG.info("end of frames", extra={"session": session.start.session})
 
-    def _publish(self, session: _SynthesizerSession, frames: Sequence[Frame]) -> None:
+    def _publish(self, session: SynthesizerSession, frames: Sequence[Frame]) -> None:
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
             session.sequence_out += 1

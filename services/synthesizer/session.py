@@ -1,0 +1,85 @@
+"""One session of the synthesizer: its face, and its position in the streams of messages."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.lateness import LatenessMeter
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.overload import Overload
+from kouxing.shared.phones import events
+from kouxing.shared.phones.events import AudioSkipped, SoundEvent
+from kouxing.shared.phones.final_time import FinalTime
+from kouxing.shared.reliable import ReliableReceiver
+from kouxing.shared.replay import Replay
+from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame
+
+RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
+
+
+class SynthesizerSession:
+    """A session, as the service keeps it."""
+
+    def __init__(
+        self,
+        start: StartSession,
+        face: FaceAnimator,
+        input_socket: Socket,
+        publisher: Socket,
+        max_behind_s: float,
+    ) -> None:
+        self.start = start
+        self.replay = Replay(publisher, time.monotonic())
+        self.face = face
+        self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledgement)
+        self.epoch_in = 0  # epoch of the newest message from the recognizer; 0 before the first
+        self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
+        self.sequence_out = 0
+        self.newest: FapFrame | None = None
+        self.final = FinalTime()
+        self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
+        self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
+        self.overload = Overload(max_behind_s)
+        self.newest_s = 0.0  # media time of the newest received event
+        self.finished = False
+        self.lateness = LatenessMeter()
+        self.shapes: list[str] = []  # shape sets to publish
+
+    def skip_if_behind(self, now_s: float) -> None:
+        """Skip all frames except the newest if the session is too far behind."""
+        waiting_s, known_s = 0.0, math.inf
+        for event in self.queue:
+            if isinstance(event, events.Progress):
+                waiting_s += max(0.0, event.time_s - known_s)
+            if isinstance(event, events.Progress | AudioSkipped):
+                known_s = event.time_s
+        if self.overload.update(waiting_s, now_s):
+            self.face.skip_to(self.newest_s)
+
+    def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
+        """Continue after the newest frame of another synthesizer."""
+        self.sequence_out = num_frames
+        self.face.resume(to_seconds(media_time), num_frames, faps)
+
+    @property
+    def media_time(self) -> int:
+        """Media time of the newest frame, samples at 16 kHz."""
+        return self.newest.media_time if self.newest is not None else 0
+
+    def _acknowledgement(self) -> Acknowledge:
+        if (frame := self.newest) is None:
+            return Acknowledge()
+        newest = NewestFrame(
+            sequence=frame.sequence, media_time=frame.media_time, values=frame.values
+        )
+        return Acknowledge(newest_frame=newest)
