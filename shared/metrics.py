@@ -12,6 +12,7 @@ import resource
 import sys
 from bisect import bisect_left
 from collections import Counter, deque
+from collections.abc import Sequence
 from pathlib import Path
 
 WINDOW = 1000  # number of newest values that percentiles are computed from
@@ -75,8 +76,13 @@ class Metrics:
         for name, latency in self.distributions.items():
             ordered = sorted(latency.newest)
             for percent in PERCENTS:
-                result[f"{name}_p{percent}"] = ordered[percent * (len(ordered) - 1) // 100]
+                result[f"{name}_p{percent}"] = percentile(ordered, percent)
         return result
+
+
+def percentile(ordered: Sequence[float], percent: int) -> float:
+    """Return a percentile of rising values, at least one; it is one of the values."""
+    return ordered[percent * (len(ordered) - 1) // 100]
 
 
 def memory_mb() -> float:

@@ -105,7 +105,7 @@ def evaluate_voice(
     """Measure voice activity; return figures for a JSON file, by model and kind of audio.
 
     The figures contain the seconds with and without a voice, and the share of each with voice
-    activity. The share is None without such audio.
+    activity. Without such audio, the share is missing: None.
     """
     results: dict[str, dict[str, Any]] = {name: {} for name in models}
     for material in track(materials, "voice activity", console=CONSOLE, transient=True):

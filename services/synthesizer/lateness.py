@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
+from kouxing.shared.metrics import percentile
+
 WINDOW_S = 10.0  # as in services/gateway/page/lateness.js
 
 
@@ -35,8 +37,8 @@ class LatenessMeter:
         differences_s = sorted(difference_s for _, difference_s in self._sent)
         if not differences_s:
             return None
-        p50_s, p95_s = (differences_s[int(share * len(differences_s))] for share in (0.5, 0.95))
-        earliest_s, latest_s = differences_s[0], differences_s[-1]
+        p50_s, p95_s, latest_s = (percentile(differences_s, percent) for percent in (50, 95, 100))
+        earliest_s = differences_s[0]
         return 1e3 * (p50_s - earliest_s), 1e3 * (p95_s - earliest_s), 1e3 * (latest_s - earliest_s)
 
     def _drop_old(self, now_s: float) -> None:

@@ -194,7 +194,8 @@ class Session(BaseSession):
     ) -> Results[Any]:
         """Return results of several classes from now on; raises as ``frames``.
 
-        Within 10 s after the session opened or moved, this also returns the results since then.
+        A call in the first 10 s after the session opens or moves also returns the results since
+        that moment.
 
         Parameters
         ----------
