@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
+from kouxing.training.device import mixed_precision
 from kouxing.training.neural.batches import Batch, Recording, Targets, augment, sampling_probs
-from kouxing.training.neural.network import Readout, ReadoutShape, mixed_precision
+from kouxing.training.neural.network import Readout, ReadoutShape
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
 from kouxing.training.neural.teacher import WholeEncoder
 from kouxing.training.training_set import Report

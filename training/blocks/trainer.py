@@ -30,8 +30,9 @@ from torch import Tensor, nn
 
 from kouxing.training.blocks.batches import BlockBatch, block_batch
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.device import mixed_precision
 from kouxing.training.neural.batches import Recording
-from kouxing.training.neural.network import MAX_DEVIATIONS, mixed_precision
+from kouxing.training.neural.network import MAX_DEVIATIONS
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_factor
 from kouxing.training.neural.teacher import WholeEncoder
 from kouxing.training.training_set import Report

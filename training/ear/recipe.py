@@ -25,13 +25,13 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.device import mixed_precision
 from kouxing.training.ear.batches import BATCH_S, Material, batch_of
 from kouxing.training.ear.export import save_ear
 from kouxing.training.ear.network import Ear
 from kouxing.training.ear.targets import Piece, Recording, Samples, TargetStore, Voice
 from kouxing.training.ear.teachers import Teachers
 from kouxing.training.model_card import write_card
-from kouxing.training.neural.network import mixed_precision
 from kouxing.training.neural.optimizer import Optimizer, warm_up_factor
 from kouxing.training.training_set import Report, read_utterances, weights_of
 

@@ -47,8 +47,9 @@ from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_predictor import NUM_LAYERS, load_lip_predictor
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.device import mixed_precision
 from kouxing.training.neural.initial_network import load_whisper
-from kouxing.training.neural.network import Layer, Network, ReadoutShape, Shape, mixed_precision
+from kouxing.training.neural.network import Layer, Network, ReadoutShape, Shape
 from kouxing.training.neural.teacher import NUM_LAYERS as NUM_WHISPER_LAYERS
 from kouxing.training.neural.teacher import WholeEncoder
 

@@ -155,12 +155,6 @@ class Network(Encoder):
         return log_softmax(logits.view(batch, num_positions, 2, -1), dim=-1)
 
 
-def mixed_precision() -> torch.autocast:
-    """Use bfloat16 products if the processor supports them."""
-    faster = torch.cpu.get_capabilities().get("avx512_bf16", False)
-    return torch.autocast("cpu", torch.bfloat16, enabled=faster)
-
-
 def output_frames(num_positions: int, look_ahead_frames: int) -> Tensor:
     """Return the numbers of each position's two output frames, (positions, 2)."""
     first = 2 * torch.arange(num_positions) + 2 - look_ahead_frames

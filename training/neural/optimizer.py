@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
@@ -44,7 +43,7 @@ class Optimizer(Generic[N]):
         mean_exponent: int,
     ) -> None:
         self._network = network
-        self._averaged = AveragedModel(network, avg_fn=_weight_average(mean_exponent))
+        self._averaged = AveragedModel(network, multi_avg_fn=_weight_average(mean_exponent))
         self._averaged.eval()
         self._adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
         self._rates = [group["lr"] for group in self._adam.param_groups]
@@ -74,9 +73,9 @@ class Optimizer(Generic[N]):
             torch.manual_seed(seed + step)
             loss = loss_of(step)
             self._step(loss, rate_factor_of(step))
-            losses.append(float(loss.detach()))
+            losses.append(loss.detach())
             if (step + 1) % SAVE_EVERY == 0 or step + 1 == num_steps:
-                report(f"step {step + 1}: loss {np.mean(losses):.3f}")
+                report(f"step {step + 1}: loss {torch.stack(losses).mean():.3f}")
                 losses = []
                 if checkpoint:
                     self._save(checkpoint, step + 1)
@@ -99,7 +98,7 @@ class Optimizer(Generic[N]):
 
     def _load(self, checkpoint: Path) -> int:
         """Restore the state; return the number of steps taken."""
-        state = torch.load(checkpoint, weights_only=True)
+        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         return int(state["num_steps"])
@@ -129,9 +128,13 @@ def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tens
     return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
 
 
-def _weight_average(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
-    def updated(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
+def _weight_average(
+    exponent: int,
+) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
+    def update(
+        means: Sequence[Tensor], weights: Sequence[Tensor], num_before: Tensor | int
+    ) -> None:
         factor = (exponent + 1) / (int(num_before) + exponent + 2)
-        return mean + factor * (weights - mean)
+        torch._foreach_lerp_(list(means), list(weights), factor)
 
-    return updated
+    return update

@@ -37,12 +37,13 @@ from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.training.blocks.batches import BATCH_S, block_batch
+from kouxing.training.device import mixed_precision
 from kouxing.training.model_card import write_card
 from kouxing.training.neural.batches import Recording
 from kouxing.training.neural.export import onnx_of
 from kouxing.training.neural.initial_network import init_encoder, init_network
 from kouxing.training.neural.labels import STATES_PER_PHONE, Mix, label, statistics_of
-from kouxing.training.neural.network import Network, mixed_precision, output_frames
+from kouxing.training.neural.network import Network, output_frames
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_factor
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.search_weights import SearchWeights, choose_search_weights

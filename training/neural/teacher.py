@@ -42,6 +42,7 @@ from torch import Tensor
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
+from kouxing.training.device import mixed_precision
 from kouxing.training.neural.batches import (
     Recording,
     Sample,
@@ -49,7 +50,7 @@ from kouxing.training.neural.batches import (
     padded_batch,
     sampling_probs,
 )
-from kouxing.training.neural.network import Encoder, Readout, ReadoutShape, Shape, mixed_precision
+from kouxing.training.neural.network import Encoder, Readout, ReadoutShape, Shape
 from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
 from kouxing.training.training_set import Report, with_progress
 

@@ -1,0 +1,13 @@
+"""The device that networks are trained on: a GPU if there is one."""
+
+from __future__ import annotations
+
+import torch
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def mixed_precision() -> torch.autocast:
+    """Use bfloat16 products if the device supports them."""
+    faster = DEVICE.type == "cuda" or torch.cpu.get_capabilities().get("avx512_bf16", False)
+    return torch.autocast(DEVICE.type, torch.bfloat16, enabled=faster)
