@@ -9,8 +9,6 @@ network processes a square around the face, turned so that the eyes are level. T
 the detector or from the previous image's landmarks.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

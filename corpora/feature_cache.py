@@ -5,8 +5,6 @@ There is one file per corpus and kind, with 16-bit floats or integers, in the us
 memory. Deleting it is always safe.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Sequence

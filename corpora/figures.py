@@ -1,7 +1,5 @@
 """Figures drawn with matplotlib, an optional dependency of training and evaluation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

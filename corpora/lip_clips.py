@@ -10,8 +10,6 @@ Every clip has one part: training (``train``), choosing settings (``choice``), o
 folder names further clips and speakers to hold out.
 """
 
-from __future__ import annotations
-
 import csv
 import itertools
 import zlib

@@ -1,7 +1,5 @@
 """Track the lips in a video: a clip with audio and lip motion, but without images."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable

@@ -5,8 +5,6 @@ a quarter of the music and noise files are held out, by the CRC-32 of their name
 have few files, so the second half of each file is held out.
 """
 
-from __future__ import annotations
-
 import csv
 import zlib
 from collections.abc import Sequence

@@ -19,8 +19,6 @@ podcasts, a talk, a web seminar and a prompt, with eight voices. The publishers 
 are cut into pieces that overlap by 0.48 s, and so are their texts.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

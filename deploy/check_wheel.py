@@ -6,8 +6,6 @@ It renders a sample sentence, starts ``kouxing run``, and loads the page with it
 its JavaScript modules. Its packages are those of requirements.lock.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

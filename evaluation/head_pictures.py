@@ -1,7 +1,5 @@
 """Draw every head: small pictures for the page, and sheets for the docs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Format figures for tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from string import ascii_uppercase
 

@@ -3,8 +3,6 @@
 Ctrl-C during slow imports ends the command without a traceback.
 """
 
-from __future__ import annotations
-
 import signal
 
 

@@ -1,7 +1,5 @@
 """The kinds of service, and the addresses that they bind."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import pkgutil

@@ -6,8 +6,6 @@ points of the group ``kouxing.lip_models``: the entry point's name is that of th
 value is the package.
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ The services run the same two halves, ``SpeechStream`` and ``Face``, and exchang
 them. Offline rendering and evaluation use this chain. Its frames are identical, bit for bit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

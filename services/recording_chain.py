@@ -10,8 +10,6 @@ visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small
 lips, phones also decide where the lips do not close. In the live chain, they arrive too late.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Reads npz files of plain arrays. Their unpacked size is checked before they are unpacked."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from functools import partial

@@ -1,7 +1,5 @@
 """Waits until data arrives at connections that libzmq owns."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import sys

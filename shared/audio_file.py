@@ -1,7 +1,5 @@
 """Audio of files and pipes as blocks of samples."""
 
-from __future__ import annotations
-
 import io
 import math
 import sys

@@ -1,7 +1,5 @@
 """The budget that limits the work that a peer causes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ linger. Connections are encrypted and both ends are authenticated (CURVE), unles
 key. The endpoint of a bound socket with a key includes the public key: ``tcp://HOST:PORT KEY``.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Iterable
 from enum import Enum

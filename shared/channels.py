@@ -1,7 +1,5 @@
 """One or two channels of sound from any number, without losing a voice."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

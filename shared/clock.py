@@ -4,8 +4,6 @@ Media time is a sample index at 16 kHz, never a wall clock. Pauses, drift and th
 hosts do not affect it. Wall clocks are compared only to report latencies between hosts.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

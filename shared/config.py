@@ -11,8 +11,6 @@ unknown variables, and does not report where a value came from. With these three
 would save fewer lines than its adapters need.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import inspect

@@ -1,7 +1,5 @@
 """Connects a command to a running system."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The form of an endpoint, and which hosts can reach it."""
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import re

@@ -1,7 +1,5 @@
 """Errors that say what is wrong and what to do."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """Fonts of drawn text: Noto Sans for pinyin, and an installed font for Chinese characters."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from itertools import groupby
 

@@ -1,7 +1,5 @@
 """What the kernel reports about one of libzmq's sockets, given its file descriptor."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import ipaddress

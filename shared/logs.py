@@ -1,7 +1,5 @@
 """Logs as JSON lines on standard error. A line names its session, but has no speech content."""
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

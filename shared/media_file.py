@@ -1,7 +1,5 @@
 """Decodes the sound of files and pipes with FFmpeg, at the times that the container states."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Handles the messages that arrive on the sockets of a service."""
 
-from __future__ import annotations
-
 import errno
 import time
 from collections.abc import Callable

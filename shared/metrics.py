@@ -3,8 +3,6 @@
 Heartbeats and the Prometheus page (``shared.prometheus``) have the same values.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -9,8 +9,6 @@ would have sent it. Audio that waited in a socket while this process was stopped
 although it was just received. Audio that a client sends ahead of the clock is not late.
 """
 
-from __future__ import annotations
-
 import math
 
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit

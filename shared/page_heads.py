@@ -1,7 +1,5 @@
 """Where the page's heads are, if the package has no GLB files of them."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scheduling of processes that must be in time."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from pathlib import Path

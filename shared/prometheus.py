@@ -5,8 +5,6 @@ docs/metrics.md lists them. ``/healthz`` answers 200 while the service's loop ru
 hangs. Neither names a session, so readers do not learn who speaks.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

@@ -4,8 +4,6 @@ Messages have sequence numbers, and the receiver acknowledges them cumulatively.
 unacknowledged messages, because ZeroMQ drops messages in flight when a peer disconnects.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import deque

@@ -4,8 +4,6 @@ When a session opens or moves, its subscribers need time to connect to the new w
 are published in the meantime are repeated for each of them. Subscribers ignore repeated messages.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 from kouxing.shared.sockets import Socket

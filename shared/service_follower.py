@@ -1,7 +1,5 @@
 """Follows a session inside the loop of a service."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Mapping
 from typing import Any

@@ -3,8 +3,6 @@
 Undecodable messages are returned as ``BadMessage``.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import secrets

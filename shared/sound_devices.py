@@ -1,7 +1,5 @@
 """Live audio from microphones, and from outputs and programs of this machine."""
 
-from __future__ import annotations
-
 import json
 import queue
 import shutil

@@ -1,7 +1,5 @@
 """Recognizes the formats of sound, and of other files, by their first bytes."""
 
-from __future__ import annotations
-
 import codecs
 from typing import Literal
 

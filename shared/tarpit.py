@@ -4,8 +4,6 @@ A ZeroMQ peer reconnects 0.1 s after its connection has ended. Each handshake co
 0.5 ms, so a thousand surplus peers would delay the messages of all other peers.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 from collections import deque

@@ -4,8 +4,6 @@ A FIFO blocks its reader, and a device may never end. Such files are rejected by
 before they are opened. A file that grows is read up to the size that it had.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Wakes a thread that waits for file descriptors."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import weakref

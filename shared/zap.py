@@ -1,7 +1,5 @@
 """The ZAP handler (ZeroMQ RFC 27): checks the key of each new connection."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Collection
 

@@ -1,7 +1,5 @@
 """A headless Chromium with one page, of which pictures can be taken, and a server of files."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import functools

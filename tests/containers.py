@@ -5,8 +5,6 @@ environment, secrets and hosts that its description names; and a user without ri
 read this machine's Python.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Control with two services that start every session at once."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

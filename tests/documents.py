@@ -1,7 +1,5 @@
 """Programs that stand in documents, so that the tests run what readers copy."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from pathlib import Path

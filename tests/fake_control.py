@@ -1,7 +1,5 @@
 """Control, a recognizer and a synthesizer that a test scripts, on a separate thread."""
 
-from __future__ import annotations
-
 import itertools
 import queue
 import threading

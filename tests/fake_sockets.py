@@ -1,7 +1,5 @@
 """Sockets without a network for a client's core: tests read what it sends and pass time."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Collection

@@ -1,7 +1,5 @@
 """Writes small GLBs like other programs (dense accessors, no kouxing extras), and reads GLBs."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass, field

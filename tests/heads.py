@@ -1,7 +1,5 @@
 """Built-in heads, read once for all tests."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

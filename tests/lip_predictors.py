@@ -1,7 +1,5 @@
 """A lip predictor with random weights for the shipped network."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Live streams for tests: every call returns the recognizer's new results."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

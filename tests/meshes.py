@@ -1,7 +1,5 @@
 """The built-in head as a user's mesh, without fields or with renamed shapes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

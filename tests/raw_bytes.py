@@ -1,7 +1,5 @@
 """Bytes that are nothing, for a port of any kind: ZeroMQ's, http, WebSockets."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import time

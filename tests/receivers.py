@@ -1,7 +1,5 @@
 """Reads sent faces like other programs, by their specifications."""
 
-from __future__ import annotations
-
 import json
 import struct
 from typing import Any

@@ -1,7 +1,5 @@
 """One message of every kind, as ``proto/golden`` has them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

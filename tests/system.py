@@ -1,7 +1,5 @@
 """Running services for tests: real processes, real sockets, and ports of their own."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

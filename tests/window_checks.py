@@ -1,7 +1,5 @@
 """Checks for ``test_window``, run in a separate process because GLX and EGL conflict."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -14,8 +14,6 @@ and likewise the second moment. Isolated words and syllables are longer, so they
 They matter only for phones that no connected speech contains.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The model card, which states what a model was trained on."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path

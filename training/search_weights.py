@@ -1,7 +1,5 @@
 """Choose the search weights on development data: acoustic scale and phone penalty."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -6,8 +6,6 @@ each, and a synthesizer makes any amount. The weight of a recording is
     w = clip(sqrt(30 min / minutes of its speaker), 0.3, 3) * (0.3 if synthetic)
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence

@@ -5,8 +5,6 @@ Li et al. 2011, section 3.3, draw box plots (figures 7 and 8), remove the outlie
 is too narrow, so the report also has the mean of all scores.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections import defaultdict

@@ -6,8 +6,6 @@ the next place, and ``POST /answers`` saves its scores. No request names a file 
 judges cannot find out which condition they see.
 """
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import time

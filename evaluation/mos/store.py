@@ -1,7 +1,5 @@
 """Judges and their answers: lines of JSON, flushed to disk before they are acknowledged."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

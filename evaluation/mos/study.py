@@ -6,8 +6,6 @@ often. A judge sees one row per sentence, drawn at random. Two videos for practi
 come first and do not count.
 """
 
-from __future__ import annotations
-
 import json
 import random
 from dataclasses import dataclass, field

@@ -14,8 +14,6 @@ speed                 overlap-add of the most similar 20 ms segments at constant
 ====================  ==========================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -15,8 +15,6 @@ rule or, unlike in the paper, along with the next phone. The final hypothesis ho
 phones. Every recording is a separate session, so the live mean starts from the prior each time.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """The consonants made with the lips, whose errors viewers can see."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from kouxing.corpora.scoring import matched_pairs

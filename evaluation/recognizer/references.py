@@ -3,8 +3,6 @@
 The speaking rate is the number of syllables per second of phones, without pauses.
 """
 
-from __future__ import annotations
-
 from bisect import bisect
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Print the recognizer's figures as a table, and plot them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path

@@ -14,8 +14,6 @@ melody            the same vowels on notes of 0.3 to 1.2 s, with vibrato
 A vowel is a train of glottal pulses through four formants in cascade (Klatt 1980).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

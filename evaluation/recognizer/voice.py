@@ -10,8 +10,6 @@ therefore includes the delays of the detector, such as the half second before sp
 - Synthesized sounds (:mod:`~kouxing.evaluation.recognizer.synthetic_sounds`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ accepts. Each attack runs for a given time and connects from a given loopback ad
 therefore distinguish the attacker from the clients that it must continue to serve.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import time

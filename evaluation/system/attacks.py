@@ -8,8 +8,6 @@ an attacker also takes processor time.
 On Linux only: memory is read from ``/proc``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import tempfile

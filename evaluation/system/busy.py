@@ -6,8 +6,6 @@ session, like a desktop program, because Linux first divides the processor among
 before the load. The lateness therefore also grows while no frame arrives.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

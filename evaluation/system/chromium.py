@@ -1,7 +1,5 @@
 """A headless Chromium with one page, driven by the Chrome DevTools Protocol."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Effects of a fault on a live face: how long it stopped, what was lost, how far it jumped."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 

@@ -4,8 +4,6 @@ The recognizer runs without its messages. An image needs the stages of the rende
 and the file of the head.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from dataclasses import dataclass

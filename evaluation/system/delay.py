@@ -3,8 +3,6 @@
 usage: python -m kouxing.evaluation.system.delay DEVICE DELAY_MS JITTER_MS
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import random

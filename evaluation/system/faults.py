@@ -6,8 +6,6 @@ subscriber are compared with those without a fault (``continuity.py``). A sudden
 several instants, in one session each. The worst value of each figure counts.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

@@ -11,8 +11,6 @@ ms chunks. Two latencies are measured for each FAP frame:
 CPU time is measured by the processes, per second of audio.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 import time

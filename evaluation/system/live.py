@@ -1,7 +1,5 @@
 """Stream sessions in real time and record what a subscriber receives."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

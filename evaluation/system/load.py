@@ -6,8 +6,6 @@ sample that it needs was due to its arrival, without the synthesizer's delay. Mi
 as late.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import time

@@ -5,8 +5,6 @@ through ``evaluation.system.delay``, because not every kernel has netem. This ne
 iproute2 and nftables.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -6,8 +6,6 @@ page reports its own figures in ``window.kouxing.state``. Its delay ends at the 
 refresh after the picture was drawn.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import time

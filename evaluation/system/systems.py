@@ -1,7 +1,5 @@
 """Start the services to measure: on this host like ``kouxing run``, or on virtual hosts."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

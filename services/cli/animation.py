@@ -1,7 +1,5 @@
 """The motion of a face: computed from sound, or read from a ``.fap`` file or a table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial

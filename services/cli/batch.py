@@ -1,7 +1,5 @@
 """Commands that take many files: their outputs, and errors that do not stop the other files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar

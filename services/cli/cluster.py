@@ -1,7 +1,5 @@
 """``kouxing cluster``: recognizers and synthesizers on the hosts of a Ray cluster."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """``kouxing config``: prints every key with its meaning, its present value and its origin."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterable

@@ -7,8 +7,6 @@ their rate. It is taken as the lowest standard rate above the largest FF. If a t
 full second, it is taken as the app's default.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import itertools

@@ -1,7 +1,5 @@
 """``kouxing doctor``: checks the keys, addresses, clocks and versions of a system from here."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Collection, Iterator, Mapping
 from importlib.metadata import version

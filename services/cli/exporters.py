@@ -1,7 +1,5 @@
 """The output formats of ``kouxing render``: one class per format, found by the file's suffix."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import fields
 from pathlib import Path

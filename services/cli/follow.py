@@ -1,7 +1,5 @@
 """Prints or records the output of a session: FAPs or shapes, syllables or phones."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Iterable, Iterator

@@ -5,8 +5,6 @@ the container image have them in the page's folder. Otherwise ``kouxing run`` ex
 the user's cache folder.
 """
 
-from __future__ import annotations
-
 import os
 from importlib import resources
 from pathlib import Path

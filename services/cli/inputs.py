@@ -1,7 +1,5 @@
 """Reads the sound files of commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The commands under ``kouxing keys``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The log of one service: private, limited in size, and harmless when the disk is full."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,7 +1,5 @@
 """The command ``kouxing``."""
 
-from __future__ import annotations
-
 import errno
 import os
 import sys

@@ -5,8 +5,6 @@ Interpolation gives R(t), and R(t) gives the contour. The paper's mouth has one 
 lip model gives the width, so that the mouth is round for u, ü and o.
 """
 
-from __future__ import annotations
-
 import csv
 from bisect import bisect_right
 from collections.abc import Callable, Sequence

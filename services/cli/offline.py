@@ -1,7 +1,5 @@
 """The commands that need no running services: files in, files out."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from functools import partial
 from pathlib import Path

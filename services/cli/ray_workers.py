@@ -5,8 +5,6 @@ the worker elsewhere. Each actor runs one worker process. That process finds con
 as usual, so no audio and no frames pass through Ray.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -4,8 +4,6 @@
 lock ends with the process, even if the process is killed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

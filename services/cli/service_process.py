@@ -1,7 +1,5 @@
 """A service as a child process. The service reports each heartbeat through a pipe."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

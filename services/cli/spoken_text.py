@@ -1,7 +1,5 @@
 """Reads the spoken texts of commands: given directly, or as a file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text

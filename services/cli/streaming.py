@@ -1,7 +1,5 @@
 """Streams audio to a running system, in real time or as fast as the system accepts it."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import time

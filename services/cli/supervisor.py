@@ -1,7 +1,5 @@
 """Runs all services on one machine, and restarts a service that crashes or hangs."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -4,8 +4,6 @@ A format is recognized by its content, because a text may come without a file na
 are left out. A format whose text cannot be extracted is rejected by its name.
 """
 
-from __future__ import annotations
-
 import codecs
 import contextlib
 import html

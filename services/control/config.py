@@ -1,7 +1,5 @@
 """Control's configuration."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Faults of services: short ones are only in the log, others are reported, and so is their end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kouxing.shared.logs import LOG

@@ -3,8 +3,6 @@
 Each step is sent to the services and the client of the session, and is published as an event.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

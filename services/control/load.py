@@ -7,8 +7,6 @@ any moment. A worker processes the audio of all sessions together, so each of ma
 less. The cost therefore falls quickly to the load divided by the number of speaking sessions.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 EQUAL_LOAD = 0.05  # loads that differ by less are equal

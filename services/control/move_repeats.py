@@ -1,7 +1,5 @@
 """Moves that clients are told again, because their connection may have broken."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Iterator

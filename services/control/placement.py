@@ -1,7 +1,5 @@
 """Chooses workers for a session."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 
 from kouxing.services.control.load import EQUAL_LOAD, RETRY_AFTER_S

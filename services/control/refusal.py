@@ -1,7 +1,5 @@
 """A request that control refuses."""
 
-from __future__ import annotations
-
 from kouxing.shared.wire.session import ErrorCode
 
 

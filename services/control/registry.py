@@ -3,8 +3,6 @@
 A worker provides endpoints and needs others. An observer takes part in every session.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """Answers requests: checks roles, and repeats the answer to a repeated request."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, TypeAlias

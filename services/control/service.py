@@ -6,8 +6,6 @@ and synchronizes them. Audio, phones and FAPs do not pass through it.
 After a restart, control learns the sessions from the services that serve them.
 """
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """One session at control, and the messages that describe it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from kouxing.services.control.placement import UNPACED_AUDIO

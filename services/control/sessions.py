@@ -1,7 +1,5 @@
 """The open sessions; no sockets, so that tests can check every rule."""
 
-from __future__ import annotations
-
 import math
 import secrets
 from bisect import bisect_left

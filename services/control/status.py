@@ -1,7 +1,5 @@
 """Reports the state of services and sessions, in pages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from kouxing.services.control.registry import Registry, ServiceRecord

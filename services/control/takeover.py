@@ -1,7 +1,5 @@
 """Collects the sessions of an earlier control, in the first seconds after startup."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from kouxing.services.control.registry import Registry

@@ -1,7 +1,5 @@
 """Decodes and encodes single pictures, also from untrusted files."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The newest pose of each followed session, and the choice of the session to show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ OpenGL and the encoder hold the GIL for up to a second, so they would delay the 
 They also keep memory until their process ends.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

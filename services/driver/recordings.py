@@ -1,7 +1,5 @@
 """The videos of recorded sessions. A separate process draws and writes them."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import multiprocessing

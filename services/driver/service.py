@@ -5,8 +5,6 @@ Reacts to: start-session, close-session (control), fap-frame, end-of-faps (synth
 Emits: session-started, recorded, error (control).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -23,8 +23,6 @@ MNS0 / 1024 or MW0 / 1024. The neutral frames are silent frames with closed lips
 16, 17) is omitted: measured with one camera, it did not follow the lips of a rendered head.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -11,8 +11,6 @@ A file contains only frames with a face. It may come from an untrusted source, s
 every size.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

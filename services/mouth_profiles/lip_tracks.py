@@ -1,7 +1,5 @@
 """Tracked lips in the form that the lip model uses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

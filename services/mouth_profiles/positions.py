@@ -4,8 +4,6 @@ Voice activity detection runs as in the live recognizer. The network therefore r
 stretch of speech.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Learn a mouth profile in a process with low priority, so that live streams do not suffer."""
 
-from __future__ import annotations
-
 import os
 import traceback
 from collections.abc import Callable, Iterator

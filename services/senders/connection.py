@@ -1,7 +1,5 @@
 """Connections to targets: the common interface, and datagrams."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import socket

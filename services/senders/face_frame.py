@@ -1,7 +1,5 @@
 """One frame of a face in the terms of other programs."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -10,8 +10,6 @@ tan(pitch), as radians would; ``eyeLookDown`` has a positive pitch, ``eyeLookInR
 yaw. (Unreal's own ARKit plugin on the phone sends degrees / 180 instead.)
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import uuid

@@ -12,8 +12,6 @@ address                 types  value
 display. Each bundle fits in one Ethernet frame.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterable, Iterator

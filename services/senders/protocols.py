@@ -1,7 +1,5 @@
 """The table of sender protocols, and the parser of target addresses."""
 
-from __future__ import annotations
-
 from urllib.parse import parse_qsl, urlsplit
 
 from kouxing.services.senders.connection import Connection

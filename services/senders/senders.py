@@ -1,7 +1,5 @@
 """Sends a face to several programs, each with its own delay, from a separate thread."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import threading

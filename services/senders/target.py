@@ -1,7 +1,5 @@
 """Where and how a face is sent: ``PROTOCOL://HOST:PORT?OPTION=VALUE``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

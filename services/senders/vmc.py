@@ -13,8 +13,6 @@ contains a position that is unknown here. It is sent as 0, and only some receive
 Therefore head rotation is off unless ``head=on``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import ClassVar
 

@@ -6,8 +6,6 @@ and sets those of ``tracking_parameters`` that exist in every frame. The model's
 what they move.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Configuration that all services with a face share."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

@@ -19,8 +19,6 @@ a       freedom of the lips, 0 to 1                           1         (6,)
 80 upwards. Without speech all lips are free; they are bound again when speech starts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Expressions that a client can request: names, strengths and duration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from enum import StrEnum
 

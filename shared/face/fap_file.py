@@ -14,8 +14,6 @@ expression_intensity1 expression_select2 expression_intensity2 init_face express
 14496-2, annex C). A single number selects one viseme or expression at full strength.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

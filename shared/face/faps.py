@@ -4,8 +4,6 @@ An array of FAPs has shape ``(68,)``; index ``i`` holds FAP ``i + 1`` in FAP uni
 is ``value * FAPU / 1024``, an angle ``value * 1e-5`` rad.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from importlib import resources

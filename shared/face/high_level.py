@@ -13,8 +13,6 @@ standard's English ones. Deviations:
 - Disgust raises both sides of the lip.
 """
 
-from __future__ import annotations
-
 import csv
 from importlib import resources
 

@@ -11,8 +11,6 @@ The motion depends only on the seed, the time and recent states. A generator tha
 makes the same motion as one that started with the session.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from enum import Enum

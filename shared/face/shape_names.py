@@ -9,8 +9,6 @@ Names match in any case, after any prefix, and with ``_L``, ``.L`` or ``Left`` a
 one letter matches only without a prefix or after ``.``, ``:``, ``|`` or ``/``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 from enum import StrEnum

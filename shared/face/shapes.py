@@ -34,8 +34,6 @@ are 0, which are 1 and which are free. Solve for the free weights. Then move the
 violate a bound or an optimality condition, and repeat.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

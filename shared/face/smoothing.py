@@ -1,7 +1,5 @@
 """Smoothing of values over time."""
 
-from __future__ import annotations
-
 import math
 from typing import Generic, TypeVar
 

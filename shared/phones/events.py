@@ -3,8 +3,6 @@
 Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The time up to which a session's phones are final, from which another recognizer may continue."""
 
-from __future__ import annotations
-
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 
 QUIET_S = 0.5  # the start of speech is reported sooner after its first phone's onset than this

@@ -26,8 +26,6 @@ before_rounded  the phone's viseme before a rounded one, if different; may be em
 =============== ===================================================================================
 """
 
-from __future__ import annotations
-
 import csv
 import importlib
 import math

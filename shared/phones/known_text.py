@@ -4,8 +4,6 @@ The recognized syllables contain errors, so they are aligned with the text by ed
 phones lower the cost, syllables may be missing or inserted, and the text may continue.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from kouxing.shared.errors import UserError

@@ -4,8 +4,6 @@ The TextGrid layout is Praat's long text format (Boersma and Weenink, Praat manu
 formats"). Intervals cover the whole time without gaps, so pauses are intervals with empty text.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

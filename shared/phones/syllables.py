@@ -1,7 +1,5 @@
 """Captions of live speech: combines phones and their revisions to syllables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A text as it is spoken: syllables with their spelling, and the parts that cannot be read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """A session's audio: from the client to the recognizer, and from there to all subscribers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 

@@ -5,8 +5,6 @@ and FAP values are fields of the map. They are small, usually under 2 KiB, so co
 less than separate parts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

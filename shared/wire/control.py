@@ -1,7 +1,5 @@
 """Messages between control and the services, and the events that control publishes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated

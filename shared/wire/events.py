@@ -1,7 +1,5 @@
 """Converts a recognizer's events to messages, and back."""
 
-from __future__ import annotations
-
 from typing import TypeAlias, get_args
 
 import numpy as np

@@ -3,8 +3,6 @@
 ``python -m kouxing.shared.wire.schema > proto/schema.json`` updates the file.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 

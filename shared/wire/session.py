@@ -1,7 +1,5 @@
 """Messages between a client and control, and the confirmation of subscriptions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The recognizer's results, and the synthesizer's acknowledgement."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, ClassVar

@@ -1,7 +1,5 @@
 """The busy command measures lateness, and prints, writes and plots its figures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

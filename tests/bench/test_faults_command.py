@@ -1,7 +1,5 @@
 """Services crash during a live session; its face only pauses."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The bench command prints and writes its figures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The load command prints, writes and plots its figures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The documents' links lead somewhere, and the commands and tests that they name exist."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """All locked packages have hashes, and the locks contain all dependencies."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The page translates every text that the gateway sends about files, mouths and other programs."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The documents in proto/, the schema and the code agree."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

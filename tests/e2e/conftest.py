@@ -1,7 +1,5 @@
 """A client of the running system, and another session that no test may disturb."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Stream audio into a session and collect its results."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A fake control that publishes a face and its sound in real time, for the page."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

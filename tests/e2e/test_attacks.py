@@ -1,7 +1,5 @@
 """Attackers at every socket: services stay alive, release memory, and serve other clients."""
 
-from __future__ import annotations
-
 import pytest
 from kouxing_client import Session
 

@@ -1,7 +1,5 @@
 """Audio from WebRTC clients, and malformed messages, against real services."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import difflib

@@ -1,7 +1,5 @@
 """Bad input of every kind: a clear answer, no service dies, and other sessions continue."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

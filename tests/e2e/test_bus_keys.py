@@ -1,7 +1,5 @@
 """Access to bound sockets: keys, roles, revoked keys and old clients."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import socket

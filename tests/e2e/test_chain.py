@@ -1,7 +1,5 @@
 """A sound through real processes: its phones and frames, bit for bit those of the chain."""
 
-from __future__ import annotations
-
 import itertools
 import signal
 import time

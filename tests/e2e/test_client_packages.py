@@ -1,7 +1,5 @@
 """The client libraries, installed from what is built of them, against a running system."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Workers on a Ray cluster of three nodes: placed, restarted elsewhere, and stopped."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

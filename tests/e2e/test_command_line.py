@@ -1,7 +1,5 @@
 """The command line with good and bad files, with and without running services."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """docker-compose.yml, carried out without an engine."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import subprocess

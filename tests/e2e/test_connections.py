@@ -1,7 +1,5 @@
 """Limits of connections over real sockets: hostile peers are disconnected, honest ones never."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import time

@@ -1,7 +1,5 @@
 """A session does not notice that control was killed and started again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

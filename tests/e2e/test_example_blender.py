@@ -1,7 +1,5 @@
 """The Blender add-on moves an exported head in Blender itself, from a recording and live."""
 
-from __future__ import annotations
-
 import csv
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The programs in examples/subscribe follow a session."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Examples that use the gateway: the voice assistant and the avatar in a browser."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

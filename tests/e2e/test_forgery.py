@@ -1,7 +1,5 @@
 """Peers with a key that say what only others may say: it counts for nothing."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Services and a client on machines of their own, each with the key that was copied there."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The profile is really learned. The camera sees one of our own heads, which opens
 mouth.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A listening test over HTTP: crashes, repeated requests, and judges in a real browser."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A live session whose recognizer or synthesizer is lost continues with another one."""
 
-from __future__ import annotations
-
 import signal
 import time
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The hosts are network namespaces; where they are forbidden, these tests are skipped.
 """
 
-from __future__ import annotations
-
 import difflib
 import functools
 import time

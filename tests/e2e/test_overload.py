@@ -1,7 +1,5 @@
 """A face is live again after its service was stopped, and the skipped audio is reported."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ The gateway is real. Control, recognizer and synthesizer play a script, so that 
 known. The Chrome DevTools Protocol drives the browser.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import re

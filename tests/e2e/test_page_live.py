@@ -1,7 +1,5 @@
 """The page with real services and a speaking microphone: its delay, and crashes of services."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """The page over https, as a bare overlay, with a keyboard and with a screen reader."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterator

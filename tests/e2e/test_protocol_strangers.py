@@ -1,7 +1,5 @@
 """Strangers that know only PROTOCOL.md."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

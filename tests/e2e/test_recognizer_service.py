@@ -1,7 +1,5 @@
 """The recognizer's loop with real sockets: how much it does at a time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A service that crashes or hangs is restarted, and its sessions continue."""
 
-from __future__ import annotations
-
 import io
 import signal
 from collections.abc import Iterator

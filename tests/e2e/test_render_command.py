@@ -1,7 +1,5 @@
 """``kouxing render`` and ``kouxing head``: files in, files out."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

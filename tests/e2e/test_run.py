@@ -1,7 +1,5 @@
 """``kouxing run``, as ``make demo`` and ``make run`` start it, and Ctrl-C at several stages."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

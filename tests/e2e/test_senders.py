@@ -1,7 +1,5 @@
 """Senders over real sockets: receivers that are missing, return, are delayed, or deny access."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

@@ -1,7 +1,5 @@
 """Settings that change what a running system does, and its end."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 from collections.abc import Iterator

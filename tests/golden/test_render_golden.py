@@ -3,8 +3,6 @@
 A change of looks that is meant: run with ``WRITE_GOLDEN=1`` and look at the pictures.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Messages are encoded to the stored bytes, and the stored bytes are decoded to the messages."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 

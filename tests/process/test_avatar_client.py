@@ -1,7 +1,5 @@
 """What the JavaScript client makes of avatars: which shapes move them, and where their face is."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

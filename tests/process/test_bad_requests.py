@@ -1,7 +1,5 @@
 """Malformed and hostile requests: each gets an error, and none leaves a traceback in the log."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The other end is the product's own, so it checks what the package sends.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 from array import array

@@ -1,7 +1,5 @@
 """Control repeats an answer, with its token, only to the client that sent the request."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import socket

@@ -1,7 +1,5 @@
 """The state of a system of any size, in pages."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import time

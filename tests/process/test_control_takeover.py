@@ -1,7 +1,5 @@
 """A restarted control learns the sessions from the services."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

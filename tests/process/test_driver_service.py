@@ -1,7 +1,5 @@
 """A driver with two sessions: one is shown, the other is recorded."""
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The gateway's WebSockets, between a scripted control and clients."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Access to the gateway over HTTP: paths, host names, origins, tokens and certificates."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

@@ -1,7 +1,5 @@
 """Limits of the gateway's port: incomplete requests, and too many connections."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

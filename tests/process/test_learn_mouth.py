@@ -1,7 +1,5 @@
 """The gateway's learning of a mouth, with other functions in place of the real learning."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import io

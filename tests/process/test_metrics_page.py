@@ -1,7 +1,5 @@
 """The metrics of running services are those of the documents and of the dashboard."""
 
-from __future__ import annotations
-
 import json
 import re
 import urllib.request

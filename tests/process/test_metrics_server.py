@@ -1,7 +1,5 @@
 """The HTTP server of metrics and health: its answers and its limits."""
 
-from __future__ import annotations
-
 import socket
 import urllib.error
 import urllib.request

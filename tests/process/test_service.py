@@ -1,7 +1,5 @@
 """The loop that every service runs."""
 
-from __future__ import annotations
-
 import errno
 import math
 import socket

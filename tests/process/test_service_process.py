@@ -1,7 +1,5 @@
 """A service process: SIGTERM ends it with status 0, a wrong configuration with status 2."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

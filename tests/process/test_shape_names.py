@@ -1,7 +1,5 @@
 """The Python, JavaScript and C# code finds the same shapes; other code has the same table."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recordings of what a machine plays, from a real PulseAudio without a loudspeaker."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 from collections.abc import Generator, Iterator

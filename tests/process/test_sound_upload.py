@@ -1,7 +1,5 @@
 """The gateway decodes the files of the page's *File* button."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 from collections.abc import AsyncIterator, Awaitable, Callable

@@ -1,7 +1,5 @@
 """The window on a separate display (Xvfb): drawing, size, closing and keys."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """WebSocket clients of a gateway."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

@@ -1,7 +1,5 @@
 """Replacing the recognizer or synthesizer during speech is not visible."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache

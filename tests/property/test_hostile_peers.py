@@ -1,7 +1,5 @@
 """Peers send anything to a service's sockets: it continues and answers the next request."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

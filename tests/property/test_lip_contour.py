@@ -1,7 +1,5 @@
 """The Ferguson contour has no "sick shapes" (Zhang et al. 2021, section 6.2) at any opening R."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The commands ``kouxing track`` and ``kouxing adapt``."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """npz files: valid files are read; others are rejected before anything is unpacked."""
 
-from __future__ import annotations
-
 import io
 import tracemalloc
 import zipfile

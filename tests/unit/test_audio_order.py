@@ -1,7 +1,5 @@
 """The order in which the recognizer accepts audio messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

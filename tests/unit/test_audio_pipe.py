@@ -1,7 +1,5 @@
 """Sound from pipes: formats by their first bytes, and raw samples."""
 
-from __future__ import annotations
-
 import io
 import os
 import sys

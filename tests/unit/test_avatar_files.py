@@ -1,7 +1,5 @@
 """Avatars as other programs write them are heads: VRM, compression, axes, places of names."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Callable

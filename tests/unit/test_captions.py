@@ -1,7 +1,5 @@
 """Captions: what they contain, where they are drawn, and slow motion."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

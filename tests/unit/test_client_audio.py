@@ -1,7 +1,5 @@
 """A client's audio: conversion to PCM; what it sends, resends and drops."""
 
-from __future__ import annotations
-
 from array import array
 
 import numpy as np

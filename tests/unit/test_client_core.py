@@ -1,7 +1,5 @@
 """A client's core: requests, sessions that move, lost connections; without sockets."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import pytest

@@ -1,7 +1,5 @@
 """Messages are encoded and decoded; everything else is rejected with a reason."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Commands that other packages add as entry points."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Configuration: priority of the sources, rejected values, and error messages."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

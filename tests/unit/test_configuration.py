@@ -1,7 +1,5 @@
 """``kouxing config`` prints a file that gives the same configuration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

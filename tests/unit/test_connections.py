@@ -1,7 +1,5 @@
 """Decisions about connections, without sockets: who is disconnected, and who never."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import cast
 from unittest import mock

@@ -1,7 +1,5 @@
 """Tables of curves are read as they were written; unclear ones are rejected with their fault."""
 
-from __future__ import annotations
-
 import csv
 import re
 from pathlib import Path

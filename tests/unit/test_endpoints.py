@@ -1,7 +1,5 @@
 """The address by which others reach this host."""
 
-from __future__ import annotations
-
 import socket
 
 import pytest

@@ -1,7 +1,5 @@
 """Output formats: chosen by suffix, checked before long work, and written as documented."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From landmarks to FAPs, and files of landmarks."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

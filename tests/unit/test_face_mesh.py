@@ -1,7 +1,5 @@
 """The face mesh finds the landmarks that MediaPipe finds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

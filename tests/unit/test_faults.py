@@ -1,7 +1,5 @@
 """Control reports lost services that do not return within a second."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

@@ -1,7 +1,5 @@
 """Live Ferguson lips: phone shapes at the times of the sound, without jumps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

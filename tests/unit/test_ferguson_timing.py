@@ -1,7 +1,5 @@
 """Syllable endpoints, and phone times of a known text."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training of the Ferguson lips' table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

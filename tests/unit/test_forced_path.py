@@ -1,7 +1,5 @@
 """The best path of known phones: memory, and the band of long utterances."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

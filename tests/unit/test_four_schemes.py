@@ -1,7 +1,5 @@
 """The four schemes of Li et al. 2011: sentences, measures and one small run."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

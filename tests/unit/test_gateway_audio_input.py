@@ -1,7 +1,5 @@
 """Client audio: format checks, and playback in real time."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import selectors

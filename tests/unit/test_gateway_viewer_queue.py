@@ -1,7 +1,5 @@
 """The queue of one viewer is bounded and favors new messages."""
 
-from __future__ import annotations
-
 import asyncio
 
 from kouxing.services.gateway.viewer_queue import (

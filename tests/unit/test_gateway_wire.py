@@ -1,7 +1,5 @@
 """The messages of browsers are checked field by field."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Exported GLBs and VRM 1.0 avatars are consistent and complete."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

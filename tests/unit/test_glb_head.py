@@ -1,7 +1,5 @@
 """GLBs with ARKit, Oculus or FAP morph targets are heads; damaged files are rejected."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

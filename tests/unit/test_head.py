@@ -1,7 +1,5 @@
 """Heads move their feature points as defined; damaged files are rejected."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

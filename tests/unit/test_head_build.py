@@ -1,7 +1,5 @@
 """The geometry that builds the head: subdivision, zones, interpolation, clipping."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from kouxing.training.heads import subdivision

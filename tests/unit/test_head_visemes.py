@@ -1,7 +1,5 @@
 """The mouths of the built-in heads in all visemes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

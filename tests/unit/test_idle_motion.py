@@ -1,7 +1,5 @@
 """Brow, head and eye motion with speech."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands refuse options that have no effect, and names of files that they would overwrite."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

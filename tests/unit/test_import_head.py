@@ -1,7 +1,5 @@
 """A mesh and its feature points become a head; errors name the problem."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Keys in files: made once, private, allowed and revoked."""
 
-from __future__ import annotations
-
 import os
 import stat
 import subprocess

@@ -1,7 +1,5 @@
 """The registry of service kinds: every entry leads to a service that runs on its own."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import socket

@@ -1,7 +1,5 @@
 """The Kubernetes manifests are valid, consistent and restricted, and their settings are known."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

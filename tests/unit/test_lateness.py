@@ -1,7 +1,5 @@
 """Lateness of the frames of a live session, with injected time."""
 
-from __future__ import annotations
-
 import pytest
 
 from kouxing.services.synthesizer.lateness import LatenessMeter

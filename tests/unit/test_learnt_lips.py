@@ -1,7 +1,5 @@
 """Learnt lips follow lip frames smoothly, close for closures, and rest."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

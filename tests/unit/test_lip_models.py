@@ -1,7 +1,5 @@
 """Discovery of lip models: built-in packages and entry points."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

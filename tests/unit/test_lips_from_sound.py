@@ -1,7 +1,5 @@
 """The lip predictor: its steps, its file, and the lip frames of a session."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Training lips from sound, on made-up speakers."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Logs are private, limited, free of tokens, and never raise."""
 
-from __future__ import annotations
-
 import os
 import resource
 import stat

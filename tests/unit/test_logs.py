@@ -1,7 +1,5 @@
 """Log lines are JSON and name their session, also after a crash."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Iterator

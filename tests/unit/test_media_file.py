@@ -1,7 +1,5 @@
 """The times, tracks and damage of media files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

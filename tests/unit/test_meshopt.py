@@ -1,7 +1,5 @@
 """Compressed buffer views; the bytes are from meshoptimizer's encoder."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

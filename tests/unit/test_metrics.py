@@ -1,7 +1,5 @@
 """Snapshots of metrics, their page for Prometheus, and the busy share of a loop."""
 
-from __future__ import annotations
-
 import pytest
 
 from kouxing.shared.metrics import WINDOW, LoadMeter, Metrics

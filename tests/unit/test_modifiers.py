@@ -1,7 +1,5 @@
 """Modifiers of the face: expressions, expressiveness and amplitude."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Listening tests: orders, studies, answers on disk, and statistics."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """``kouxing lips``: the 2-D mouth of a sound."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from xml.etree import ElementTree

@@ -1,7 +1,5 @@
 """Light on teeth and tongue."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

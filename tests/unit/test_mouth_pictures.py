@@ -1,7 +1,5 @@
 """Mouths can be distinguished in pictures at viewing distance."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mouth profiles: their format, their effect, and how they are learned."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands never overwrite an input, or ask before they overwrite a file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A live session that falls behind skips old audio; unpaced audio is complete."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every class of phones is seen in every output, and shapes lead back to the face they are of."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, partial
 

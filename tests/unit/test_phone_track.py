@@ -1,7 +1,5 @@
 """Each phone of a session counts once, even if several recognizers publish it."""
 
-from __future__ import annotations
-
 import pytest
 from kouxing_client import Phone, Speech
 from kouxing_client.messages import SILENCE

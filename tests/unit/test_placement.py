@@ -1,7 +1,5 @@
 """Placement by load: where sessions go, and when they are refused; no sockets, no clocks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

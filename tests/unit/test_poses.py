@@ -1,7 +1,5 @@
 """The choice of the shown session, and the fade to rest without frames."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A service requests a higher priority, and continues without it."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

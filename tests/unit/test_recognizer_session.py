@@ -1,7 +1,5 @@
 """A session of the recognizer service: the audio that it accepts, and its messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, cast
 

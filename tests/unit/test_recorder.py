@@ -1,7 +1,5 @@
 """The order in which the driver draws its videos, and how they end."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

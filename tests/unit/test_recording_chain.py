@@ -1,7 +1,5 @@
 """Recordings: everything is known before the first frame is made."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The acknowledged stream from recognizer to synthesizer, with messages that are lost."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Rendering without a display: framings, backgrounds, windows and errors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import moderngl

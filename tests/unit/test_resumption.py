@@ -1,7 +1,5 @@
 """A recognizer that continues the session of a lost recognizer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import chain
 

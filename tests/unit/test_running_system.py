@@ -1,7 +1,5 @@
 """Commands find the running system of their user."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

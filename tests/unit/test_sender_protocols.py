@@ -1,7 +1,5 @@
 """Messages of the sender protocols, and target addresses."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """The memory of a speaking session in the recognizer: small, and it does not grow."""
 
-from __future__ import annotations
-
 import gc
 
 import numpy as np

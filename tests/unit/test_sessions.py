@@ -1,7 +1,5 @@
 """The rules by which control opens, moves, restores and ends sessions; no sockets, no clocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The names of shapes in avatars of many programs."""
 
-from __future__ import annotations
-
 import pytest
 
 from kouxing.shared.errors import UserError

@@ -1,7 +1,5 @@
 """Conversion between FAPs and weights of ARKit, Oculus and VRM shapes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear

@@ -1,7 +1,5 @@
 """The supervisor restarts a service that hangs, but not one that is only slow."""
 
-from __future__ import annotations
-
 import pytest
 
 from kouxing.services.cli.service_process import POLL_S, SilenceMeter

@@ -1,7 +1,5 @@
 """Recordings of what the machine plays, from a scripted sound server."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

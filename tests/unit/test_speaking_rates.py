@@ -1,7 +1,5 @@
 """Accuracy of made lips compared with real ones (Zhang et al. 2021, section 6)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

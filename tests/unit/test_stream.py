@@ -1,7 +1,5 @@
 """A session's audio and its events: gaps, flushes, chunks, and times in whole samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Captions: phones and their revisions become syllables of pinyin."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The messages of a session that a new synthesizer receives."""
 
-from __future__ import annotations
-
 from typing import cast
 
 from kouxing.services.recognizer.synthesizer_link import (

@@ -1,7 +1,5 @@
 """Several sessions of one synthesizer, without sockets."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tables fit into the terminal and keep words whole."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from io import StringIO

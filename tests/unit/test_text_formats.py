@@ -1,7 +1,5 @@
 """Spoken texts in subtitles, markup and other encodings."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

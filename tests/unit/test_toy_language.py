@@ -3,8 +3,6 @@
 The toy language has seven phones and silence. Its model has the Mandarin model's states of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

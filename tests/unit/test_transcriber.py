@@ -1,7 +1,5 @@
 """Speech to text with sherpa-onnx."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every reader of a user's file accepts regular files only, and reports bad contents."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Videos and pictures, read back: pictures, sound, transparency and colors."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The virtual camera sends pictures at its rate; errors name the missing device or library."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 from typing import Any

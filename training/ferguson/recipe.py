@@ -12,8 +12,6 @@ bounded linear least-squares problem. Rare phones are shrunk toward the values o
 other phones. Silence and bilabials are closed: R is 0.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

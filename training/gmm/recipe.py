@@ -1,7 +1,5 @@
 """From corpora to a model file with its card: the Gaussian mixture recognizer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

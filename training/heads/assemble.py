@@ -4,8 +4,6 @@ Every head is a shape of one mesh. Zones, texture, teeth, tongue and hair are la
 the reference head, in dm, and transferred to the same vertices of the other heads.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

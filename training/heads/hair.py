@@ -5,8 +5,6 @@ Hair is made on the reference head (see ``assemble``) and warped onto each head 
 lengths are MakeHuman decimeters, y up, z toward the viewer, x to the subject's left.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A style makes its parts over points (N, 3) of the skin of the reference head: ``
 body, and ``hair_tips``, the locks. The colors of a part are factors on its texture.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

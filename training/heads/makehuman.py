@@ -7,8 +7,6 @@ Points on the eyeballs (3.5, 3.6) and the teeth (9.8 to 9.11) are missing, becau
 rebuilt.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import subprocess

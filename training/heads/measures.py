@@ -1,7 +1,5 @@
 """Measure places and sizes on a head's mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ It is estimated from many depth images. H. Landis, "Production-ready global illu
 course 16, 2002.
 """
 
-from __future__ import annotations
-
 import moderngl
 import numpy as np
 from numpy.typing import NDArray

@@ -4,8 +4,6 @@ Both halves of the face share one texture. Its columns are the angle around a ve
 the head (0 in front, pi behind), its rows the height. Colors are sRGB, 0 to 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

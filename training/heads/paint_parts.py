@@ -1,7 +1,5 @@
 """Textures: noise, mixing, encoding, and all that are not skin. Colors are sRGB, 0 to 1."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from fractions import Fraction

@@ -5,8 +5,6 @@ Eyeballs and teeth are made here, because MakeHuman's base mesh lacks them or ha
 All lengths are MakeHuman decimeters, y up, z toward the viewer, x to the subject's left.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The people to build: shapes from MakeHuman's targets, colors and hair."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from kouxing.training.heads.hair_styles import Bob, Crop, Hair

@@ -4,8 +4,6 @@ E. Catmull, J. Clark, "Recursively generated B-spline surfaces on arbitrary topo
 Computer-Aided Design 10(6), 1978.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 

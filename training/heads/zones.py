@@ -14,8 +14,6 @@ lips, eyelids move around the eyeball, puffed cheeks come forward.
 - The jaw's motion at the lips' feature points is subtracted from FAPs 3, 14 and 15.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ words leave is distributed over the words counted after one word, and the rest o
 that the language does not write (punctuation, foreign words) become pauses.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -17,8 +17,6 @@ The gain of an n-gram, ``c log(p(u | h) / (T p(u | h') / (N + T)))``, is how muc
 likelihood of the texts. The n-grams with the highest gains and their prefixes are kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -25,8 +25,6 @@ Deviations from the paper:
   scaled to the measured extent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

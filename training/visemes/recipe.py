@@ -1,7 +1,5 @@
 """From clips of real lips to a file with viseme parameters."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What ``Client`` and ``AsyncClient`` share: arguments, audio formats, and when to wait."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future

@@ -1,7 +1,5 @@
 """Errors, with messages for the person who runs the program."""
 
-from __future__ import annotations
-
 
 class KouxingError(Exception):
     """The system does not answer, a key is missing, or a session has ended."""

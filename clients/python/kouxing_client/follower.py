@@ -1,7 +1,5 @@
 """Follows the messages of one session through moves and reconnections; no I/O of its own."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping

@@ -1,7 +1,5 @@
 """The CURVE key pair of this program, stored where kouxing's own commands store theirs."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass

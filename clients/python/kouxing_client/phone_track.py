@@ -1,7 +1,5 @@
 """Joins the phones of successive recognizers into one sequence; does no I/O."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 from msgspec.structs import replace

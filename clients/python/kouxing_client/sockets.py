@@ -1,7 +1,5 @@
 """The ZeroMQ sockets of one client. One thread uses them; other threads hand it functions."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import secrets

@@ -1,7 +1,5 @@
 """The thread that does a client's I/O."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future

@@ -3,8 +3,6 @@
 pygltflib is not used: it has no accessors from arrays, so this code would remain.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -24,8 +24,6 @@ linear between frames.
 The suffix ``.vrm`` makes a VRM 1.0 avatar instead, see ``vrm``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias

@@ -4,8 +4,6 @@ Khronos glTF 2.0, sections 3.6 (accessors), 3.7 (geometry, skins, morph targets)
 pygltflib is not used because it does not check sizes and decodes neither accessors nor nodes.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import struct

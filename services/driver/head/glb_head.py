@@ -19,8 +19,6 @@ r       ridge: keeps weights of similar shapes small  m     1
 ======  ============================================  ====  ========
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The shapes of a mesh are its morph targets. In a VRM, an expression is also a sh
 of morph targets of several meshes (``VRM`` of version 0, ``VRMC_vrm`` of version 1).
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from typing import Any

@@ -8,8 +8,6 @@ that is 1 at its point and 0 at the other points.
 A field is the displacement by one FAP unit, m. FAPs of missing points have no effect.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ mouth below the lips (lower teeth, tongue) follow the jaw. Objects on the skin (
 beard) follow the skin. The rest only follows the head.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

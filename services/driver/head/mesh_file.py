@@ -1,7 +1,5 @@
 """Reads a user's mesh file (OBJ, PLY, GLB) as pieces in common axes."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from pathlib import Path

@@ -4,8 +4,6 @@ Khronos EXT_meshopt_compression, appendix A (attributes, triangles, indices) and
 has no package with wheels for all platforms. The input is not trusted: reading past its end fails.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

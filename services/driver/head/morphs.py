@@ -1,7 +1,5 @@
 """The morph targets of an exported head: FAPs, shapes of ARKit, expressions of VRM."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

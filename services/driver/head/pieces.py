@@ -1,7 +1,5 @@
 """The pieces of a mesh, and how they become the parts of a head."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from typing import Any

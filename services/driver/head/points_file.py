@@ -7,8 +7,6 @@ Two formats are accepted. Text files have lines ``point x y z``, in the mesh's o
 surface, as for the built-in heads.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ET

@@ -1,7 +1,5 @@
 """Geodesic distances, zones of influence and smooth fields on surfaces."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse

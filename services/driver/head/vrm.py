@@ -5,8 +5,6 @@ emotions, and ARKit's 52 shapes for programs with "perfect sync". The format req
 so the head gets the bones of a body in T-pose without a mesh.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Captions below a picture: what is spoken, with the current syllable or phone highlighted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Draws a head with OpenGL, either offscreen (EGL) or in an existing window."""
 
-from __future__ import annotations
-
 import ctypes.util
 import sys
 import time

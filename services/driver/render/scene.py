@@ -1,7 +1,5 @@
 """The head, camera and background of a picture."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

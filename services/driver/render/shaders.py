@@ -1,7 +1,5 @@
 """The GLSL shaders and the materials of a head; the lighting is in ``light.glsl``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import kouxing.shared.face

@@ -1,7 +1,5 @@
 """Several faces side by side in one picture, each with a caption."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shows a head in a window."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import glfw

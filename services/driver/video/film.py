@@ -1,7 +1,5 @@
 """Renders FAP frames or a FAP file to a video or pictures, without running services."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

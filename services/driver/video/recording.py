@@ -4,8 +4,6 @@ Images are interpolated between FAP frames by media time, at the video's own rat
 sync at any rates and with late frames.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plays sound slower without changing its pitch, by FFmpeg's filter atempo."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import av

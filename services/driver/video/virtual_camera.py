@@ -1,7 +1,5 @@
 """Offers the head as a camera that other programs, such as video calls or OBS, can select."""
 
-from __future__ import annotations
-
 import importlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Converts bopomofo (zhuyin), the phonetic letters of Taiwan, to pinyin."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

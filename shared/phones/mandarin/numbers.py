@@ -7,8 +7,6 @@ other pairs as subtractions. Such pairs are therefore rewritten first:
 - 12.25 is a decimal.
 """
 
-from __future__ import annotations
-
 import re
 
 # wetext gets one sentence at a time: its time and memory grow with the square of the length.

@@ -16,8 +16,6 @@ Decisions beyond these sources:
   shape (``n`` for ``ng``), after ``h`` if it is written.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from functools import lru_cache
