@@ -15,7 +15,6 @@ from tests.e2e.following import Stream, samples_of_file
 from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port
 
 FOLDER = ROOT / "examples" / "subscribe"
-STREAM_CLIENTS = ROOT / "examples" / "stream"
 STREAM = ROOT / "examples" / "unity" / "KouxingStream.cs"
 SAMPLES = samples_of_file(VOWELS_FILE)
 
@@ -36,34 +35,30 @@ def programs(tmp_path: Path) -> list[list[str]]:
 
 
 @pytest.fixture
-def clients(tmp_path: Path, programs: list[list[str]]) -> list[list[str]]:
-    """The commands of the programs that stream a file."""
-    shutil.copy(STREAM_CLIENTS / "client.mjs", tmp_path)
-    return [
-        [sys.executable, str(STREAM_CLIENTS / "client.py")],
-        [str(NODE), str(tmp_path / "client.mjs")],
-    ]
+def client(tmp_path: Path, programs: list[list[str]]) -> list[str]:
+    """The command of the program that streams a file."""
+    shutil.copy(ROOT / "examples" / "stream" / "client.mjs", tmp_path)
+    return [str(NODE), str(tmp_path / "client.mjs")]
 
 
 @pytest.mark.parametrize("wav", ["stereo 24", "float 48k"])
-def test_the_clients_stream_wav_files(
-    system: System, tmp_path: Path, clients: list[list[str]], wav: str
+def test_the_client_streams_wav_files(
+    system: System, tmp_path: Path, client: list[str], wav: str
 ) -> None:
     samples, rate_hz, form = {
         "stereo 24": (np.stack([SAMPLES, SAMPLES], axis=1), 16000, "PCM_24"),
         "float 48k": (np.repeat(SAMPLES, 3), 48000, "FLOAT"),
     }[wav]
     soundfile.write(tmp_path / "said.wav", samples, rate_hz, form, format="WAVEX")
-    for client in clients:
-        arguments = [*client, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
-        output = subprocess.run(arguments, check=True, stdout=subprocess.PIPE, text=True).stdout
-        jaw = [float(line.split()[-1]) for line in output.splitlines()]
-        assert len(jaw) == pytest.approx(50 * len(samples) / rate_hz, abs=50)
-        assert max(jaw) - min(jaw) > 100
+    arguments = [*client, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
+    output = subprocess.run(arguments, check=True, stdout=subprocess.PIPE, text=True).stdout
+    jaw = [float(line.split()[-1]) for line in output.splitlines()]
+    assert len(jaw) == pytest.approx(50 * len(samples) / rate_hz, abs=50)
+    assert max(jaw) - min(jaw) > 100
 
 
 def test_without_a_server_each_program_prints_one_line(
-    programs: list[list[str]], clients: list[list[str]]
+    programs: list[list[str]], client: list[str]
 ) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     assistant = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
@@ -71,13 +66,13 @@ def test_without_a_server_each_program_prints_one_line(
         subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for command in [
             *([*program, "", address] for program in programs),
-            *([*client, str(VOWELS_FILE), address] for client in clients),
+            [*client, str(VOWELS_FILE), address],
             [*assistant, address.replace("tcp", "ws")],
         ]
     ]
     for process in running:
         (line,) = process.communicate(timeout=60)[1].splitlines()
-        assert "start it with: kouxing run" in line
+        assert "kouxing run" in line
         assert process.returncode == 1
 
 
