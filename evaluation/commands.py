@@ -236,11 +236,7 @@ def schemes(
     By default, the shipped samples are used, with the recognizers blocks and gmm.
     """
     from kouxing.evaluation.lips import sentences
-    from kouxing.evaluation.lips.four_schemes import (
-        load_recognizers,
-        print_missing,
-        recognize_all,
-    )
+    from kouxing.evaluation.lips.four_schemes import load_recognizers, print_missing, recognize_all
     from kouxing.evaluation.lips.report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos

@@ -14,13 +14,7 @@ import soxr
 
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.media_file import (
-    MediaSound,
-    RawFormat,
-    has_video,
-    pcm_of_wav,
-    to_float,
-)
+from kouxing.shared.media_file import MediaSound, RawFormat, has_video, pcm_of_wav, to_float
 from kouxing.shared.sound_formats import (
     NUM_BEGIN_BYTES,
     is_sound,

@@ -151,10 +151,7 @@ class Connection:
         return self.unread > 0 and now_s - self._stalled_since_s > STALLED_S
 
     def disconnect(
-        self,
-        reason: str,
-        penalty_s: float = 0.0,
-        end: Callable[[int, int], None] | None = None,
+        self, reason: str, penalty_s: float = 0.0, end: Callable[[int, int], None] | None = None
     ) -> None:
         """End the connection, and log the reason. Any thread may call this.
 
@@ -245,9 +242,7 @@ class ConnectionLimiter:
     """
 
     def __init__(
-        self,
-        extra_connections: int = 0,
-        is_service: Callable[[str], bool] = lambda key: False,
+        self, extra_connections: int = 0, is_service: Callable[[str], bool] = lambda key: False
     ) -> None:
         self._quota = ConnectionQuota(extra_connections, is_service)
         self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
@@ -407,10 +402,7 @@ def _exists(connection: Connection) -> bool:
 
 
 def _disconnect_heaviest(
-    connections: Iterable[Connection],
-    measure: Callable[[Connection], int],
-    limit: int,
-    reason: str,
+    connections: Iterable[Connection], measure: Callable[[Connection], int], limit: int, reason: str
 ) -> int:
     """Disconnect peers until the sum of a measure is within its limit; return the sum.
 

@@ -78,9 +78,7 @@ def _has_role(grant: Grant, name: str) -> bool:
 
 
 def answer_handshakes(
-    context: zmq.Context[zmq.Socket[bytes]],
-    zap: Zap | None,
-    is_blocked: Callable[[str], bool],
+    context: zmq.Context[zmq.Socket[bytes]], zap: Zap | None, is_blocked: Callable[[str], bool]
 ) -> None:
     """Start a thread that answers libzmq's requests until the context ends.
 

@@ -83,8 +83,7 @@ def materials_of(
 
 def _material(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> Material:
     return Material(
-        kind,
-        [(samples, np.full(-(-len(samples) // SLICE), is_voice)) for samples in recordings],
+        kind, [(samples, np.full(-(-len(samples) // SLICE), is_voice)) for samples in recordings]
     )
 
 

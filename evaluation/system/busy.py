@@ -112,11 +112,7 @@ class Busy:
 
 
 def measure(
-    paths: Sequence[Path],
-    programs: Sequence[int],
-    load_s: float,
-    after_s: float,
-    console: Console,
+    paths: Sequence[Path], programs: Sequence[int], load_s: float, after_s: float, console: Console
 ) -> Busy:
     """Start all services, and speak while each number of busy programs runs.
 

@@ -192,11 +192,7 @@ FAULTS = {
 
 
 def measure(
-    path: Path,
-    names: Collection[str],
-    logs: Path | None,
-    console: Console,
-    timing: Timing,
+    path: Path, names: Collection[str], logs: Path | None, console: Console, timing: Timing
 ) -> Iterator[Outcome]:
     """Stream an audio file during faults, one after another; yield the effects of each.
 

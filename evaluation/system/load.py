@@ -102,12 +102,7 @@ class Load:
         }
 
 
-def measure(
-    paths: Sequence[Path],
-    num_sessions: int,
-    step_s: float,
-    console: Console,
-) -> Load:
+def measure(paths: Sequence[Path], num_sessions: int, step_s: float, console: Console) -> Load:
     """Start control, a recognizer and a synthesizer, put them under load, return the figures.
 
     The last step has ``num_sessions``; each is measured for ``step_s``. Raises UserError if a file

@@ -53,8 +53,7 @@ def speak(
     ],
     session: Annotated[str, typer.Option(help="Name of the session.")] = "",
     record: Annotated[
-        bool,
-        typer.Option("--record", help="Record the face: the driver writes <session>.mp4."),
+        bool, typer.Option("--record", help="Record the face: the driver writes <session>.mp4.")
     ] = False,
     fast: Annotated[
         bool, typer.Option("--fast", help="Send as fast as possible instead of in real time.")
@@ -136,8 +135,7 @@ def devices() -> None:
 
 def listen(
     session: Annotated[
-        str,
-        typer.Argument(help="Name of the session. It may open later. Default: the newest."),
+        str, typer.Argument(help="Name of the session. It may open later. Default: the newest.")
     ] = "",
     show: Annotated[
         ListenOutput,

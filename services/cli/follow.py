@@ -9,13 +9,7 @@ from typing import TypeVar
 import numpy as np
 from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 
-from kouxing.services.cli.curves import (
-    CURVE_EXPORTERS,
-    CurveExporter,
-    Curves,
-    Row,
-    json_line,
-)
+from kouxing.services.cli.curves import CURVE_EXPORTERS, CurveExporter, Curves, Row, json_line
 from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
 from kouxing.services.cli.streaming import missed_remark
 from kouxing.shared.clock import to_seconds

@@ -28,8 +28,7 @@ def export_head(
     glb: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE",
-            help="File to write: .glb, or .vrm for an avatar. With --all, a folder.",
+            metavar="FILE", help="File to write: .glb, or .vrm for an avatar. With --all, a folder."
         ),
     ],
     head: HeadName = DEFAULT_HEAD,

@@ -309,8 +309,7 @@ def lips(
         ),
     ] = None,
     speech_to_text: Annotated[
-        Path | None,
-        typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text."),
+        Path | None, typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text.")
     ] = None,
     track: AudioTrack = None,
     force: Force = False,

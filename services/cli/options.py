@@ -15,8 +15,7 @@ DEFAULT_HEAD = DriverConfig().head
 HeadName = Annotated[
     str,
     typer.Option(
-        "--head",
-        help=f"{', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz).",
+        "--head", help=f"{', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz)."
     ),
 ]
 AudioTrack = Annotated[

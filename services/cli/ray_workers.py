@@ -44,9 +44,7 @@ class Worker:
         folders = dict.fromkeys(("CREDENTIALS_DIRECTORY", "XDG_STATE_HOME"), str(self._folder))
         self._draining = False
         self._process = ServiceProcess(
-            kind,
-            environment={**os.environ, **environment, **folders},
-            stdin=subprocess.DEVNULL,
+            kind, environment={**os.environ, **environment, **folders}, stdin=subprocess.DEVNULL
         )
         threading.Thread(target=self._watch_process, daemon=True).start()
 

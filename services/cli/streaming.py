@@ -7,12 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from kouxing_client import (
-    Client,
-    KouxingError,
-    Phone,
-    Refused,
-)
+from kouxing_client import Client, KouxingError, Phone, Refused
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -56,10 +51,7 @@ def stream(
     """
     with connect(control) as client:
         return _Streaming(client, source, console).run(
-            record=record,
-            name=session,
-            paced=paced,
-            mouth_profile=mouth_profile or None,
+            record=record, name=session, paced=paced, mouth_profile=mouth_profile or None
         )
 
 

@@ -30,13 +30,7 @@ from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
-from kouxing.shared.wire.control import (
-    Event,
-    EventName,
-    Heartbeat,
-    HeartbeatReply,
-    SessionStarted,
-)
+from kouxing.shared.wire.control import Event, EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (

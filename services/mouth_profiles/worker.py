@@ -20,9 +20,7 @@ def learn_from_landmarks(recording: bytes) -> tuple[bytes, dict[str, object]]:
     Raises UserError if the content is invalid or has too little speech with lips in view.
     """
     # Imported here, so that the gateway itself does not load the models.
-    from kouxing.services.mouth_profiles.landmark_file import (  # noqa: PLC0415
-        parse_landmark_file,
-    )
+    from kouxing.services.mouth_profiles.landmark_file import parse_landmark_file  # noqa: PLC0415
     from kouxing.services.mouth_profiles.learning import learn_mouth_profile  # noqa: PLC0415
 
     learned = learn_mouth_profile([parse_landmark_file(recording)])

@@ -19,10 +19,7 @@ _COLUMNS = ("index", "phone", "onset_s", "duration_s", "confidence")
 
 
 def format_phones(
-    phones: Sequence[Phone],
-    style: str,
-    total_s: float,
-    syllables: Sequence[TimedSyllable] = (),
+    phones: Sequence[Phone], style: str, total_s: float, syllables: Sequence[TimedSyllable] = ()
 ) -> str:
     """Write the spoken phones, in order, as ``table``, ``csv``, ``json`` or ``textgrid``.
 
@@ -78,9 +75,7 @@ _Interval: TypeAlias = tuple[float, float, str]  # start and end in seconds, tex
 
 
 def _textgrid(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]) -> str:
-    tiers = {
-        "phones": [(p.onset_s, p.onset_s + p.duration_s, p.symbol) for p in phones],
-    }
+    tiers = {"phones": [(p.onset_s, p.onset_s + p.duration_s, p.symbol) for p in phones]}
     if syllables:
         ends_s = [syllable.onset_s + syllable.duration_s for syllable in syllables]
         tiers = {

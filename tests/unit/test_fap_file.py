@@ -72,10 +72,7 @@ def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
         (["2.1 x 25 1", mask(3), "0 one"], "line 3: a value is not a number"),
         (["2.1 x 25 1", mask(3), "x 1"], "line 3: 'x' is not a frame number"),
         (["2.1 x 25 2", mask(3), "0 1", mask(3), "5 1"], "line 5: found frame 5, expected frame 1"),
-        (
-            ["2.1 x 25 1", mask(3), "0 1", mask(3)],
-            "line 4: more frames than the header states: 1",
-        ),
+        (["2.1 x 25 1", mask(3), "0 1", mask(3)], "line 4: more frames than the header states: 1"),
     ],
 )
 def test_error_names_line_and_reason(tmp_path: Path, lines: list[str], complaint: str) -> None:

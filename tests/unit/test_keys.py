@@ -153,10 +153,7 @@ def test_creates_no_key_for_control_on_another_machine() -> None:
         ),
         (lambda folder: (folder / "control.key").unlink(), r"control\.key .*rm -r .*kouxing"),
         (lambda folder: (folder / "lamp.key").unlink(), r"another key has the name 'lamp'"),
-        (
-            lambda folder: (folder / "lamp.key").chmod(0),
-            r"no permission .*chmod 600 .*lamp",
-        ),
+        (lambda folder: (folder / "lamp.key").chmod(0), r"no permission .*chmod 600 .*lamp"),
         (lambda folder: (folder / "allowed").write_text("no key"), r"delete this line.*rm -r "),
     ],
 )

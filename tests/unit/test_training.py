@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from kouxing.corpora.speech_corpus import (
-    RowErrors,
-    may_ship,
-    read_corpus,
-)
+from kouxing.corpora.speech_corpus import RowErrors, may_ship, read_corpus
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.search.forced_path import (
-    utterance_graph,
-    viterbi_path,
-)
+from kouxing.services.recognizer.search.forced_path import utterance_graph, viterbi_path
 from kouxing.shared.errors import UserError
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
