@@ -90,6 +90,7 @@ class AudioSessions:
         self._warn = warn
         self._client: AsyncClient | None = None
         self._open: dict[str, AudioSession] = {}
+        self.num_opening = 0  # sessions that control has not confirmed yet
 
     @contextlib.asynccontextmanager
     async def open(self, session: str = "", **options: object) -> AsyncIterator[AudioSession]:
@@ -104,10 +105,14 @@ class AudioSessions:
                 insecure=self._key is None,
                 timeout_s=CONTROL_TIMEOUT_S,
             )
-        opened = AudioSession(
-            await self._client.open_session(session, **options),  # type: ignore[arg-type]
-            self._warn,
-        )
+        self.num_opening += 1
+        try:
+            opened = AudioSession(
+                await self._client.open_session(session, **options),  # type: ignore[arg-type]
+                self._warn,
+            )
+        finally:
+            self.num_opening -= 1
         self._open[opened.name] = opened
         try:
             yield opened

@@ -7,7 +7,7 @@ configuration. It cannot make the gateway send to arbitrary hosts.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -23,13 +23,24 @@ from kouxing.shared.logs import LOG
 
 
 class SendersApi:
-    """Sends the face that the gateway shows to other programs, and reports their state."""
+    """Sends the face that the gateway shows to other programs, and reports their state.
 
-    def __init__(self, urls: Iterable[str], idle_motion_seed: int) -> None:
+    ``on_started`` is called when a page starts a sender.
+    """
+
+    def __init__(
+        self, urls: Iterable[str], idle_motion_seed: int, on_started: Callable[[], None]
+    ) -> None:
         self._configured = {url: parse_target(url) for url in urls}
+        self._on_started = on_started
         self._senders = Senders(idle_motion_seed, _log_problem)
         for target in self._configured.values():
             self._senders.start(target)
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether any program receives the face."""
+        return self._senders.is_sending
 
     def send_frame(self, media_time: int, values: bytes) -> None:
         """Send a frame: 68 little-endian float32, FAP units."""
@@ -55,6 +66,7 @@ class SendersApi:
             start, stop, delay_ms = (command.get(key) for key in ("start", "stop", "delay_ms"))
             if isinstance(start, str):
                 self._senders.start(self._allowed_target(start))
+                self._on_started()
             elif isinstance(stop, str):
                 self._senders.stop(stop)
             elif isinstance(delay_ms, int | float):

@@ -60,11 +60,12 @@ CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes
 
 @dataclass(slots=True)
 class _FollowedSession:
-    """A session that the gateway subscribes to."""
+    """A session. The gateway subscribes to it from when somebody needs it until it ends."""
 
     start: StartSession
     follower: ServiceFollower
     syllables: SyllableTrack
+    is_followed: bool = False
 
 
 class GatewayService(Service):
@@ -106,7 +107,7 @@ class GatewayService(Service):
         )
         self._mouth_learner = MouthLearner()
         self._sound_upload = SoundUpload()
-        self._senders = SendersApi(config.senders, config.idle_motion_seed)
+        self._senders = SendersApi(config.senders, config.idle_motion_seed, self.waker.wake)
         self._routes = (
             web.get("/viewer", self._viewers.serve),
             web.get("/microphone", self._microphones.serve),
@@ -201,14 +202,27 @@ class GatewayService(Service):
     # --- from control ----------------------------------------------------------------------------
 
     def start_session(self, start: StartSession) -> bool:
-        """Subscribe to a session; confirm when the subscriptions are in effect."""
+        """Subscribe to a session that somebody needs; confirm when this is in effect."""
         session = self._sessions.get(start.session)
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
         session.start = start
-        session.follower.start(start.epoch, start.endpoints)
         self._viewers.add_session(start.session, start.epoch, start.face.lip_model or "")
-        return False
+        is_needed = start.session in self._needed_sessions() or self._audio_sessions.num_opening
+        if session.is_followed or is_needed:
+            self._follow(session)
+        return not session.is_followed
+
+    def _follow(self, session: _FollowedSession) -> None:
+        session.is_followed = True
+        session.follower.start(session.start.epoch, session.start.endpoints)
+
+    def _needed_sessions(self) -> set[str]:
+        """Return the sessions that are shown or sent to other programs."""
+        needed = {*self._viewers.shown_sessions}
+        if self._senders.is_sending:
+            needed.add(self._viewers.newest)
+        return needed
 
     def stop_session(self, session: str) -> None:
         """Unsubscribe from a session and notify its viewers and its microphone."""
@@ -244,7 +258,10 @@ class GatewayService(Service):
         return dict.fromkeys(self._sessions, SessionInput())
 
     def on_tick(self, now_s: float) -> float:
-        """Move the face at rest, and request the status of the services."""
+        """Follow sessions, move the face at rest, and request the status of the services."""
+        for name in self._needed_sessions() & self._sessions.keys():
+            if not self._sessions[name].is_followed:
+                self._follow(self._sessions[name])
         if self._viewers.has_viewers and now_s >= self._rest_due_s:
             self._rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
             self._viewers.show_rest(self._resting_face, now_s)
@@ -311,7 +328,7 @@ class GatewayService(Service):
     def _on_frame(self, frame: FapFrame) -> None:
         now_s = time.monotonic()
         self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values, now_s)
-        if frame.session == self._viewers.newest:
+        if self._senders.is_sending and frame.session == self._viewers.newest:
             self._senders.send_frame(frame.media_time, frame.values)
 
     def _on_sound(self, sound: Sound) -> None:

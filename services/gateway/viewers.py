@@ -149,6 +149,11 @@ class Viewers:
         return next(names, self._sample)
 
     @property
+    def shown_sessions(self) -> Iterator[str]:
+        """The sessions that viewers see."""
+        return (viewer.shown[0] for viewer in self._viewers if viewer.shown)
+
+    @property
     def has_viewers(self) -> bool:
         """Whether any browser is connected."""
         return bool(self._viewers)

@@ -118,9 +118,14 @@ class Senders:
         """Set the delay of all targets, in place of the delays in their addresses."""
         self._call(lambda: self._set_delay(delay_s))
 
+    @property
+    def is_sending(self) -> bool:
+        """Whether there are targets."""
+        return bool(self._senders)
+
     def show(self, session_time_s: float, faps: Faps) -> None:
         """Queue a frame (68,) of the session; return immediately."""
-        if self._senders:
+        if self.is_sending:
             self._loop.call_soon_threadsafe(self._add_frame, session_time_s, faps, time.monotonic())
 
     def express(self, strengths: Mapping[str, float], hold_s: float) -> None:

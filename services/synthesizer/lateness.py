@@ -12,7 +12,9 @@ from collections import deque
 from collections.abc import Iterable
 
 from kouxing.shared.metrics import percentile
+from kouxing.shared.wire.session import Lateness
 
+IN_TIME = Lateness(p50_ms=0.0, p95_ms=0.0, worst_ms=0.0)
 WINDOW_S = 10.0  # as in services/gateway/page/lateness.js
 
 
@@ -20,6 +22,7 @@ class LatenessMeter:
     """Measures the lateness of one session's newest frames. Times are in seconds."""
 
     def __init__(self) -> None:
+        self.newest: Lateness | None = None  # the newest measurement
         self._sent: deque[tuple[float, float]] = deque()  # when sent; clock minus media time
 
     def add(self, times_s: Iterable[float], now_s: float) -> None:
@@ -31,15 +34,18 @@ class LatenessMeter:
         """Record that the client sends no audio, so that media time stands still."""
         self._sent.clear()
 
-    def percentiles_ms(self, now_s: float) -> tuple[float, float, float] | None:
-        """Return the median, 95th percentile and maximum of the last 10 s, None without frames."""
+    def measure(self, now_s: float) -> Lateness | None:
+        """Return the lateness of the last 10 s, None without frames; keep it as ``newest``."""
         self._drop_old(now_s)
-        differences_s = sorted(difference_s for _, difference_s in self._sent)
-        if not differences_s:
-            return None
-        p50_s, p95_s, latest_s = (percentile(differences_s, percent) for percent in (50, 95, 100))
-        earliest_s = differences_s[0]
-        return 1e3 * (p50_s - earliest_s), 1e3 * (p95_s - earliest_s), 1e3 * (latest_s - earliest_s)
+        self.newest = None
+        differences_s = sorted([difference_s for _, difference_s in self._sent])
+        if differences_s:
+            p50_ms, p95_ms, worst_ms = (
+                1e3 * (percentile(differences_s, percent) - differences_s[0])
+                for percent in (50, 95, 100)
+            )
+            self.newest = Lateness(p50_ms=p50_ms, p95_ms=p95_ms, worst_ms=worst_ms)
+        return self.newest
 
     def _drop_old(self, now_s: float) -> None:
         while self._sent and self._sent[0][0] <= now_s - WINDOW_S:

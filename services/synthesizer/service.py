@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import itemgetter
+from operator import attrgetter
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from kouxing.services.lip_models import lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
+from kouxing.services.synthesizer.lateness import IN_TIME
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.bus import PHONES
@@ -45,7 +46,7 @@ from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of, is_report
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import ErrorCode, Lateness, SessionFacts
+from kouxing.shared.wire.session import ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import (
     AudioState,
     NewestFrame,
@@ -198,27 +199,22 @@ class SynthesizerService(Service):
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return, for each session, the end of its final phones, its lateness and skipped time."""
         now_s = time.monotonic()
-        inputs = {}
-        for name, session in self._sessions.items():
-            lateness = None
-            if percentiles := session.lateness.percentiles_ms(now_s):
-                p50_ms, p95_ms, worst_ms = percentiles
-                lateness = Lateness(p50_ms=p50_ms, p95_ms=p95_ms, worst_ms=worst_ms)
-            media_time = to_samples(session.final.time_s)
-            inputs[name] = SessionInput(
-                media_time=media_time, lateness=lateness, skipped_s=session.overload.skipped_s
+        return {
+            name: SessionInput(
+                media_time=to_samples(session.final.time_s),
+                lateness=session.lateness.measure(now_s),
+                skipped_s=session.overload.skipped_s,
             )
-        return inputs
+            for name, session in self._sessions.items()
+        }
 
     def gauges(self) -> dict[str, float]:
         """Return the lateness of the session with the greatest lateness."""
-        now_s = time.monotonic()
-        measured = [session.lateness.percentiles_ms(now_s) for session in self._sessions.values()]
-        latest = max(filter(None, measured), key=itemgetter(-1), default=(0.0, 0.0, 0.0))
-        names = ("p50", "p95", "worst")
+        measured = [session.lateness.newest for session in self._sessions.values()]
+        latest = max(filter(None, measured), key=attrgetter("worst_ms"), default=IN_TIME)
         return {
-            f"lateness_{name}_seconds": late_ms / 1e3
-            for name, late_ms in zip(names, latest, strict=True)
+            f"lateness_{name}_seconds": getattr(latest, f"{name}_ms") / 1e3
+            for name in ("p50", "p95", "worst")
         }
 
     def on_drain(self) -> bool:

@@ -1,12 +1,16 @@
 """Captions of live speech: combines phones and their revisions to syllables."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TypeAlias
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.known_text import Characters, match_syllables
+
+# phones, index of the character, first phone of the next syllable
+_Source: TypeAlias = tuple[list[Phone], int | None, list[Phone]]
 
 MAX_PHONES = 40  # that may still be revised; older ones are dropped
 
@@ -33,7 +37,8 @@ class SyllableTrack:
         self._characters = characters
         self._num_dropped = 0  # characters before the first kept phone
         self._phones: dict[int, Phone] = {}
-        self._syllables: dict[int, Syllable] = {}
+        # by index, with what they were made of
+        self._syllables: dict[int, tuple[_Source, Syllable]] = {}
 
     def reset(self) -> None:
         """Forget all phones when a session restarts."""
@@ -57,21 +62,26 @@ class SyllableTrack:
             self._syllables.pop(oldest[0].index, None)
             for dropped in oldest:
                 del self._phones[dropped.index]
-        syllables = {
-            group[0].index: self._syllable(group, place, following)
-            for place, (group, following) in zip(places, pairwise([*groups, []]), strict=True)
-        }
+        syllables, changed = {}, []
+        for place, (group, following) in zip(places, pairwise([*groups, []]), strict=True):
+            phones = (group, place, following[:1])
+            known_phones, known = self._syllables.get(group[0].index, (None, None))
+            syllable = known if known and phones == known_phones else self._syllable(*phones)
+            if syllable != known:
+                changed.append(syllable)
+            syllables[syllable.index] = phones, syllable
         withdrawn = [
-            Syllable(index=index, text=old.text, onset_s=old.onset_s, duration_s=0.0, final=True)
-            for index, old in self._syllables.items()
+            replace(old, duration_s=0.0, final=True)
+            for index, (_, old) in self._syllables.items()
             if index not in syllables
         ]
-        changed = [new for index, new in syllables.items() if self._syllables.get(index) != new]
         self._syllables = syllables
         return withdrawn + changed
 
     def _places(self, groups: list[list[Phone]]) -> list[int | None]:
         """Return the index of each syllable's character; None: it has no character."""
+        if not self._characters:
+            return [None] * len(groups)
         silence = (self.inventory.silence,)
         symbols = [tuple(phone.symbol for phone in group) for group in groups]
         spoken = [syllable for syllable in symbols if syllable != silence]
@@ -84,7 +94,7 @@ class SyllableTrack:
         first, last = phones[0], phones[-1]
         # The vowel of an initial may still follow.
         is_complete = last.symbol not in self.inventory.initials or any(
-            phone.final for phone in following[:1]
+            phone.final for phone in following
         )
         spelling = self.inventory.spell(tuple(phone.symbol for phone in phones))
         return Syllable(

@@ -25,14 +25,14 @@ class Stream:
 
     def late_ms(self) -> tuple[float, float, float]:
         """Return p50, p95 and the worst lateness, ms."""
-        percentiles_ms = self.meter.percentiles_ms(self.now_s)
-        assert percentiles_ms is not None
-        return percentiles_ms
+        lateness = self.meter.measure(self.now_s)
+        assert lateness is not None
+        return lateness.p50_ms, lateness.p95_ms, lateness.worst_ms
 
 
 def test_measures_lateness_relative_to_the_earliest_frame() -> None:
     stream = Stream()
-    assert stream.meter.percentiles_ms(stream.now_s) is None, "no frames"
+    assert stream.meter.measure(stream.now_s) is None, "no frames"
     stream.run(9.0)
     stream.run(0.9, late_s=0.1)
     stream.run(0.1, late_s=2.0)
@@ -44,7 +44,7 @@ def test_only_the_last_ten_seconds_count() -> None:
     stream.run(5.0, late_s=0.5)
     stream.run(11.0)
     assert max(stream.late_ms()) < 1.0
-    assert stream.meter.percentiles_ms(stream.now_s + 20.0) is None
+    assert stream.meter.measure(stream.now_s + 20.0) is None
 
 
 def test_a_growing_delay_stays_visible() -> None:
