@@ -1,7 +1,5 @@
 """The device that networks are trained on: a GPU if there is one."""
 
-from __future__ import annotations
-
 import torch
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

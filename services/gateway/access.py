@@ -1,7 +1,5 @@
 """Access control for HTTP requests: host names, origins of other pages, and the token."""
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Collection
 from dataclasses import dataclass

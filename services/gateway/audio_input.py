@@ -1,7 +1,5 @@
 """One client's audio on its way into a session, passed on at once or in real time."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator

@@ -1,7 +1,5 @@
 """The certificate for https: the configured one, or a self-signed one created on first use."""
 
-from __future__ import annotations
-
 import datetime
 import ipaddress
 import os

@@ -1,7 +1,5 @@
 """The gateway's configuration."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, ClassVar
 

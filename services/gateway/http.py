@@ -1,7 +1,5 @@
 """The web application: the page's files, its security policy, and open WebSockets."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import contextlib

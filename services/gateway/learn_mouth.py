@@ -4,8 +4,6 @@ The browser sends a landmark file (``docs/my_mouth.md``). A worker process learn
 Nothing is stored.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import multiprocessing

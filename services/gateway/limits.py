@@ -1,7 +1,5 @@
 """Limits on the number of connections, in total and from one address, and on their data."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

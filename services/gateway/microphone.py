@@ -1,7 +1,5 @@
 """Microphones: each WebSocket streams audio into a session of its own."""
 
-from __future__ import annotations
-
 import contextlib
 
 from aiohttp import WSCloseCode, WSMsgType, web

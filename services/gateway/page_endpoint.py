@@ -1,7 +1,5 @@
 """The page's endpoint: its URL, its certificate and its access policy."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 import ssl

@@ -1,7 +1,5 @@
 """The PCM format that a client announces, and checks that its data has this format."""
 
-from __future__ import annotations
-
 import base64
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The sample sentence: a recording that the gateway speaks in a session of its own."""
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 from importlib import resources

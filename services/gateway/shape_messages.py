@@ -1,7 +1,5 @@
 """Messages with a frame's blend-shape weights, in the set and format that a viewer asked for."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output."""
 
-from __future__ import annotations
-
 import resource
 import sys
 import wave

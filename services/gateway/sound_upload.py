@@ -4,8 +4,6 @@ The browser sends a file and receives 16-bit WAV, mono. A process of its own dec
 malicious file cannot harm the gateway. Nothing is stored.
 """
 
-from __future__ import annotations
-
 import asyncio
 import re
 import sys

@@ -1,7 +1,5 @@
 """The bounded queue of messages for one viewer. It favors new frames over complete delivery."""
 
-from __future__ import annotations
-
 import asyncio
 from collections import deque
 from enum import Enum

@@ -1,7 +1,5 @@
 """The gateway's HTTP server: it limits connections, closes idle ones, and answers errors."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import math

@@ -1,7 +1,5 @@
 """One WebRTC connection: audio track in, data channels out. Needs aiortc (extra ``webrtc``)."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import re

@@ -4,8 +4,6 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 16 kHz), then the payload at an offset that is a multiple of four.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

@@ -4,8 +4,6 @@ ZeroMQ loses messages in flight when a connection ends. A client that asks for a
 resends them. Until then, later messages are held for a limited time.
 """
 
-from __future__ import annotations
-
 from kouxing.shared.wire.audio import AudioChunk
 
 WAIT_S = 1.0  # for missing messages

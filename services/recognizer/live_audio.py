@@ -1,7 +1,5 @@
 """The audio of one live session that is queued for decoding."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Loads numba's runtime, which takes as long as loading the models."""
 
-from __future__ import annotations
-
 import sys
 
 from numba.core.registry import cpu_target

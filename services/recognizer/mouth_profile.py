@@ -21,8 +21,6 @@ Format in files and messages:
     rest      s, b and r: float16, little endian
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Opens ONNX files with onnxruntime, on one thread."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import onnxruntime

@@ -4,8 +4,6 @@ A new synthesizer in place of a lost one must continue the face. It gets the new
 published, and the messages of the last seconds again.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 from kouxing.shared.clock import to_samples

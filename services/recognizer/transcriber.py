@@ -4,8 +4,6 @@ Any speech recognizer can implement ``Transcriber``. This module uses sherpa-onn
 the user provides.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """Audio of sessions that are not paced. It waits while there is live audio to decode."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 

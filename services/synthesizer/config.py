@@ -1,7 +1,5 @@
 """The synthesizer's configuration."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import AfterValidator, Field

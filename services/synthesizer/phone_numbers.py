@@ -4,8 +4,6 @@ A recognizer that replaces a lost one numbers phones from 0. Phones of the lost 
 not final are void. If the new recognizer finds a void phone again, the phone keeps its index.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from kouxing.shared.phones.events import Phone

@@ -1,7 +1,5 @@
 """One session of the synthesizer: its face, and its position in the streams of messages."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """Conversion of audio bytes to samples and back, and the level and pitch of 20 ms slices."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ Source: P. Ghahremani et al., "A pitch extraction algorithm tuned for automatic 
 ICASSP 2014, as implemented in kaldi-native-fbank.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -46,8 +46,6 @@ so VTLN adds no delay to that of the features. The sums run in a fixed order, so
 depend on the chunks.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -24,8 +24,6 @@ these by up to 0.8, and the shipped networks were trained on these.
 Cost: about 1 ms per second of audio in chunks of 10 ms.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

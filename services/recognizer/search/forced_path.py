@@ -3,8 +3,6 @@
 Source: the HTK book (Young et al. 2009), chapter 8; used in Li et al. 2011, section 3.2, scheme 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

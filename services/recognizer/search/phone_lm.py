@@ -20,8 +20,6 @@ contexts: the nodes with children, and all single phones. A pause resets the con
 silence only as its first or last phone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple

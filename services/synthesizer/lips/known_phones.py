@@ -1,7 +1,5 @@
 """The known phones of a session, each in its newest revision."""
 
-from __future__ import annotations
-
 import math
 
 from kouxing.shared.phones.events import Phone, SpeechChange

@@ -5,8 +5,6 @@ model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_M
 ``services.lip_models``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 

@@ -1,7 +1,5 @@
 """Loads lip models by name."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 from kouxing.services.lip_models import lip_model_info

@@ -12,8 +12,6 @@ The rate acts twice. Blending makes fast visemes miss their targets, which expla
 the reduction in real lips; `_PER_RATE` is the other half (see docs/visemes.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

@@ -1,7 +1,5 @@
 """Requested expressions on a face that speaks."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -21,8 +21,6 @@ do not grow, so that the jaw does not drop too far. Horizontal movements are sma
 visible, so they count twice.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The interface of modifiers, which change a FAP frame after the lip model has set the mouth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -8,8 +8,6 @@ selects. A softmax over log weights replaces the quotient, because the silences'
 overflow.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 A closure that is late by less than ``_MAX_LATE_S`` is postponed to a time at which it can be shown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 

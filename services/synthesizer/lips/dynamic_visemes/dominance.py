@@ -19,8 +19,6 @@ softmax over log weights equals the papers' quotient. A short pause weakens its 
 closure rule is geometric instead of arithmetic (`log_closure`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

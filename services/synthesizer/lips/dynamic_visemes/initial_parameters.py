@@ -5,8 +5,6 @@ feature that defines a consonant dominates (closed lips for labials, closed teet
 Its other features yield to the vowel, more for consonants that are articulated further back.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns

@@ -4,8 +4,6 @@ Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta
 for closures C and T; per FAP the silence models; one exponent c.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path

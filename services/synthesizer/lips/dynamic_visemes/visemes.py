@@ -5,8 +5,6 @@ table 1, each named after a phone. The rounded variants of consonants before rou
 static targets in ``targets.tsv``, are from Crystal.TTVS (Tsinghua University, Apache-2.0).
 """
 
-from __future__ import annotations
-
 from importlib import resources
 
 import numpy as np

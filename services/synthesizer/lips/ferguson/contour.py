@@ -23,8 +23,6 @@ of Cupid's bow. The curves have free ends (natural splines). As in the paper, li
 vertically: the corners do not move, so /u/ is a small opening.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from functools import lru_cache

@@ -4,8 +4,6 @@ A drawing is a list of outlines and labels, in pixels, y downwards. ``svg`` and 
 convert it to the text of a file and to a picture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape

@@ -24,8 +24,6 @@ Martin, "Noise power spectral density estimation based on optimal smoothing and 
 floor in noise.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass

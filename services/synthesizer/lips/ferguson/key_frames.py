@@ -7,8 +7,6 @@ R is a smooth curve: a piecewise cubic without overshoot (PCHIP, Fritsch and But
 constructing local monotone piecewise cubic interpolants", 1984).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -15,8 +15,6 @@ influence       vowels: influence factor D of the level, 0 to 1; else empty
 =============== ===================================================================================
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass

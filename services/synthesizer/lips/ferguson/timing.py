@@ -11,8 +11,6 @@ cheapest assignment. Costs depend on the syllables' typical durations, at the ra
 recording, and on whether zero crossings match the first consonant of each syllable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

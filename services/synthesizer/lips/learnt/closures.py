@@ -12,8 +12,6 @@ Phones alone decide about lower lip to upper teeth (f), which the lip predictor 
 well.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

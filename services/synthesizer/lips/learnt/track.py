@@ -5,8 +5,6 @@ previous frame, so position and velocity are continuous without waiting for the 
 frames are missing, the mouth moves to rest and back.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass
 
