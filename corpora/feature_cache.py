@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -102,17 +103,21 @@ def _cached(
     rows, bounds = stem.with_suffix(".rows"), stem.with_suffix(".bounds.npy")
     if not (rows.is_file() and bounds.is_file()):
         num_rows = []
+
+        def compute(utterance: Utterance) -> NDArray[Any]:
+            with suppress(ValueError):
+                return block_of(read_audio(utterance.path))
+            return empty
+
         with rows.open("wb") as file:
-            for utterance in track(utterances, description=kind):
-                block = empty
-                with suppress(ValueError):
-                    block = block_of(read_audio(utterance.path))
+            blocks = process_in_order(compute, utterances)
+            for block in track(blocks, total=len(utterances), description=kind):
                 file.write(np.ascontiguousarray(block).tobytes())
                 num_rows.append(len(block))
         np.save(bounds, np.cumsum(num_rows))
     ends = np.load(bounds, allow_pickle=False)
     if not ends[-1]:
         return [empty] * len(ends)
-    blocks = np.memmap(rows, empty.dtype, "r").reshape(-1, *empty.shape[1:])
+    content = np.memmap(rows, empty.dtype, "r").reshape(-1, *empty.shape[1:])
     starts = [0, *ends[:-1]]
-    return [blocks[start:end] for start, end in zip(starts, ends, strict=True)]
+    return [content[start:end] for start, end in zip(starts, ends, strict=True)]

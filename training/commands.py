@@ -33,8 +33,8 @@ Whisper = Annotated[
 StartFrom = Annotated[
     Path | None,
     typer.Option(
-        help="Neural model that aligns the recordings and provides the HMMs and the phone language "
-        "model. Default: the shipped model."
+        help="Acoustic model that aligns the recordings and provides the phone language model. "
+        "Default: the shipped block model."
     ),
 ]
 Untranscribed = Annotated[
@@ -168,17 +168,20 @@ def blocks(
     whisper: Whisper,
     start_from: StartFrom = None,
     untranscribed: Untranscribed = None,
+    sounds: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of music and noise for the background; repeatable."),
+    ] = None,
     seed: Seed = 0,
-    readout_steps: Annotated[
-        int, typer.Option(min=1, help="Number of batches of 70 s of audio for the first readout.")
-    ] = 450,
-    steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 450,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Number of steps, each with 256 s of audio.")
+    ] = 1000,
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
     """Train the block model, and write its model card.
 
-    Repeat the command to resume an interrupted run.
+    Repeat the command to resume an interrupted run. It may have another number of steps.
     """
     with _neural_training(output, force=force):
         from kouxing.training.blocks.recipe import train_blocks
@@ -189,8 +192,8 @@ def blocks(
         whisper=whisper,
         start=start_from,
         untranscribed=untranscribed or [],
+        sounds=sounds or [],
         seed=seed,
-        num_readout_steps=readout_steps,
         num_steps=steps,
         shipping=not any_license,
     )

@@ -16,8 +16,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import onnx_of
-from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
-from kouxing.training.blocks.readout import READOUT
+from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, layout
 from kouxing.training.neural.network import Shape
 from tests.system import DEMO
 

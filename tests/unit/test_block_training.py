@@ -1,5 +1,6 @@
 """Training of the block model: its network in PyTorch, its batches, tuning, the recipe."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.errors import UserError
-from kouxing.training.blocks import batches, readout
+from kouxing.training.blocks import batches, recipe
+from kouxing.training.blocks.batches import Material, block_batch
 from kouxing.training.blocks.recipe import train_blocks
 from kouxing.training.neural import optimizer, teacher
+from kouxing.training.neural.batches import Recording, Targets
 from kouxing.training.neural.network import ReadoutShape
 from tests.unit.test_block_model import HELLO, SMALL
+from tests.unit.test_ear_training import write_sounds
 from tests.unit.test_neural_training import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 
@@ -22,46 +25,90 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL_READOUT = ReadoutShape(inner=48, gru=24, dropout=0.2, noise=0.15)
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "BATCH_S", 2)
     monkeypatch.setattr(batches, "_LENGTHS", (30, 40))
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 2)
-    monkeypatch.setattr(readout, "READOUT", SMALL_READOUT)
-    monkeypatch.setattr(readout, "BATCH_S", 3)
-    monkeypatch.setattr(readout, "MAX_WINDOW_FRAMES", 80)
-    monkeypatch.setattr(readout, "_FIXED_FRAMES", 50)
+    monkeypatch.setattr(recipe, "READOUT", SMALL_READOUT)
+    monkeypatch.setattr(recipe, "_SUNG_SHARE", 2)
+    monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick")
-def test_trains_and_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("start", ["gmm", "blocks"])
+def test_trains_resumes_and_writes_model_and_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: str
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("kouxing.training.neural.initial_network.Shape", SMALL)
-    monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
     corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
-    whisper = write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6))
     output = tmp_path / "blocks.npz"
     lines: list[str] = []
-    train_blocks(
-        [corpus], output, whisper=whisper, untranscribed=[corpus],
-        seed=1, num_readout_steps=4, num_steps=2, report=lines.append,
-    )  # fmt: skip
+    train = partial(
+        train_blocks,
+        [corpus],
+        output,
+        whisper=write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6)),
+        start=model_path(start),
+        untranscribed=[corpus],
+        sounds=[write_sounds(tmp_path / "sounds")],
+        seed=1,
+        report=lines.append,
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "onnx_of", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(num_steps=2)
+    train(num_steps=3)
+    assert "resuming after step 2" in lines
     assert "5 of 5 recordings labeled by the teacher" in lines
+    assert "3 of 3 recordings sung" in lines
     model = load_model(output)
     assert isinstance(model, BlockModel)
     stream = model.create_stream()
     frames = WhisperMel().accept_waveform(HELLO)
     assert len(stream.score(frames)) + len(stream.score(None)) == len(frames)
-    np.testing.assert_array_equal(model.topology.log_stay, load_model().topology.log_stay)
     card = output.with_suffix(".md").read_text()
-    assert "4 steps of the readout, 2 of" in card
-    assert "on 5 recordings of 0 minutes drawn from those below" in card
+    assert f"3 steps of 256 s of sound, aligned by `{start}.npz`, on 8 recordings" in card
     assert "CC0-1.0" in card
     left = {path.name for path in tmp_path.iterdir() if path.is_file()}
     assert left == {"blocks.npz", "blocks.md"}
 
 
-def test_needs_a_neural_model_to_start_from(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="is not a neural model; give one from"):
-        train_blocks([], tmp_path / "b.npz", whisper=tmp_path, start=model_path("gmm"))
+def interrupt(*_arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
+def recording(num_frames: int) -> Recording:
+    """Samples and targets that count up, so that each frame has its number as its target."""
+    samples = np.repeat(np.arange(num_frames + 2, dtype=np.int16), 160)[: 160 * num_frames + 240]
+    return Recording(samples=samples, targets=Targets.hard(np.arange(num_frames)), weight=1.0)
+
+
+def test_batches_of_a_step_have_one_shape_and_can_be_drawn_again() -> None:
+    noise = np.random.default_rng(0).integers(-999, 999, 16_000).astype(np.int16)
+    material = Material([recording(90), recording(700)], [noise])
+    step = [block_batch(material, 3, number) for number in range(8, 16)]
+    assert len({(one.frames.shape, one.block, one.start) for one in step}) == 1
+    assert not np.array_equal(step[0].frames, step[1].frames)
+    again = block_batch(material, 3, 8)
+    for name in ("frames", "clean", "states", "probs"):
+        array = getattr(step[0], name)
+        np.testing.assert_array_equal(array, getattr(again, name))
+        assert np.isfinite(array).all()
+
+
+@pytest.mark.parametrize(("tempo", "shortening"), [(0.8, 0.0), (1.3, 0.0), (1.2, 0.8)])
+def test_faster_speech_keeps_the_order_of_its_frames(tempo: float, shortening: float) -> None:
+    frames = np.random.default_rng(0).normal(size=(300, 160)).astype(np.float32)
+    frames[60:200] = 0.5  # steady
+    kept = batches._shorten(frames, tempo, shortening, 100)
+    assert len(kept) == 100
+    assert (np.diff(kept) >= 0).all()
+    assert kept[-1] < 300
+    if shortening:
+        steps = np.diff(kept)
+        assert steps[(kept[1:] > 70) & (kept[1:] < 190)].mean() > 2 * steps[kept[1:] < 50].mean()
+    else:
+        assert kept[-1] == pytest.approx(100 * tempo, abs=2)

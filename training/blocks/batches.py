@@ -1,7 +1,7 @@
 """Batches for the block network: clean speech for the teacher, disturbed speech for the network.
 
-The disturbances are those of :mod:`kouxing.training.neural.augmentation`, and background speech,
-clipping and lossy coding.
+The disturbances are those of :mod:`kouxing.training.neural.augmentation`, and background music and
+voices, clipping and lossy coding.
 
 An excerpt is cut from the concatenated recordings, and its speed is drawn. The teacher sees it
 clean, and slightly longer than the network does. A tempo is drawn for the frames of both. Every
@@ -17,10 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import soundfile
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
@@ -28,7 +26,6 @@ from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_M
 from kouxing.training.neural.augmentation import (
     Samples,
     change_speed,
-    change_tempo,
     disturb,
     scale_level,
     source_frames,
@@ -36,64 +33,108 @@ from kouxing.training.neural.augmentation import (
 from kouxing.training.neural.batches import Recording, Targets, sampling_probs
 
 BATCH_S = 32
+BATCHES_PER_STEP = 8
 _POSITIONS_PER_S = 50
 _LENGTHS = (80, 120, 160, 200)  # positions of an excerpt
 _BEYOND = 25  # further positions that only the teacher sees
-_BLOCK_LENGTHS, _BLOCK_PROBS = (5, 10, 20), (0.2, 0.4, 0.4)
+# lengths of a block and its right context, positions: live, then offline
+_BLOCKS = ((2, 14), (3, 12), (4, 12), (5, 10), (10, 10), (20, 10), (40, 10))
+_BLOCK_PROBS = (0.25, 0.1, 0.1, 0.15, 0.1, 0.2, 0.1)
 _FROM_START_PROB = 0.5  # of a recording
 _FIRST_ROW_PROB, _MAX_START = 0.7, 1200  # row of the table of positions
+_MAX_SPEED = 1.2
 _DISTURB_PROB, _TEMPO_PROB, _HURRY_PROB = 0.9, 0.3, 0.4
-_MAX_STRETCH = 2.2  # frames needed for an excerpt of any speed and tempo
-_MAX_SHORTENING = 0.7  # of a frame that resembles its neighbors
+_MIN_LOG_TEMPO, _MAX_LOG_TEMPO = -0.2, 0.3
+_MAX_SHORTENING = 0.8  # of a frame that resembles its neighbors
+_MEAN_STEADINESS = 0.6
 _STEADY_FRAMES = 5  # steadiness is averaged over them
 _TEACHER_PEAK = 0.5
-_BABBLE_PROB, _MAX_VOICES, _MIN_BABBLE_DB, _MAX_BABBLE_DB = 0.15, 3, 0.0, 20.0
+_MUSIC_PROB, _BABBLE_PROB, _MAX_VOICES = 0.25, 0.15, 4
+_MIN_SNR_DB, _MAX_SNR_DB = 0.0, 20.0
 _CLIP_PROB, _MIN_CLIPPED = 0.1, 0.15  # lowest limit, of the peak
-_CODEC_PROB = 0.2
+_CODEC_PROB = 0.12
 _CODED_PEAK, _MIN_COMPRESSION, _MAX_COMPRESSION = 0.5, 0.3, 0.98
 _CODECS = (("MP3", "MPEG_LAYER_III"), ("OGG", "OPUS"))
 _TINY = 1e-9
 
 Floats = NDArray[np.float32]
+Integers = NDArray[np.int16]
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """The recordings, and sounds for their background, that batches are drawn from."""
+
+    recordings: Sequence[Recording]
+    backgrounds: Sequence[Integers] = ()  # music and noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockBatch:
     """Excerpts of a step."""
 
-    frames: Tensor  # (batch, 2 positions + 1, 80), the network's input
-    clean: Tensor  # (batch, 80, more frames), the teacher's input
-    states: Tensor  # (batch, positions, 2, k), the targets
-    probs: Tensor  # (batch, positions, 2, k)
-    block_length: int
+    frames: NDArray[np.float16]  # (batch, 2 positions + 1, 80), the network's input
+    clean: NDArray[np.float16]  # (batch, 80, more frames), the teacher's input
+    states: NDArray[np.int16]  # (batch, positions, 2, k), the targets
+    probs: NDArray[np.float16]  # (batch, positions, 2, k)
+    block: tuple[int, int]  # lengths of a block and its right context, positions
     start: int  # row of the first position
 
 
-def block_batch(recordings: Sequence[Recording], seed: int, number: int) -> BlockBatch:
-    """Draw the batch with this number."""
-    rng = np.random.default_rng([seed, number])
-    probs = sampling_probs(recordings)
-    length = int(rng.choice(_LENGTHS))
+def block_batch(material: Material, seed: int, number: int) -> BlockBatch:
+    """Draw the batch with this number; the batches of a step have the same shape."""
+    of_step = np.random.default_rng([seed, number // BATCHES_PER_STEP])
+    length = int(of_step.choice(_LENGTHS))
+    block = _BLOCKS[int(of_step.choice(len(_BLOCKS), p=_BLOCK_PROBS))]
+    start = 0 if of_step.random() < _FIRST_ROW_PROB else int(of_step.integers(_MAX_START))
+    rng = np.random.default_rng([seed, 1, number])
+    probs = np.cumsum(sampling_probs(material.recordings))
     num_frames = 2 * (length + _BEYOND) + 1
     disturbed, clean, states, target_probs = [], [], [], []
     for _ in range(_POSITIONS_PER_S * BATCH_S // length):
-        samples, targets = _speech(recordings, probs, math.ceil(_MAX_STRETCH * num_frames), rng)
-        both, source = _frames(samples, len(targets), recordings, rng)
-        bands = both[:num_frames, :NUM_MELS]
+        both, targets = _excerpt(material, probs, num_frames, rng)
+        bands = both[:, :NUM_MELS]
         clean.append(np.maximum(bands, bands.max() - FLOOR_BANDS).T)
         disturbed.append(both[: 2 * length + 1, NUM_MELS:])
-        target = targets.of(source[: 2 * length])
-        states.append(target.states.astype(np.int64))
-        target_probs.append(target.probs.astype(np.float32))
+        states.append(targets.states[: 2 * length])
+        target_probs.append(targets.probs[: 2 * length])
     shape = len(states), length, 2, -1
     return BlockBatch(
-        frames=torch.from_numpy(np.stack(disturbed)),
-        clean=torch.from_numpy(np.stack(clean)),
-        states=torch.from_numpy(np.stack(states)).view(*shape),
-        probs=torch.from_numpy(np.stack(target_probs)).view(*shape),
-        block_length=int(rng.choice(_BLOCK_LENGTHS, p=_BLOCK_PROBS)),
-        start=0 if rng.random() < _FIRST_ROW_PROB else int(rng.integers(_MAX_START)),
+        frames=np.stack(disturbed).astype(np.float16),
+        clean=np.stack(clean).astype(np.float16),
+        states=np.stack(states).astype(np.int16).reshape(shape),
+        probs=np.stack(target_probs).reshape(shape),
+        block=block,
+        start=start,
     )
+
+
+def _excerpt(
+    material: Material, probs: NDArray[np.float64], num_frames: int, rng: np.random.Generator
+) -> tuple[Floats, Targets]:
+    """Draw an excerpt: frames, clean and disturbed, (num_frames, 160), and their targets."""
+    tempo, shortening = 1.0, 0.0
+    draw = rng.random()
+    if draw < _TEMPO_PROB + _HURRY_PROB:
+        tempo = math.exp(rng.uniform(_MIN_LOG_TEMPO, _MAX_LOG_TEMPO))
+    if _TEMPO_PROB <= draw < _TEMPO_PROB + _HURRY_PROB:
+        tempo = max(tempo, 1.0)
+        shortening = rng.uniform(0, _MAX_SHORTENING)
+    stretch = tempo / (1 - _MEAN_STEADINESS * shortening)
+    num_source = math.ceil(_MAX_SPEED * stretch * num_frames) + 2
+    samples, targets = _speech(material.recordings, probs, num_source, rng)
+    sound, speed = change_speed(samples, rng)
+    sound = sound[: HOP_SAMPLES * (math.ceil(stretch * num_frames) + 3)]
+    sound = (sound * (_TEACHER_PEAK / (np.abs(sound).max() + _TINY))).astype(np.float32)
+    disturbed = sound
+    if rng.random() < _DISTURB_PROB:
+        disturbed = _distort(disturb(_add_background(sound, material, rng), rng), rng)
+    frames = np.hstack(
+        [WhisperMel().accept_waveform(one) for one in (sound, scale_level(disturbed, rng))]
+    )
+    kept = _shorten(frames, tempo, shortening, num_frames)
+    source = source_frames(len(frames), speed, len(targets))
+    return frames[kept], targets.of(source[kept])
 
 
 def _speech(
@@ -102,11 +143,14 @@ def _speech(
     num_frames: int,
     rng: np.random.Generator,
 ) -> tuple[Samples, Targets]:
-    """Draw recordings until they fill the frames; the first may start anywhere."""
+    """Draw recordings until they fill the frames; the first may start anywhere.
+
+    ``probs`` are cumulative.
+    """
     sounds, states, target_probs = [], [], []
     missing = num_frames
     while missing > 0:
-        recording = recordings[int(rng.choice(len(probs), p=probs))]
+        recording = recordings[int(np.searchsorted(probs, rng.random() * probs[-1]))]
         size = len(recording.targets)
         start_frame = 0
         if missing == num_frames and size > num_frames and rng.random() >= _FROM_START_PROB:
@@ -121,56 +165,40 @@ def _speech(
     return as_floats(np.concatenate(sounds)), targets
 
 
-def _frames(
-    samples: Samples, num_source: int, recordings: Sequence[Recording], rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Compute frames, clean and disturbed, (n, 160), and their source frames, (n,)."""
-    sound, speed = change_speed(samples, rng)
-    sound = (sound * (_TEACHER_PEAK / (np.abs(sound).max() + _TINY))).astype(np.float32)
-    disturbed = sound
-    if rng.random() < _DISTURB_PROB:
-        disturbed = _distort(disturb(_add_babble(sound, recordings, rng), rng), rng)
-    frames = np.hstack(
-        [WhisperMel().accept_waveform(one) for one in (sound, scale_level(disturbed, rng))]
-    )
-    source = source_frames(len(frames), speed, num_source)
-    draw = rng.random()
-    if draw < _TEMPO_PROB + _HURRY_PROB:
-        frames, changed = (change_tempo if draw < _TEMPO_PROB else _shorten_steady_sounds)(
-            frames, rng
-        )
-        source = source[changed]
-    return frames, source
+def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -> NDArray[np.int64]:
+    """Choose the frames of faster speech, (num_frames,).
 
-
-def _shorten_steady_sounds(
-    frames: Floats, rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Shorten steady sounds, like fast speakers.
-
-    Return frames, (m, k), and their source frames, (m,).
+    Steady sounds, which resemble their neighbors, are shortened more, like fast speakers do.
     """
-    change = np.abs(np.diff(frames[:, :NUM_MELS], axis=0, prepend=frames[:1, :NUM_MELS]))
-    change = uniform_filter1d(change.mean(axis=1), _STEADY_FRAMES)
-    steady = 1 / (1 + np.square(change / (np.median(change) + _TINY)))
-    durations = 1 - rng.uniform(0, _MAX_SHORTENING) * steady
+    durations = np.full(len(frames), 1 / tempo)
+    if shortening:
+        change = np.abs(np.diff(frames[:, :NUM_MELS], axis=0, prepend=frames[:1, :NUM_MELS]))
+        change = uniform_filter1d(change.mean(axis=1), _STEADY_FRAMES)
+        durations *= 1 - shortening / (1 + np.square(change / (np.median(change) + _TINY)))
     ends = np.cumsum(durations)
-    kept = np.searchsorted(ends, np.arange(ends[0], ends[-1]))
-    return frames[kept], kept
+    ends *= max(1.0, num_frames / ends[-1])
+    kept = np.searchsorted(ends, np.arange(num_frames) + 0.5)
+    return np.minimum(kept, len(frames) - 1)
 
 
-def _add_babble(
-    sound: Samples, recordings: Sequence[Recording], rng: np.random.Generator
-) -> Samples:
-    if rng.random() >= _BABBLE_PROB:
+def _add_background(sound: Samples, material: Material, rng: np.random.Generator) -> Samples:
+    """Add music, noise or other voices of random levels, or nothing."""
+    draw = rng.random()
+    if draw < _BABBLE_PROB:
+        numbers = rng.integers(len(material.recordings), size=int(rng.integers(1, _MAX_VOICES + 1)))
+        others: list[Integers] = [material.recordings[number].samples for number in numbers]
+    elif draw < _BABBLE_PROB + _MUSIC_PROB and material.backgrounds:
+        others = [material.backgrounds[int(rng.integers(len(material.backgrounds)))]]
+    else:
         return sound
-    babble = np.zeros_like(sound)
-    for _ in range(int(rng.integers(1, _MAX_VOICES + 1))):
-        voice = as_floats(recordings[int(rng.integers(len(recordings)))].samples)
-        babble += np.resize(voice, len(sound)) / (np.sqrt(np.mean(voice**2)) + _TINY)
-    below_db = rng.uniform(_MIN_BABBLE_DB, _MAX_BABBLE_DB)
-    level = np.sqrt(np.mean(sound**2) / np.mean(babble**2)) * 10 ** (-below_db / 20)
-    return sound + np.float32(level) * babble
+    background = np.zeros(len(sound), np.float32)
+    for other in others:
+        start = int(rng.integers(len(other)))
+        voice = as_floats(np.resize(other[start : start + len(sound)], len(sound)))
+        background += voice / (np.sqrt(np.mean(voice**2)) + np.float32(_TINY))
+    snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
+    level = np.sqrt(np.mean(sound**2) / (np.mean(background**2) + _TINY)) * 10 ** (-snr_db / 20)
+    return sound + np.float32(level) * background
 
 
 def _distort(sound: Samples, rng: np.random.Generator) -> Samples:

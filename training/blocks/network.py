@@ -51,12 +51,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
-from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Readout, Shape
+from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Readout, ReadoutShape, Shape
 from kouxing.training.neural.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms
 PAST = 125  # positions before a block that it attends to, 2.5 s
 
+READOUT = ReadoutShape(inner=320, gru=192, dropout=0.2, noise=0.15)
+_CPU = torch.device("cpu")
 _GRU_WEIGHTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
 
@@ -69,20 +71,26 @@ class Layout:
     may_attend: Tensor  # (n, n)
     blocks: Tensor  # (blocks, B + R), the positions of a block and its right context, of n
     exists: Tensor  # (blocks, B + R)
+    in_blocks: Tensor  # (n,), places in the flattened blocks
+    in_right: Tensor  # (copies,), places in the flattened right contexts
     block_length: int  # B
 
     def in_order(self, of_blocks: Tensor) -> Tensor:
         """Put values of the blocks, (batch, blocks, B + R, width), in order: (batch, n, width)."""
-        parts = (slice(self.block_length), slice(self.block_length, None))
-        return torch.cat([of_blocks[:, :, part][:, self.exists[:, part]] for part in parts], dim=1)
+        return of_blocks.flatten(1, 2)[:, self.in_blocks]
 
 
 @cache
-def layout(num_positions: int, block_length: int) -> Layout:
+def layout(
+    num_positions: int,
+    block_length: int,
+    right_context: int = RIGHT_CONTEXT,
+    device: torch.device = _CPU,
+) -> Layout:
     """Lay out a recording's positions and right contexts."""
     num_blocks = math.ceil(num_positions / block_length)
     begins = block_length * torch.arange(num_blocks)
-    places = begins[:, None] + torch.arange(block_length + RIGHT_CONTEXT)
+    places = begins[:, None] + torch.arange(block_length + right_context)
     exists = places < num_positions
     copied = exists.clone()
     copied[:, :block_length] = False
@@ -94,12 +102,16 @@ def layout(num_positions: int, block_length: int) -> Layout:
     begin = begins[block_of][:, None]  # of the block of the one that attends
     may_attend = block_of == block_of[:, None]
     may_attend[:, :num_positions] |= (positions < begin) & (positions >= begin - PAST)
+    of_block = exists & ~copied
+    in_blocks = torch.cat([part.flatten().nonzero()[:, 0] for part in (of_block, copied)])
     return Layout(
         num_positions=num_positions,
-        places=torch.cat([positions, places[copied]]),
-        may_attend=may_attend,
-        blocks=blocks,
-        exists=exists,
+        places=torch.cat([positions, places[copied]]).to(device),
+        may_attend=may_attend.to(device),
+        blocks=blocks.to(device),
+        exists=exists.to(device),
+        in_blocks=in_blocks.to(device),
+        in_right=copied[:, block_length:].flatten().nonzero()[:, 0].to(device),
         block_length=block_length,
     )
 
@@ -141,7 +153,7 @@ class BlockReadout(Readout):
         last = laid.blocks[:, : laid.block_length].amax(dim=1)
         right = of_blocks[:, :, laid.block_length :]
         after = self._run(right.flatten(0, 1), outputs[:, last].flatten(0, 1))
-        of_right = after.view(*right.shape[:3], -1)[:, laid.exists[:, laid.block_length :]]
+        of_right = after.reshape(len(inner), -1, after.shape[-1])[:, laid.in_right]
         return torch.cat([outputs, of_right], dim=1)
 
     def _run(self, inputs: Tensor, state: Tensor) -> Tensor:

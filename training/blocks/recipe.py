@@ -1,69 +1,106 @@
-"""From corpora to the block model: labels, readout, tuned encoder, model card.
+"""From corpora to the block model: labels, tuned encoder with its readout, model card.
 
-A trained neural model supplies HMMs, phone language model, state prior and acoustic scale, and
-aligns the recordings with their texts (:mod:`kouxing.training.neural.labels`). First a readout is
-trained on windows of Whisper's unchanged encoder. Then encoder and readout are tuned in blocks.
+A trained acoustic model aligns the recordings with their texts, and a teacher labels all recordings
+(:mod:`kouxing.training.neural.labels`). Some recordings get a sung copy. Then encoder and readout
+are tuned in blocks. The HMMs are estimated from the alignment; the phone language model is that of
+the acoustic model.
 
-Training can be interrupted. Labels and checkpoints are stored next to the output, as
-``.labels.npz``, ``.readout.pt`` and ``.network.pt``. The same command resumes from them, and
-deletes them at the end.
+Training can be interrupted. Labels and checkpoint are stored next to the output, as ``.labels.npz``
+and ``.network.pt``. The same command resumes from them, and deletes them at the end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from kouxing.corpora.feature_cache import as_floats, as_integers
+from kouxing.corpora.parallel import process_in_order
+from kouxing.corpora.sounds import read_sounds
 from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.load import NEURAL_PATH, load_model
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.shared.errors import UserError
-from kouxing.training.blocks.batches import BATCH_S
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.model_file import (
+    Archive,
+    topology_arrays,
+    topology_from,
+)
+from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, frames_in
+from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, Material
 from kouxing.training.blocks.export import onnx_of
-from kouxing.training.blocks.network import BlockEncoder, BlockReadout
-from kouxing.training.blocks.readout import train_readout
+from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
+from kouxing.training.ear.singing import sing
 from kouxing.training.model_card import write_card
 from kouxing.training.neural.batches import Recording, Targets
 from kouxing.training.neural.initial_network import init_encoder, load_whisper
-from kouxing.training.neural.labels import Mix, label
-from kouxing.training.training_set import FRAMES_PER_MINUTE, Report, load_examples
+from kouxing.training.neural.labels import STATES_PER_PHONE, Mix, label, statistics_of
+from kouxing.training.training_set import (
+    FRAMES_PER_MINUTE,
+    Example,
+    Report,
+    load_examples,
+    with_progress,
+)
 
-
-def save_labels(path: Path, recordings: Sequence[Recording]) -> None:
-    """Write labeled recordings, so that training can resume."""
-    np.savez(
-        path,
-        samples=np.concatenate([recording.samples for recording in recordings]),
-        num_samples=[len(recording.samples) for recording in recordings],
-        states=np.concatenate([recording.targets.states for recording in recordings]),
-        probs=np.concatenate([recording.targets.probs for recording in recordings]),
-        num_frames=[len(recording.targets) for recording in recordings],
-        weights=[recording.weight for recording in recordings],
-    )
-
-
-def load_labels(path: Path) -> list[Recording]:
-    """Read a file of :func:`save_labels`."""
-    with np.load(path, allow_pickle=False) as file:
-        kept = {name: file[name] for name in file.files}
-    samples = np.split(kept["samples"], np.cumsum(kept["num_samples"])[:-1])
-    bounds = np.cumsum(kept["num_frames"])[:-1]
-    states, probs = np.split(kept["states"], bounds), np.split(kept["probs"], bounds)
-    return [
-        Recording(samples=sound, targets=Targets(*pair), weight=float(weight))
-        for sound, *pair, weight in zip(samples, states, probs, kept["weights"], strict=True)
-    ]
-
-
-BLOCK_LENGTH = 5  # positions, live
+# Live, in positions. A short block gives early hypotheses. Its positions have less right context
+# than the first ones of a long block, so R is longer than in training.
+BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
+_ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY = 2.0  # most of the network's errors are deletions
-_MIX = Mix({"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)}, 0.72)
+_MIX = Mix({"sentence": 0.38, "word": 0.05, "synthetic": 0.14}, 0.43)
+_BACKGROUNDS = ("music", "noise", "babble")
+_SUNG_SHARE, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
+_MAX_SUNG_FRAMES = 800  # of a recording, that are sung
+_FRAMES_PER_POSITION = 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Labeled:
+    """The recordings to train on, and the statistics of their alignment."""
+
+    recordings: list[Recording]
+    topology: Topology
+    log_prior: NDArray[np.float32]  # (states,)
+
+    def save(self, path: Path) -> None:
+        """Write a file, so that training can resume."""
+        targets = [recording.targets for recording in self.recordings]
+        unfinished = path.with_suffix(".part.npz")
+        np.savez(
+            unfinished,
+            allow_pickle=False,
+            **topology_arrays(self.topology),
+            log_prior=self.log_prior,
+            samples=np.concatenate([recording.samples for recording in self.recordings]),
+            num_samples=[len(recording.samples) for recording in self.recordings],
+            states=np.concatenate([one.states for one in targets]),
+            probs=np.concatenate([one.probs for one in targets]),
+            num_frames=[len(one) for one in targets],
+            weights=[recording.weight for recording in self.recordings],
+        )
+        unfinished.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> _Labeled:
+        """Read a file of :meth:`save`."""
+        with np.load(path, allow_pickle=False) as file:
+            kept = {name: file[name] for name in file.files}
+        samples = np.split(kept["samples"], np.cumsum(kept["num_samples"])[:-1])
+        bounds = np.cumsum(kept["num_frames"])[:-1]
+        states, probs = np.split(kept["states"], bounds), np.split(kept["probs"], bounds)
+        recordings = [
+            Recording(samples=sound, targets=Targets(*pair), weight=float(weight))
+            for sound, *pair, weight in zip(samples, states, probs, kept["weights"], strict=True)
+        ]
+        return cls(recordings, topology_from(Archive(kept)), kept["log_prior"])
 
 
 def train_blocks(
@@ -73,33 +110,36 @@ def train_blocks(
     whisper: Path,
     start: Path | None = None,
     untranscribed: Sequence[Path] = (),
+    sounds: Sequence[Path] = (),
     seed: int = 0,
-    num_readout_steps: int = 450,
-    num_steps: int = 475,
+    num_steps: int = 1000,
     shipping: bool = True,
     report: Report = print,
 ) -> None:
     """Train the block model, and write it with its card.
 
     The arguments are the options of ``kouxing train blocks``. Raises UserError if there is nothing
-    to train on, ``start`` is not a neural model, or a file cannot be read.
+    to train on, or a file cannot be read.
     """
-    start = start or NEURAL_PATH
+    start = start or model_path("blocks")
     before = load_model(start)
-    if not isinstance(before, NeuralModel):
-        raise UserError(f"{start} is not a neural model; give one from 'kouxing train neural'")
     torch.set_num_threads(1)  # reproducible sums on every machine
+    torch.set_float32_matmul_precision("high")  # faster on a GPU
     torch.manual_seed(seed)
-    whole = init_encoder(whisper, before.topology.num_states)
+    num_states = STATES_PER_PHONE * len(before.inventory)
+    whole = init_encoder(whisper, num_states)
     errors = RowErrors()
+    backgrounds = [
+        sound.samples
+        for sound in read_sounds(sounds, shipping=shipping)
+        if sound.kind in _BACKGROUNDS and not sound.is_held_out
+    ]
     examples = load_examples(
         corpora, errors, before.inventory, shipping=shipping, with_samples=True
     )
-    labels, readout_state, network_state = stored = [
-        output.with_suffix(suffix) for suffix in (".labels.npz", ".readout.pt", ".network.pt")
-    ]
+    labels, checkpoint = (output.with_suffix(end) for end in (".labels.npz", ".network.pt"))
     if not labels.exists():
-        _, labeled = label(
+        aligned, recordings = label(
             examples,
             untranscribed,
             _MIX,
@@ -109,48 +149,79 @@ def train_blocks(
             seed=seed,
             report=report,
         )
-        save_labels(labels, labeled)
-    recordings = load_labels(labels)
-    first = train_readout(
-        whole,
-        recordings,
-        before.topology.num_states,
-        seed=seed,
-        num_steps=num_readout_steps,
-        checkpoint=readout_state,
-        report=report,
-    )
+        weights = [recording.weight for recording in recordings[: len(aligned)]]
+        statistics = statistics_of(aligned, weights, before.topology.phone_lm)
+        _Labeled([*recordings, *_sung_copies(recordings, seed, report)], *statistics).save(labels)
+    labeled = _Labeled.load(labels)
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
-    readout = BlockReadout(len(first.mean), encoder.shape.num_states, first.shape)
-    readout.load_state_dict(first.state_dict())
+    readout = BlockReadout(whole.shape.width * len(whole.kept_layers), num_states, READOUT)
     network = train_network(
         BlockNetwork(encoder, readout),
         whole,
-        recordings,
+        Material(labeled.recordings, backgrounds),
         seed=seed,
         num_steps=num_steps,
-        checkpoint=network_state,
+        checkpoint=checkpoint,
         report=report,
-    )
+    ).cpu()
     model = BlockModel(
-        topology=replace(before.topology, phone_penalty=_PHONE_PENALTY),
-        network=onnx_of(network.encoder, network.readout, BLOCK_LENGTH),
-        log_prior=before.log_prior,
-        acoustic_scale=before.acoustic_scale,
+        topology=replace(labeled.topology, phone_penalty=_PHONE_PENALTY),
+        network=onnx_of(network.encoder, network.readout, BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST),
+        log_prior=labeled.log_prior,
+        acoustic_scale=_ACOUSTIC_SCALE,
     )
     model.save(output)
+    _write_card(output, start, seed, num_steps, labeled.recordings, examples, errors)
+    errors.report_to(report)
+    for path in (labels, checkpoint):
+        path.unlink()
+
+
+def _sung_copies(recordings: Sequence[Recording], seed: int, report: Report) -> Iterator[Recording]:
+    """Yield copies of some recordings that are sung, or have a held vowel."""
+    numbers = np.random.default_rng(seed).permutation(len(recordings))[::_SUNG_SHARE].tolist()
+    copies = process_in_order(partial(_sung_copy, recordings, seed), numbers)
+    for copy, _ in zip(copies, with_progress(numbers, "sung", report), strict=True):
+        if copy:
+            yield copy
+
+
+def _sung_copy(recordings: Sequence[Recording], seed: int, number: int) -> Recording | None:
+    """Sing the start of a recording; None if it has too little voice."""
+    recording = recordings[number]
+    speech = as_floats(recording.samples[: HOP_SAMPLES * _MAX_SUNG_FRAMES])
+    num_positions = len(speech) // HOP_SAMPLES // _FRAMES_PER_POSITION
+    sung = sing(speech, num_positions, np.random.default_rng([seed, number]))
+    if sung is None:
+        return None
+    frames = _FRAMES_PER_POSITION * sung.source[:, None] + np.arange(_FRAMES_PER_POSITION)
+    targets = recording.targets.of(np.minimum(frames.flatten(), len(recording.targets) - 1))
+    num_frames = min(len(targets), frames_in(len(sung.samples)))
+    return Recording(
+        samples=as_integers(sung.samples),
+        targets=targets.of(slice(num_frames)),
+        weight=_SUNG_WEIGHT * recording.weight,
+    )
+
+
+def _write_card(
+    output: Path,
+    start: Path,
+    seed: int,
+    num_steps: int,
+    recordings: Sequence[Recording],
+    examples: Sequence[Example],
+    errors: RowErrors,
+) -> None:
     minutes = sum(len(one.targets) for one in recordings) / FRAMES_PER_MINUTE
     write_card(
         output,
         title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",
         details=f"with Whisper's weights (Radford et al. 2023, MIT license), seed {seed}, "
-        f"{num_readout_steps} steps of the readout, {num_steps} of {BATCH_S} s of sound of all, "
-        f"aligned by `{start.name}`, on {len(recordings)} recordings of {minutes:.0f} minutes "
-        "drawn from those below",
+        f"{num_steps} steps of {BATCHES_PER_STEP * BATCH_S} s of sound, aligned by `{start.name}`, "
+        f"on {len(recordings)} recordings of {minutes:.0f} minutes: those below, speech without "
+        "text, and sung copies",
         recordings=examples,
         errors=errors,
     )
-    errors.report_to(report)
-    for path in stored:
-        path.unlink()

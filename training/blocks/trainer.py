@@ -16,30 +16,40 @@ h_whole  those of the unchanged encoder, which sees the whole clean    (n, 3 wid
 H        mean cross-entropy with the target states, nats a frame       1
 ======== ============================================================= ==================
 
-Convolutions are frozen. A layer's rate is 0.85 of the rate of the layer above. Rates rise and then
-stay constant, and the result is a running mean of the weights. Training can end after any step.
+Convolutions are frozen. A layer's rate is 0.85 of the rate of the layer above. Rates rise, stay
+constant and fall to 0, and the result is a running mean of the weights. During the first steps, H
+trains only the readout.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from kouxing.training.blocks.batches import BlockBatch, block_batch
+from kouxing.corpora.parallel import process_in_order
+from kouxing.training.blocks.batches import BATCHES_PER_STEP, BlockBatch, Material, block_batch
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
-from kouxing.training.device import mixed_precision
-from kouxing.training.neural.batches import Recording
+from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.neural.network import MAX_DEVIATIONS
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_factor
+from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
 from kouxing.training.neural.teacher import WholeEncoder
 from kouxing.training.training_set import Report
 
-_RATE, _READOUT_RATE = 1e-4, 6e-4  # of the last layer, of the readout
+_RATE, _READOUT_RATE = 2e-4, 1.5e-3  # of the last layer, of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above
+_READOUT_STEPS = 150
 _WARM_UP_STEPS = 60
+_FALLING = 0.6  # fraction of the steps, at the end, over which the rates fall to 0
+_NUM_STANDARDIZED = 4  # batches that mean and deviation of the features are computed from
+_JOINED = BATCHES_PER_STEP if DEVICE.type == "cuda" else 1  # batches that are computed together
 _HIDDEN_WEIGHT, _RIGHT_WEIGHT = 0.5, 0.5  # of a loss
 
 
@@ -55,7 +65,7 @@ class BlockNetwork(nn.Module):
 def train_network(
     network: BlockNetwork,
     teacher: WholeEncoder,
-    recordings: Sequence[Recording],
+    material: Material,
     *,
     seed: int,
     num_steps: int,
@@ -64,15 +74,40 @@ def train_network(
 ) -> BlockNetwork:
     """Train the network in place; return one with the running mean of its weights.
 
-    ``network`` has Whisper's weights and a trained readout, ``teacher`` is Whisper's encoder.
+    ``network`` has Whisper's weights and an untrained readout, ``teacher`` is Whisper's encoder.
     Training saves its state in ``checkpoint``, and resumes from it if the file exists.
     """
+    first = [block_batch(material, seed, number) for number in range(_NUM_STANDARDIZED)]
+    with torch.no_grad():
+        features = [
+            teacher(_tensor([batch.clean]), batch.start)[:, : batch.states.shape[1]].flatten(0, 1)
+            for batch in first
+        ]
+    network.readout.standardize(torch.cat(features).to(network.readout.mean.device))
+    network.to(DEVICE).train()
     groups = _groups(network)
-    optimizer = Optimizer(network, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=3)
-    network.train()
+    optimizer = Optimizer(network, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=8)
+    batches: Iterator[BlockBatch] | None = None
+
+    def loss(step: int) -> Tensor:
+        nonlocal batches
+        if batches is None:
+            numbers = range(BATCHES_PER_STEP * step, BATCHES_PER_STEP * num_steps)
+            batches = process_in_order(partial(block_batch, material, seed), numbers)
+        total = torch.zeros((), device=DEVICE)
+        for last in range(_JOINED, BATCHES_PER_STEP + 1, _JOINED):
+            joined = list(islice(batches, _JOINED))
+            part = _loss(network, teacher, joined, only_readout=step < _READOUT_STEPS)
+            part = part * (_JOINED / BATCHES_PER_STEP)
+            if last < BATCHES_PER_STEP:
+                part.backward()  # type: ignore[no-untyped-call]
+                part = part.detach()
+            total = total + part
+        return total
+
     return optimizer.train(
-        lambda step: _loss(network, teacher, block_batch(recordings, seed, step)),
-        lambda step: warm_up_factor(step, _WARM_UP_STEPS),
+        loss,
+        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
         num_steps=num_steps,
         seed=seed,
         report=report,
@@ -80,17 +115,39 @@ def train_network(
     )
 
 
-def _loss(network: BlockNetwork, teacher: WholeEncoder, batch: BlockBatch) -> Tensor:
-    """Compute the loss of a batch."""
-    num_positions = batch.states.shape[1]
-    laid = layout(num_positions, batch.block_length)
+def _tensor(arrays: Sequence[NDArray[Any]]) -> Tensor:
+    """Join arrays; floats get 32 bits, integers 64."""
+    joined = torch.from_numpy(np.concatenate(arrays))
+    if DEVICE.type == "cuda":
+        joined = joined.pin_memory()  # copied while the GPU computes
+    joined = joined.to(DEVICE, non_blocking=True)
+    return joined.float() if joined.is_floating_point() else joined.long()
+
+
+def _loss(
+    network: BlockNetwork,
+    teacher: WholeEncoder,
+    batches: Sequence[BlockBatch],
+    *,
+    only_readout: bool,
+) -> Tensor:
+    """Compute the loss of batches of the same shape.
+
+    With ``only_readout`` the cross-entropy does not train the encoder.
+    """
+    num_positions, start = batches[0].states.shape[1], batches[0].start
+    laid = layout(num_positions, *batches[0].block, DEVICE)
+    frames, clean, states, probs = (
+        _tensor([getattr(batch, name) for batch in batches])
+        for name in ("frames", "clean", "states", "probs")
+    )
     with mixed_precision():
         with torch.no_grad():
-            whole = teacher(batch.clean, batch.start)[:, laid.places]
-        features = network.encoder(batch.frames, laid, batch.start).float()
-    log_posteriors = network.readout.read(features, laid)
+            whole = teacher(clean, start)[:, laid.places]
+        features = network.encoder(frames, laid, start).float()
+    log_posteriors = network.readout.read(features.detach() if only_readout else features, laid)
     apart = ((features - whole) / network.readout.deviation).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
-    states, probs = batch.states[:, laid.places], batch.probs[:, laid.places]
+    states, probs = states[:, laid.places], probs[:, laid.places]
     losses = []
     for part in (slice(num_positions), slice(num_positions, None)):
         entropy = cross_entropy(log_posteriors[:, part], states[:, part], probs[:, part])

@@ -21,8 +21,6 @@ takes the targets of its source frame in the recording. The middle of frame t, s
 was sample s (160 t + 200) of the recording, which is the middle of the source frame
 
     t_source = s t + (s - 1) 200 / 160
-
-A change of tempo interpolates frames, so the number of frames changes but not the pitch.
 """
 
 from __future__ import annotations
@@ -31,6 +29,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
 
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
@@ -55,7 +54,6 @@ _FLUTTER_SAMPLES = 2400  # between two knots of the noise's level
 _KNOCK_SAMPLES = 160
 _KNOCK_RATE = 0.03  # fraction of the pieces of this length with a knock
 _MIN_PEAK_DB = -36.0  # relative to full scale
-_MIN_LOG_TEMPO, _MAX_LOG_TEMPO = -0.20, 0.25
 
 
 def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples, float]:
@@ -101,18 +99,6 @@ def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.
     return np.asarray(np.clip(np.rint(at), 0, num_source - 1).astype(np.int64))
 
 
-def change_tempo(
-    frames: NDArray[np.float32], rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Change the tempo at random; return the new frames, (m, k), and their source frames, (m,)."""
-    num_frames = round(len(frames) / np.exp(rng.uniform(_MIN_LOG_TEMPO, _MAX_LOG_TEMPO)))
-    at = np.linspace(0, len(frames) - 1, max(1, num_frames))
-    low = np.minimum(at.astype(np.int64), len(frames) - 2)
-    fraction = (at - low)[:, None].astype(np.float32)
-    changed = (1 - fraction) * frames[low] + fraction * frames[low + 1]
-    return changed, np.rint(at).astype(np.int64)
-
-
 def _room(rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw a room's response; the first echo arrives after 1 to 8 ms."""
     t60_s = rng.uniform(_MIN_T60_S, _MAX_T60_S)
@@ -129,10 +115,11 @@ def _room(rng: np.random.Generator) -> NDArray[np.float64]:
 def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw a noise 3 to 30 dB below a recording."""
     num_samples = len(samples)
-    frequency = np.maximum(np.fft.rfftfreq(num_samples, 1 / SAMPLE_RATE_HZ), _MIN_NOISE_HZ)
+    size = next_fast_len(num_samples, real=True)
+    frequency = np.maximum(np.fft.rfftfreq(size, 1 / SAMPLE_RATE_HZ), _MIN_NOISE_HZ)
     slope = rng.uniform(-2.2, 0.2)
     density = (frequency / 1000) ** (slope / 2) * _random_curve(frequency, 12, (0.1, 0.7), rng)
-    noise = np.fft.irfft(np.fft.rfft(rng.standard_normal(num_samples)) * density, num_samples)
+    noise = irfft(rfft(rng.standard_normal(size)) * density, size)[:num_samples]
     if rng.random() < _FLUTTER_PROB:
         num_knots = 2 + num_samples // _FLUTTER_SAMPLES
         knots = rng.normal(0.0, rng.uniform(0.2, 0.8), num_knots)
@@ -166,9 +153,9 @@ def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
 
 
 def _color(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
-    frequency = np.fft.rfftfreq(len(samples), 1 / SAMPLE_RATE_HZ)
-    color = _random_curve(frequency, 7, (0.1, 0.5), rng)
-    return np.fft.irfft(np.fft.rfft(samples) * color, len(samples))
+    size = next_fast_len(len(samples), real=True)
+    color = _random_curve(np.fft.rfftfreq(size, 1 / SAMPLE_RATE_HZ), 7, (0.1, 0.5), rng)
+    return np.asarray(irfft(rfft(samples, size) * color, size)[: len(samples)])
 
 
 def _random_curve(

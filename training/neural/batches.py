@@ -11,19 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kouxing.corpora.feature_cache import as_floats
-from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.training.neural.augmentation import (
-    augment_samples,
-    change_tempo,
-    scale_level,
-    source_frames,
-)
-
-_MAX_FRAMES = 800  # in a batch; longer recordings are cropped
-_AUGMENT_PROB = 0.9
-_TEMPO_PROB = 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class Targets:
@@ -75,23 +62,6 @@ def sampling_probs(recordings: Sequence[Recording]) -> NDArray[np.float64]:
     weights = np.array([recording.weight for recording in recordings])
     weights /= weights.sum()
     return weights
-
-
-def augment(recording: Recording, rng: np.random.Generator) -> tuple[NDArray[np.float32], Targets]:
-    """Augment a recording; return its frames, (frames, 80), and their targets."""
-    samples, speed = as_floats(recording.samples), 1.0
-    if rng.random() < _AUGMENT_PROB:
-        samples, speed = augment_samples(samples, rng)
-    frames = WhisperMel().accept_waveform(scale_level(samples, rng))
-    targets = recording.targets.of(source_frames(len(frames), speed, len(recording.targets)))
-    if rng.random() < _TEMPO_PROB:
-        frames, source = change_tempo(frames, rng)
-        targets = targets.of(source)
-    if len(frames) > _MAX_FRAMES:
-        start = int(rng.integers(len(frames) - _MAX_FRAMES + 1))
-        crop = slice(start, start + _MAX_FRAMES)
-        frames, targets = frames[crop], targets.of(crop)
-    return frames, targets
 
 
 def padded_batch(group: Sequence[Sample]) -> Batch:

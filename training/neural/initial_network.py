@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import open_file
+from kouxing.training.device import DEVICE
 from kouxing.training.neural.network import Encoder, Network, Shape
 from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
 
@@ -166,7 +167,7 @@ def init_encoder(whisper: Path, num_states: int) -> WholeEncoder:
     """Make the teacher's encoder, with Whisper's weights."""
     encoder = WholeEncoder(Shape(num_states=num_states, look_aheads=(), layers=NUM_LAYERS))
     load_whisper(encoder, whisper)
-    return encoder.eval()
+    return encoder.eval().to(DEVICE)
 
 
 def init_network(whisper: Path, num_states: int, look_aheads: tuple[int, ...]) -> Network:

@@ -6,15 +6,17 @@ clean and whole. A target is the average of both, or only the teacher's label if
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.network import NetworkModel
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.search.decoder import Segment
 from kouxing.services.recognizer.search.forced_path import (
@@ -26,7 +28,7 @@ from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.neural.batches import Recording, Targets
-from kouxing.training.neural.teacher import WholeEncoder, process_all, train_teacher
+from kouxing.training.neural.teacher import WholeEncoder, train_teacher
 from kouxing.training.search_weights import all_scores
 from kouxing.training.training_set import (
     FRAMES_PER_MINUTE,
@@ -41,16 +43,15 @@ _LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; those with more are t
 _MIN_STAY, _MAX_STAY = 0.05, 0.98
 _LM_SCALE = 2.0  # chosen on development data
 _PRIOR_SCALE = 0.5  # of the states' log priors; chosen on development data
-_TEACHER_SET = 1000  # recordings of each kind that the teacher is trained on
-_MAX_UNTRANSCRIBED = 3000  # pieces of each folder
-_FULL_FOLDER_MINUTES = 35  # longer folders get the weight of this much speech
+_TEACHER_SET = 2000  # recordings of each kind that the teacher is trained on
+_FULL_FOLDER_MINUTES = 45  # longer folders get the weight of this much speech
 
 
 @dataclass(frozen=True, slots=True)
 class Mix:
     """Composition of a training set."""
 
-    kinds: Mapping[str, tuple[float, int]]  # share of a kind of speech, and its most recordings
+    kinds: Mapping[str, float]  # share of each kind of speech with text
     untranscribed: float  # share of recordings without text
 
 
@@ -74,23 +75,15 @@ def label(
     seed: int,
     report: Report,
 ) -> tuple[list[AlignedExample], list[Recording]]:
-    """Align and label a random selection of recordings; those with text come first.
+    """Align and label recordings; those with text come first, in random order.
 
     ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
     folders of recordings without text. ``encoder`` is Whisper's, for the teacher.
     """
     rng = np.random.default_rng(seed)
-    drawn: list[Example] = []
-    for kind, (_, limit) in mix.kinds.items():
-        of_kind = [example for example in examples if example.kind == kind]
-        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:limit]]
-    folders: list[list[NDArray[np.int16]]] = []
-    for folder in untranscribed:
-        pieces = load_untranscribed([folder], errors)
-        folders.append(
-            [pieces[place] for place in rng.permutation(len(pieces))[:_MAX_UNTRANSCRIBED]]
-        )
-    aligned = _align_all(aligner, drawn, report)
+    folders = [load_untranscribed([folder], errors) for folder in untranscribed]
+    in_random_order = [examples[place] for place in rng.permutation(len(examples))]
+    aligned = _align_all(aligner, in_random_order, report)
     recordings = _recordings(aligned, mix)
     num_of_kind = dict.fromkeys(mix.kinds, 0)
     teacher_set = []
@@ -101,7 +94,7 @@ def label(
     teacher = train_teacher(encoder, teacher_set, seed=seed, report=report)
     sounds = [sound for pieces in folders for sound in pieces]
     all_sounds = [*(recording.samples for recording in recordings), *sounds]
-    labels = process_all(teacher.targets_of, all_sounds, "labeled by the teacher", report)
+    labels = teacher.label(all_sounds, report)
     labeled = [
         replace(recording, targets=recording.targets.averaged_with(targets))
         for recording, targets in zip(recordings, labels, strict=False)
@@ -128,7 +121,7 @@ def _recordings(aligned: Sequence[AlignedExample], mix: Mix) -> list[Recording]:
     recordings = []
     for one in aligned:
         kind = one.example.kind
-        weight = mix.kinds[kind][0] * one.example.weight * len(one.states) / frames[kind]
+        weight = mix.kinds[kind] * one.example.weight * len(one.states) / frames[kind]
         targets = Targets.hard(one.states)
         recordings.append(Recording(samples=one.example.samples, targets=targets, weight=weight))
     return recordings
@@ -141,7 +134,6 @@ def _align_all(
 
     Raises UserError if no recording fits its text.
     """
-    aligned = []
     topology = aligner.topology
     inventory = topology.inventory
     silence = inventory.index[inventory.silence]
@@ -150,27 +142,33 @@ def _align_all(
     place = np.arange(len(phone)) - topology.first_state[phone]
     # the middle of a phone's n-th state, among STATES_PER_PHONE
     new_place = (2 * place + 1) * STATES_PER_PHONE // (2 * num_states[phone])
-    tracked = with_progress(examples, "aligned", report)
-    for rows, example in zip(_scores(aligner, examples), tracked, strict=True):
+    if isinstance(aligner, NetworkModel):
+        aligner = replace(aligner, acoustic_scale=1.0)
+    if isinstance(aligner, NeuralModel):
+        layer = int(np.abs(aligner.look_aheads - _LOOK_AHEAD_FRAMES).argmin())
+        aligner = replace(aligner, output_layer=layer)
+
+    def align(number: int) -> tuple[NDArray[np.int64], list[Segment]] | None:
+        example = examples[number]
         graph = utterance_graph(
             example.phones, example.syllables, topology.first_state, silence=silence
         )
+        (rows,) = all_scores(aligner, [example])
         path, _ = viterbi_path(rows, graph.states, graph, topology.log_stay, topology.log_leave)
-        if len(path):
-            on_path = graph.states[path]
-            states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
-            aligned.append(AlignedExample(example, states, segments_of_path(path, graph)))
+        on_path = graph.states[path]
+        states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
+        return (states, segments_of_path(path, graph)) if len(path) else None
+
+    alignments = process_in_order(align, range(len(examples)))
+    tracked = with_progress(examples, "aligned", report)
+    aligned = [
+        AlignedExample(example, *alignment)
+        for alignment, example in zip(alignments, tracked, strict=True)
+        if alignment
+    ]
     if not aligned:
         raise UserError("no recording fits its text; check the texts and the aligner")
     return aligned
-
-
-def _scores(aligner: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
-    """Yield the aligner's scores; an output layer that sees a little more aligns best."""
-    if isinstance(aligner, NeuralModel):
-        layer = int(np.abs(aligner.look_aheads - _LOOK_AHEAD_FRAMES).argmin())
-        aligner = replace(aligner, output_layer=layer, acoustic_scale=1.0)
-    return all_scores(aligner, examples)
 
 
 def statistics_of(

@@ -222,16 +222,18 @@ class Readout(nn.Module):
     def _add_noise(self, standard: Tensor) -> Tensor:
         """Add noise to features, (batch, positions, features); mask some features and positions."""
         batch, num_positions, num_features = standard.shape
+        device = standard.device
         noisy = standard + self.shape.noise * torch.randn_like(standard)
         if self.shape.constant_noise:
-            amount = self.shape.constant_noise * torch.rand(batch, 1, 1)
-            noisy = noisy + amount * torch.randn(batch, 1, num_features)
+            amount = self.shape.constant_noise * torch.rand(batch, 1, 1, device=device)
+            noisy = noisy + amount * torch.randn(batch, 1, num_features, device=device)
         if self.shape.feature_dropout:
-            noisy = noisy * (torch.rand(batch, 1, num_features) >= self.shape.feature_dropout)
-        position = torch.arange(num_positions)[:, None]
+            kept = torch.rand(batch, 1, num_features, device=device) >= self.shape.feature_dropout
+            noisy = noisy * kept
+        position = torch.arange(num_positions, device=device)[:, None]
         for _ in range(self.shape.num_masks):
-            first = torch.randint(num_positions, (batch, 1, 1))
-            width = torch.randint(1, _MAX_MASKED + 1, (batch, 1, 1))
-            is_used = torch.rand(batch, 1, 1) < 0.5
+            first = torch.randint(num_positions, (batch, 1, 1), device=device)
+            width = torch.randint(1, _MAX_MASKED + 1, (batch, 1, 1), device=device)
+            is_used = torch.rand(batch, 1, 1, device=device) < 0.5
             noisy = noisy * ~(is_used & (position >= first) & (position < first + width))
         return noisy

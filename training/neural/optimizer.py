@@ -11,9 +11,10 @@ v are the weights after a step, m their mean, and e is its exponent.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeAlias, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -22,8 +23,10 @@ from torch.optim.swa_utils import AveragedModel
 from kouxing.training.training_set import Report
 
 SAVE_EVERY = 25  # steps
+MIN_SAVE_S = 30.0  # between two saves
 
 N = TypeVar("N", bound=nn.Module)
+_Tensors: TypeAlias = tuple[Tensor, ...] | list[Tensor]
 
 
 class Optimizer(Generic[N]):
@@ -61,30 +64,33 @@ class Optimizer(Generic[N]):
     ) -> N:
         """Train, and return the network with the running mean of the weights.
 
-        ``loss_of`` computes the loss of a step, ``rate_factor_of`` the factor of its learning
-        rates. Each step has its own random state. The state is saved in ``checkpoint``, and
-        training resumes from this file if it exists.
+        ``loss_of`` computes the loss of a step. It may add the gradients of parts of it itself.
+        ``rate_factor_of`` computes the factor of the learning rates. Each step has its own random
+        state. The state is saved in ``checkpoint``, and training resumes from this file if it
+        exists.
         """
         first_step = self._load(checkpoint) if checkpoint and checkpoint.exists() else 0
         if first_step:
             report(f"resuming after step {first_step}")
         losses = []
+        next_save_s = time.monotonic() + MIN_SAVE_S
         for step in range(first_step, num_steps):
             torch.manual_seed(seed + step)
+            self._adam.zero_grad()
             loss = loss_of(step)
             self._step(loss, rate_factor_of(step))
             losses.append(loss.detach())
             if (step + 1) % SAVE_EVERY == 0 or step + 1 == num_steps:
                 report(f"step {step + 1}: loss {torch.stack(losses).mean():.3f}")
                 losses = []
-                if checkpoint:
+                if checkpoint and (time.monotonic() >= next_save_s or step + 1 == num_steps):
                     self._save(checkpoint, step + 1)
+                    next_save_s = time.monotonic() + MIN_SAVE_S
         return cast(N, self._averaged.module).eval()
 
     def _step(self, loss: Tensor, rate_factor: float) -> None:
         for group, rate in zip(self._adam.param_groups, self._rates, strict=True):
             group["lr"] = rate_factor * rate
-        self._adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self._network.parameters(), self._max_norm)
         self._adam.step()
@@ -128,13 +134,9 @@ def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tens
     return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
 
 
-def _weight_average(
-    exponent: int,
-) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    def update(
-        means: Sequence[Tensor], weights: Sequence[Tensor], num_before: Tensor | int
-    ) -> None:
-        factor = (exponent + 1) / (int(num_before) + exponent + 2)
-        torch._foreach_lerp_(list(means), list(weights), factor)
+def _weight_average(exponent: int) -> Callable[[_Tensors, _Tensors, Tensor | int], None]:
+    def update(means: _Tensors, weights: _Tensors, num_before: Tensor | int) -> None:
+        factor: Any = (exponent + 1) / (num_before + exponent + 2)  # a tensor stays on its device
+        torch._foreach_lerp_(means, weights, [factor] * len(means))
 
     return update

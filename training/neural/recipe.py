@@ -36,7 +36,7 @@ from torch import Tensor, nn
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.training.blocks.batches import BATCH_S, block_batch
+from kouxing.training.blocks.batches import BATCH_S, Material, block_batch
 from kouxing.training.device import mixed_precision
 from kouxing.training.model_card import write_card
 from kouxing.training.neural.batches import Recording
@@ -50,7 +50,7 @@ from kouxing.training.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.training_set import Report, load_examples
 
 LOOK_AHEADS = (1, 3, 6, 10, 20)  # of the output layers, feature frames
-_MIX = Mix({"sentence": (0.33, 10_000), "word": (0.08, 10_000), "synthetic": (0.30, 10_000)}, 0.29)
+_MIX = Mix({"sentence": 0.33, "word": 0.08, "synthetic": 0.30}, 0.29)
 _UNTUNED = SearchWeights(acoustic_scale=0.5, phone_penalty=1.0)
 _ACOUSTIC_SCALES = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 _RATE, _NEW_RATE = 2e-4, 1.2e-3
@@ -145,10 +145,11 @@ def train_network(
     network.train()
 
     def loss(step: int) -> Tensor:
-        batch = block_batch(recordings, seed, step)
-        states, probs = batch.states.flatten(1, 2), batch.probs.flatten(1, 2)
+        batch = block_batch(Material(recordings), seed, step)
+        frames, states, probs = map(torch.from_numpy, (batch.frames, batch.states, batch.probs))
+        states, probs = states.long().flatten(1, 2), probs.float().flatten(1, 2)
         with mixed_precision():
-            hidden = network(batch.frames, batch.start)
+            hidden = network(frames.float(), batch.start)
             losses = [
                 cross_entropy(
                     network.log_posteriors(hidden, layer),

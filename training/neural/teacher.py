@@ -29,10 +29,8 @@ audio in about a second, or 80 s in mixed precision.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -42,7 +40,7 @@ from torch import Tensor
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
-from kouxing.training.device import mixed_precision
+from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.neural.batches import (
     Recording,
     Sample,
@@ -55,13 +53,14 @@ from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_
 from kouxing.training.training_set import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder
-_NUM_STEPS = 300  # batches of up to 70 s of sound
+_NUM_STEPS = 600  # batches of up to 70 s of sound
 KEPT_LAYERS = (-3, -2, -1)  # indices of the layers that are read
 _PIECE_FRAMES = 2960  # with the padding, less than 30 s
 _PADDING = np.zeros(4800, np.float32)  # appended to a piece
 _MIN_POWER, _FLOOR_DECADES = 1e-10, 8.0
 _MAX_HALF = 6e4  # a 16-bit float's range
 _NUM_TARGETS = 8  # likeliest states of a frame
+_BATCH_SAMPLES = 16_000 * (300 if DEVICE.type == "cuda" else 30)  # labeled together
 
 READOUT = ReadoutShape(
     inner=256, gru=160, dropout=0.3, noise=0.3, constant_noise=0.3, feature_dropout=0.1, num_masks=2
@@ -72,8 +71,6 @@ _NUM_CROPS = 14  # in a batch
 _CROP_POSITIONS = 250
 _WARM_UP_STEPS = 30
 _FALLING = 0.5  # fraction of the steps, at the end, over which the rate falls to 0
-
-T = TypeVar("T")
 
 
 class WholeEncoder(Encoder):
@@ -103,11 +100,16 @@ class WholeEncoder(Encoder):
         for start in range(0, num_frames, _PIECE_FRAMES):
             end = min(start + _PIECE_FRAMES, num_frames)
             piece = samples[HOP_SAMPLES * start : HOP_SAMPLES * (end - 1) + WINDOW_SAMPLES]
-            bands = centered_mel(np.concatenate([as_floats(piece), _PADDING]))
-            with mixed_precision():
-                hidden = self(bands[None])[0, 1 : 1 + math.ceil((end - start) / 2)]
-            pieces.append(hidden.clamp(-_MAX_HALF, _MAX_HALF).half().numpy())
+            hidden = self.encode(np.concatenate([as_floats(piece), _PADDING])[None])
+            hidden = hidden[0, 1 : 1 + math.ceil((end - start) / 2)]
+            pieces.append(hidden.clamp(-_MAX_HALF, _MAX_HALF).half().cpu().numpy())
         return np.concatenate(pieces)
+
+    def encode(self, samples: NDArray[np.float32]) -> Tensor:
+        """Encode padded samples, (batch, n), to (batch, positions, 3 width)."""
+        with mixed_precision():
+            hidden: Tensor = self(centered_mel(torch.from_numpy(samples).to(self.positions.device)))
+        return hidden
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,13 +120,39 @@ class Teacher:
     readout: Readout
 
     @torch.no_grad()
-    def targets_of(self, samples: NDArray[np.int16]) -> Targets:
-        """Find the likeliest states of the frames of samples, (n,) at 16 kHz, 25 ms or longer."""
-        features = torch.from_numpy(self.encoder.features(samples)).float()
-        log_posteriors = self.readout(features[None])[0, : frames_in(len(samples))]
-        best, states = log_posteriors.topk(min(_NUM_TARGETS, log_posteriors.shape[-1]))
-        probs = best.softmax(dim=-1)
-        return Targets(states.numpy().astype(np.uint16), probs.numpy().astype(np.float16))
+    def label(self, sounds: Sequence[NDArray[np.int16]], report: Report) -> list[Targets]:
+        """Find the likeliest states of the frames of recordings, (n,) at 16 kHz, 25 ms or longer.
+
+        Recordings of similar lengths are computed together.
+        """
+        labels: dict[int, Targets] = {}
+        order = sorted(range(len(sounds)), key=lambda number: len(sounds[number]))
+        batch: list[int] = []
+        for number in with_progress(order, "labeled by the teacher", report):
+            batch.append(number)
+            if number == order[-1] or len(batch) * len(sounds[number]) > _BATCH_SAMPLES:
+                targets = self._targets_of([sounds[place] for place in batch])
+                labels.update(zip(batch, targets, strict=True))
+                batch = []
+        return [labels[number] for number in range(len(sounds))]
+
+    def _targets_of(self, sounds: Sequence[NDArray[np.int16]]) -> Iterator[Targets]:
+        """Yield the targets of recordings; all but the last are no longer than it."""
+        longest = frames_in(len(sounds[-1]))
+        if longest > _PIECE_FRAMES:  # each alone, in pieces
+            features = [torch.from_numpy(self.encoder.features(sound))[None] for sound in sounds]
+        else:
+            padded = np.zeros((len(sounds), len(sounds[-1]) + len(_PADDING)), np.float32)
+            for row, sound in zip(padded, sounds, strict=True):
+                row[: len(sound)] = as_floats(sound)
+            features = [self.encoder.encode(padded)[:, 1 : 1 + math.ceil(longest / 2)]]
+        for some in features:
+            log_posteriors = self.readout(some.to(DEVICE).float())
+            best, states = log_posteriors.topk(min(_NUM_TARGETS, log_posteriors.shape[-1]))
+            rows = zip(states.cpu().numpy(), best.softmax(dim=-1).cpu().numpy(), strict=True)
+            for (row, probs), sound in zip(rows, sounds, strict=False):
+                kept = slice(frames_in(len(sound)))
+                yield Targets(row[kept].astype(np.uint16), probs[kept].astype(np.float16))
 
 
 def train_teacher(
@@ -136,8 +164,8 @@ def train_teacher(
     """
     rng = np.random.default_rng(seed)
     sampling = sampling_probs(recordings)
-    samples = [recording.samples for recording in recordings]
-    features = process_all(encoder.features, samples, "encoded for the teacher", report)
+    tracked = with_progress(recordings, "encoded for the teacher", report)
+    features = [encoder.features(recording.samples) for recording in tracked]
 
     def draw() -> Sample:
         number = rng.choice(len(sampling), p=sampling)
@@ -147,14 +175,15 @@ def train_teacher(
         targets = recordings[number].targets.of(slice(2 * start, 2 * end))
         return features[number][start:end], targets
 
-    readout = Readout(features[0].shape[1], encoder.shape.num_states, READOUT)
+    readout = Readout(features[0].shape[1], encoder.shape.num_states, READOUT).to(DEVICE)
     drawn = rng.choice(len(sampling), size=_NUM_STANDARDIZED, p=sampling)
     readout.standardize(torch.cat([torch.from_numpy(features[one]).float() for one in drawn]))
     groups = [{"params": list(readout.parameters()), "lr": 2e-3}]
     optimizer = Optimizer(readout, groups, weight_decay=0.02, max_norm=2.0, mean_exponent=8)
 
     def loss(_step: int) -> Tensor:
-        inputs, states, probs = padded_batch([draw() for _ in range(_NUM_CROPS)])
+        batch = padded_batch([draw() for _ in range(_NUM_CROPS)])
+        inputs, states, probs = (tensor.to(DEVICE) for tensor in batch)
         return cross_entropy(readout(inputs)[:, : states.shape[1]], states, probs)
 
     trained = optimizer.train(
@@ -167,36 +196,16 @@ def train_teacher(
     return Teacher(encoder.eval(), trained)
 
 
-def centered_mel(samples: NDArray[np.float32]) -> Tensor:
-    """Whisper's log-mel bands of a whole recording, shape (80, n // 160)."""
+def centered_mel(samples: Tensor) -> Tensor:
+    """Whisper's log-mel bands of whole recordings, (batch, n) to (batch, 80, n // 160)."""
     spectra = torch.stft(
-        torch.from_numpy(samples),
+        samples,
         WINDOW_SAMPLES,
         HOP_SAMPLES,
-        window=torch.hann_window(WINDOW_SAMPLES),
+        window=torch.hann_window(WINDOW_SAMPLES, device=samples.device),
         return_complex=True,
-    )[:, :-1]
-    power = torch.from_numpy(mel_bands().T).float() @ spectra.abs().square()
-    log_power = power.clamp(min=_MIN_POWER).log10()
-    return (log_power.clamp(min=float(log_power.max()) - _FLOOR_DECADES) + 4) / 4
-
-
-def process_all(
-    process: Callable[[NDArray[np.int16]], T],
-    recordings: Sequence[NDArray[np.int16]],
-    what: str,
-    report: Report,
-) -> list[T]:
-    """Process recordings in parallel on one core each, which is faster than one on all cores.
-
-    ``what`` names the processing in the progress lines, which ``report`` receives.
-    """
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    pool = ThreadPoolExecutor(num_threads)
-    try:
-        followed = with_progress(recordings, what, report)
-        return [result for result, _ in zip(pool.map(process, recordings), followed, strict=True)]
-    finally:
-        pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(num_threads)
+    )[..., :-1]
+    bands = torch.from_numpy(mel_bands().T).float().to(samples.device)
+    log_power = (bands @ spectra.abs().square()).clamp(min=_MIN_POWER).log10()
+    loudest = log_power.amax(dim=(1, 2), keepdim=True)
+    return (log_power.maximum(loudest - _FLOOR_DECADES) + 4) / 4

@@ -1,0 +1,50 @@
+"""Process items in parallel, on all cores of a machine with more than two."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from typing import Any, TypeVar
+
+_MIN_CORES = 3  # with fewer, processes would only compete with the caller
+_AHEAD_PER_CORE = 6  # items that may wait for the caller
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_function: Callable[[Any], Any]  # of a worker process
+
+
+def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Yield the function's result for each item, in order.
+
+    Processes are forked when the iteration starts, so the function may use large data in memory.
+    """
+    num_cores = len(os.sched_getaffinity(0))
+    if num_cores < _MIN_CORES:
+        yield from map(function, items)
+        return
+    results: deque[Future[R]] = deque()
+    context = multiprocessing.get_context("fork")
+    pool = ProcessPoolExecutor(num_cores, context, _start_worker, (function,))
+    try:
+        for item in items:
+            results.append(pool.submit(_process, item))
+            if len(results) > _AHEAD_PER_CORE * num_cores:
+                yield results.popleft().result()
+        while results:
+            yield results.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker(function: Callable[[Any], Any]) -> None:
+    global _function  # noqa: PLW0603
+    _function = function
+
+
+def _process(item: Any) -> Any:
+    return _function(item)
