@@ -152,7 +152,7 @@ class BlockReadout(Readout):
         outputs = self._run(inner, inner.new_zeros(len(inner), self.gru.hidden_size))
         last = laid.blocks[:, : laid.block_length].amax(dim=1)
         right = of_blocks[:, :, laid.block_length :]
-        after = self._run(right.flatten(0, 1), outputs[:, last].flatten(0, 1))
+        after = self._run(right.flatten(0, 1), outputs[:, last].flatten(0, 1).contiguous())
         of_right = after.reshape(len(inner), -1, after.shape[-1])[:, laid.in_right]
         return torch.cat([outputs, of_right], dim=1)
 

@@ -43,7 +43,7 @@ from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_
 from kouxing.training.neural.teacher import WholeEncoder
 from kouxing.training.training_set import Report
 
-_RATE, _READOUT_RATE = 2e-4, 1.5e-3  # of the last layer, of the readout
+_RATE, _READOUT_RATE = 1.5e-4, 1.5e-3  # of the last layer, of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above
 _READOUT_STEPS = 150
 _WARM_UP_STEPS = 60
