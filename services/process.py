@@ -1,4 +1,4 @@
-"""Runs a service as a process.
+"""Runs a service as a process: ``python -m kouxing.services.process KIND``.
 
 Slow imports are inside functions: they run after Ctrl-C is set up to exit without a traceback.
 """
@@ -74,24 +74,27 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     return 0
 
 
-def run_module(name: str) -> None:
-    """Run one service, as ``python -m kouxing.services.<name>`` does."""
+def main() -> None:
+    """Run the service that the command line names. It starts faster than ``kouxing KIND``."""
     gc.disable()  # until the service runs: collection frees nothing, and takes a tenth of the start
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.kinds import KINDS
     from kouxing.shared.errors import UserError, with_name
 
-    parser = argparse.ArgumentParser(
-        prog=f"python -m kouxing.services.{name}", description=KINDS[name].summary
-    )
+    parser = argparse.ArgumentParser(prog="python -m kouxing.services.process")
+    parser.add_argument("kind", choices=KINDS)
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file.")
     parser.add_argument(
         "--set", action="append", metavar="KEY=VALUE", default=[], help="Set one key."
     )
     arguments = parser.parse_args()
     try:
-        status = serve(name, arguments.config, arguments.set)
+        status = serve(arguments.kind, arguments.config, arguments.set)
     except UserError as error:
-        print(with_name(name, str(error)), file=sys.stderr)
+        print(with_name(arguments.kind, str(error)), file=sys.stderr)
         status = 2
     sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
 VOWELS_FILE = ROOT / "tests" / "sounds" / "vowels-male.wav"  # a o e i u ü, with pauses between
 CHAIN = ("control", "recognizer", "synthesizer")
+SERVICE = ("-m", "kouxing.services.process")
 NODE = Path(sys.executable).with_name("node")
 LIMIT_S = 60.0  # for anything that takes no time on an idle machine
 NOTHING_SKIPPED = {  # on a busy machine
@@ -125,7 +126,7 @@ def kouxing(
 def start_python(
     *arguments: object, control: str = "", **environment: str
 ) -> subprocess.Popen[str]:
-    """Start Python with pipes; a service is ``-m kouxing.services.KIND``."""
+    """Start Python with pipes; a service is ``*SERVICE, KIND``."""
     if control:
         environment["KOUXING_CONTROL"] = control.partition(" ")[0]
     return subprocess.Popen(
@@ -243,7 +244,7 @@ class Gateway:
             "log_level": "error",
             **settings,
         }
-        self._program = program or ("-m", "kouxing.services.gateway")
+        self._program = program or (*SERVICE, "gateway")
         self._control = control
         self._environment = {variable("gateway", key): value for key, value in settings.items()}
         self.start()

@@ -185,7 +185,8 @@ class HostsSystem(System):
             "KOUXING_ADVERTISE": address,
             "KOUXING_INSECURE": "false",
         }
-        command = self.network.command(host, sys.executable, "-m", f"kouxing.services.{service}")
+        module = (sys.executable, "-m", "kouxing.services.process")
+        command = self.network.command(host, *module, service)
         environment |= {variable(service, "instance"): host}
         with (self._logs / f"{host}.log").open("wb") as log:
             self._processes[host] = subprocess.Popen(  # noqa: S603 - our own module

@@ -25,7 +25,7 @@ HANG_S = 5.0  # without a heartbeat; a loop that is silent for longer hangs
 
 
 class ServiceProcess(subprocess.Popen[bytes]):
-    """Runs ``python -m kouxing.services.<kind>``. It ends when this process ends.
+    """Runs ``python -m kouxing.services.process KIND``. It ends when this process ends.
 
     ``environment`` is complete but for two variables. A loop that sends no heartbeat for
     ``hang_limit_s`` hangs; without sessions, for 0.75 s longer. Other options are those of
@@ -48,7 +48,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         added = {PARENT_VARIABLE: str(os.getpid()), PULSE_VARIABLE: str(write_end)}
         try:
             super().__init__(
-                [sys.executable, "-m", f"kouxing.services.{kind}", *arguments],
+                [sys.executable, "-m", "kouxing.services.process", kind, *arguments],
                 env={**environment, **added},
                 pass_fds=(write_end,),
                 **options,

@@ -9,7 +9,7 @@ import pytest
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import key_folder, read_grants
 from tests.e2e.following import stream
-from tests.system import System, kouxing, own_addresses, start_python, wait_until
+from tests.system import SERVICE, System, kouxing, own_addresses, start_python, wait_until
 
 WORKERS = ("recognizer", "synthesizer")
 
@@ -74,7 +74,7 @@ def test_a_service_waits_for_control_and_says_why(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert kouxing("keys", "init").returncode == 0
     addresses = own_addresses(["control", "synthesizer"])
-    started = [start_python("-m", "kouxing.services.synthesizer", **addresses)]
+    started = [start_python(*SERVICE, "synthesizer", **addresses)]
     try:
         log = read_until("nothing listens there; start the service", started[0])
         assert "waiting for control at tcp://127.0.0.1" in log
@@ -82,7 +82,7 @@ def test_a_service_waits_for_control_and_says_why(
         checked = kouxing("doctor", environment=addresses)
         assert checked.returncode == 1
         assert "FAIL control at tcp://127.0.0.1" in checked.stdout
-        started.append(start_python("-m", "kouxing.services.control", **addresses))
+        started.append(start_python(*SERVICE, "control", **addresses))
         read_until('"message": "ready ', started[0])
     finally:
         for process in started:

@@ -38,9 +38,9 @@ from tests.system import LIMIT_S, Gateway, free_port, port_of
 PONG = b"\x8a\x80" + bytes(4)  # of a client
 LONG_TIMEOUT = """
 from kouxing.services.gateway import audio_sessions
-from kouxing.services.process import run_module
+from kouxing.services.process import serve
 audio_sessions.LAST_FRAME_TIMEOUT_S = 600
-run_module("gateway")
+serve("gateway", None, [])
 """
 
 

@@ -13,7 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import LIMIT_S, Gateway, System, free_port, port_of, start_python, wait_until
+from tests.system import (
+    LIMIT_S,
+    SERVICE,
+    Gateway,
+    System,
+    free_port,
+    port_of,
+    start_python,
+    wait_until,
+)
 
 NO_CONTROL = "tcp://127.0.0.1:9"
 UPGRADE = {
@@ -198,7 +207,7 @@ def test_only_the_owner_can_read_the_certificate(public: Site) -> None:
 def gateway_process(control: str = NO_CONTROL, **settings: str) -> subprocess.Popen[str]:
     names = {f"KOUXING_{name.upper()}": value for name, value in settings.items()}
     names = {"KOUXING_GATEWAY_PORT": "0", **names}
-    return start_python("-m", "kouxing.services.gateway", control=control, **names)
+    return start_python(*SERVICE, "gateway", control=control, **names)
 
 
 def test_plain_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> None:

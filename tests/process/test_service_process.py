@@ -9,12 +9,20 @@ from pathlib import Path
 import pytest
 
 from kouxing.shared.config import variable
-from tests.system import LIMIT_S, ROOT, can_connect, own_addresses, start_python, wait_until
+from tests.system import (
+    LIMIT_S,
+    ROOT,
+    SERVICE,
+    can_connect,
+    own_addresses,
+    start_python,
+    wait_until,
+)
 
 
 def ended(*arguments: str, **environment: str) -> tuple[int, str]:
     """Return the exit status of a program, and what it prints on standard error."""
-    process = start_python("-m", *arguments, **environment)
+    process = start_python(*arguments, **environment)
     _, log = process.communicate(timeout=LIMIT_S)
     return process.returncode, log
 
@@ -22,7 +30,7 @@ def ended(*arguments: str, **environment: str) -> tuple[int, str]:
 def test_ctrl_c_during_startup_prints_no_traceback() -> None:
     addresses = own_addresses(["recognizer"])
     port = int(addresses[variable("recognizer", "audio")].rpartition(":")[2])
-    process = start_python("-m", "kouxing.services.recognizer", **addresses)
+    process = start_python(*SERVICE, "recognizer", **addresses)
     wait_until(lambda: can_connect(port))  # bound, but no model is loaded yet
     process.send_signal(signal.SIGINT)
     _, log = process.communicate(timeout=LIMIT_S)
@@ -31,13 +39,16 @@ def test_ctrl_c_during_startup_prints_no_traceback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "slow_import"), [("kouxing.services.recognizer", "pydantic"), ("kouxing", "typer")]
+    ("arguments", "slow_import"),
+    [((*SERVICE, "recognizer"), "pydantic"), (("-m", "kouxing"), "typer")],
 )
-def test_ctrl_c_in_imports_prints_nothing(tmp_path: Path, module: str, slow_import: str) -> None:
+def test_ctrl_c_in_imports_prints_nothing(
+    tmp_path: Path, arguments: tuple[str, ...], slow_import: str
+) -> None:
     ctrl_c = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / f"{slow_import}.py").write_text(ctrl_c)
     path = f"{tmp_path}{os.pathsep}{ROOT}"
-    assert ended(module, PYTHONPATH=path) == (-signal.SIGINT, "")
+    assert ended(*arguments, PYTHONPATH=path) == (-signal.SIGINT, "")
 
 
 @pytest.mark.parametrize(
@@ -51,21 +62,21 @@ def test_reports_a_port_in_use(service: str, key: str) -> None:
         port = taken.getsockname()[1]
         value = str(port) if key.endswith("port") else f"tcp://127.0.0.1:{port}"
         environment = {**own_addresses([service]), variable(service, key): value}
-        status, log = ended(f"kouxing.services.{service}", **environment)
+        status, log = ended(*SERVICE, service, **environment)
     assert status == 2
     assert key in log
     assert "Traceback" not in log
 
 
 def test_reports_a_wrong_setting_before_it_binds_anything() -> None:
-    status, log = ended("kouxing.services.driver", "--set", "log_level=loud")
+    status, log = ended(*SERVICE, "driver", "--set", "log_level=loud")
     assert status == 2
     assert "driver.log_level" in log
     assert "Traceback" not in log
 
 
 def test_a_service_ends_with_its_supervisor(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "kouxing.services.synthesizer"]
+    command = [sys.executable, *SERVICE, "synthesizer"]
     starter = (
         "import os, subprocess\n"
         "os.environ['_KOUXING_SUPERVISOR'] = str(os.getpid())\n"

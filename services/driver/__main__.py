@@ -1,6 +1,0 @@
-"""Runs the driver as a process."""
-
-from kouxing.services.process import run_module
-
-if __name__ == "__main__":
-    run_module("driver")

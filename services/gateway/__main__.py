@@ -1,6 +1,0 @@
-"""Run the gateway in this process."""
-
-from kouxing.services.process import run_module
-
-if __name__ == "__main__":
-    run_module("gateway")
