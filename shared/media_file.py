@@ -14,7 +14,9 @@ from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.sound_formats import (
     MIN_UNKNOWN_BYTES,
+    codec_of_padded_wav,
     is_sound,
+    is_transport_stream,
     unprobed_format,
     why_unreadable,
 )
@@ -24,6 +26,7 @@ _MAX_RATE_HZ = 1_000_000
 OPTIONS = {"protocol_whitelist": "none"}  # no network access, and no files from playlists
 # A pipe's first frame is decoded as soon as its bytes are there.
 _PIPE_OPTIONS = OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
+_PACKET_OPTIONS = _PIPE_OPTIONS | {"probesize": "4096"}  # with the list of tracks
 _JITTER_S = 0.05  # timestamps that differ less from the number of samples are inexact
 _MAX_OVERLAP_S = 1.0  # timestamps that go back further start again
 _MAX_GAP_S = 3600.0  # a larger one is an error in the timestamps
@@ -31,6 +34,8 @@ _MAX_GAP_OF_BROADCAST_S = 10.0  # its timestamps may start again at any value
 _MIN_MISSING_S = 0.1  # of a track that is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
+# FFmpeg guesses these by the name of the file, and guesses their rate.
+_RAW_FORMATS = {"alaw", "mulaw", "s8", "u8", "s16le", "s16be", "u16le", "u16be"}
 _TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
 # AVI is not in this list, because its duration includes gaps without packets.
 _HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|flv|caf|ape|tta|wv|au|w64")
@@ -55,9 +60,9 @@ class WavPcm(NamedTuple):
 class MediaSound:
     """One audio track of a media file, with one or two channels.
 
-    ``track`` counts from 1; None: the first track that can be decoded. ``name`` is the file's, for
-    messages. ``blocks`` yields the sample rate and samples, (n, channels); the rate may change.
-    ``remarks`` is complete after the last block.
+    ``track`` counts from 1. If it is None, the default track is read, or else the first, of those
+    that can be decoded. ``name`` is the file's, for messages. ``blocks`` yields the sample rate and
+    samples, (n, channels); the rate may change. ``remarks`` is complete after the last block.
 
     Raises ``UserError`` if FFmpeg cannot read the file, or it has no such track; while reading, if
     nothing can be decoded.
@@ -72,13 +77,16 @@ class MediaSound:
         self._mixers: dict[tuple[str, str, int], list[Any]] = {}
         if begin.startswith(b"RIFX"):  # FFmpeg reads its samples in the wrong byte order
             raise UserError(f"{name}: this is a big-endian WAV file; export it as wav or flac")
+        options = OPTIONS
+        if is_pipe:
+            options = _PACKET_OPTIONS if is_transport_stream(begin) else _PIPE_OPTIONS
         self._file = _GuardedFile(file, can_seek=not is_pipe)
         try:
             self._container: Any = av.open(
                 self._file,
                 mode="r",
                 format=unprobed_format(begin),
-                options=_PIPE_OPTIONS if is_pipe else OPTIONS,
+                options=options,
                 buffer_size=4096 if is_pipe else 65536,
                 metadata_errors="replace",
             )
@@ -86,7 +94,17 @@ class MediaSound:
             self._file.check()
             raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
         try:
+            if self._container.format.name in _RAW_FORMATS:
+                raise UserError(
+                    f"{name}: these are samples without a header; convert them to wav with FFmpeg,"
+                    " stating their format and rate"
+                )
             self._stream = self._choose(track, begin)
+            self._decoder = self._stream.codec_context
+            if codec := codec_of_padded_wav(begin):
+                self._decoder = av.CodecContext.create(codec, "r")
+                self._decoder.sample_rate = self._stream.codec_context.sample_rate
+                self._decoder.layout = self._stream.codec_context.layout
             self._frames = self._decode()
             first = next(self._frames, None)
             if first is None:
@@ -115,6 +133,8 @@ class MediaSound:
         if track is not None and not 1 <= track <= len(tracks):
             raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")
         decodable = [place for place, one in enumerate(tracks, 1) if one.codec_context is not None]
+        default = av.stream.Disposition.default
+        decodable.sort(key=lambda place: not tracks[place - 1].disposition & default)
         chosen = track or next(iter(decodable), 1)
         stream = tracks[chosen - 1]
         if stream.codec_context is None:
@@ -159,7 +179,7 @@ class MediaSound:
             if self._is_encrypted:
                 return
             try:
-                frames = packet.decode()
+                frames = self._decoder.decode(packet)
             except (av.error.FFmpegError, ValueError):
                 self._on_damage(end_s)
                 continue
@@ -331,7 +351,7 @@ def pcm_of_wav(begin: bytes) -> WavPcm | None:
 
     None for other encodings, more than two channels, and rates that need resampling.
     """
-    if begin[:4] != b"RIFF" or begin[8:12] != b"WAVE":
+    if begin[:4] != b"RIFF" or begin[8:12] != b"WAVE" or codec_of_padded_wav(begin):
         return None
     try:
         with av.open(io.BytesIO(begin), mode="r", format="wav") as container:

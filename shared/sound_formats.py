@@ -5,7 +5,8 @@ from typing import Literal
 
 import av
 
-NUM_BEGIN_BYTES = 4096  # enough for all of this module
+NUM_BEGIN_BYTES = 16_384  # enough for all of this module; three frames of the largest size
+_NUM_HEADER_BYTES = 4096  # of a WAV or MP4 file
 _SOUND = (
     (0, b"RIFF"), (0, b"RIFX"), (0, b"RF64"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"),
     (0, b"OggS"), (0, b"fLaC"), (0, b"ID3"), (0, b"FORM"), (0, b"caff"), (0, b"#!AMR"),
@@ -15,10 +16,16 @@ _SOUND = (
     (0, b"nut/multimed"), (0, b"\0\0\0\0\1\xbc"), (0, b"\6\x0e\x2b\x34"), (0, b"NIST_1A"),
     (0, b"\xb7\xd8\0\x20\x37\x49\xda\x11"), (0, b".SoX"), (0, b"XoS."), (0, b"MMMD"),
     (0, b"STRM\0"), (0, b"DSD "), (0, b"FRM8"), (0, b"tBaK"), (0, b"MPCK"), (0, b"#!iLBC"),
-    (0, b"\2dss"), (0, b"\3ds2"), (0, b"\x7f\xfe\x80\1"), (0, b"\x72\xf8\x1f\x4e"),
+    (0, b"\2dss"), (0, b"\3ds2"), (0, b"\x72\xf8\x1f\x4e"), (0, b"MP+"), (0, b"ajkg"),
     *((0, bytes([0x64, 0xA3, kind, 0])) for kind in (1, 2, 3, 4)),  # IRCAM
     *((0, bytes([0, kind, 0xA3, 0x64])) for kind in (1, 2, 3, 4)),
 )  # fmt: skip
+# Formats that FFmpeg recognizes only by more bytes, with FFmpeg's names.
+_UNPROBED = {
+    "dts": (0, b"\x7f\xfe\x80\1"),
+    "truehd": (4, b"\xf8\x72\x6f\xba"),
+    "mlp": (4, b"\xf8\x72\x6f\xbb"),
+}
 # Codecs whose frames need no container, with the bits of a frame's first two bytes.
 _FRAMED = (
     ("mp3", 0xFFE6, 0xFFE2),
@@ -48,6 +55,7 @@ _OTHER = {
     b"\x89PNG": "a picture, not sound",
     b"\xff\xd8\xff": "a picture, not sound",
     b"GIF8": "a picture, not sound",
+    **dict.fromkeys((b"#!SILK", b"\2#!SILK"), "a SILK voice message; convert it to wav first"),
     b"MThd": "a MIDI file: notes without sound; render it to wav with a synthesizer",
 }
 
@@ -55,22 +63,29 @@ _OTHER = {
 def is_sound(begin: bytes) -> bool:
     """Return whether the first bytes are those of a sound or video format."""
     return (
-        any(begin.startswith(mark, place) for place, mark in _SOUND)
-        or _is_transport_stream(begin)
+        any(begin.startswith(mark, place) for place, mark in (*_SOUND, *_UNPROBED.values()))
+        or (begin.startswith(b"\x80\0") and b"(c)CRI" in begin)  # ADX
+        or is_transport_stream(begin)
         or any(_consists_of_frames(begin, *kind) for kind in _FRAMED)
     )
 
 
 def unprobed_format(begin: bytes) -> str | None:
-    """Return FFmpeg's name of a format that FFmpeg recognizes only by the file extension."""
-    return "sbc" if begin.startswith(b"\x9c") and is_sound(begin) else None
+    """Return FFmpeg's name of a format that FFmpeg does not recognize by its first bytes."""
+    if begin.startswith(b"\x9c") and is_sound(begin):
+        return "sbc"
+    names = (name for name, (place, mark) in _UNPROBED.items() if begin.startswith(mark, place))
+    return next(names, None)
 
 
 def needs_more(begin: bytes) -> bool:
     """Return whether more bytes are needed, up to ``NUM_BEGIN_BYTES``, to recognize a format."""
-    if len(begin) < 12 or begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
+    if len(begin) < 12:
         return True
-    may_be = begin[0] in (0xFF, 0x0B, 0x56, 0x9C, _TS_SYNC) or begin[4] == _TS_SYNC
+    if begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
+        return len(begin) < _NUM_HEADER_BYTES
+    may_be = _TS_SYNC in (begin[0], begin[4]) or begin.startswith(b"\x80\0")
+    may_be |= any(int.from_bytes(begin[:2], "big") & mask == sync for _, mask, sync in _FRAMED)
     return may_be and not is_sound(begin)
 
 
@@ -108,6 +123,18 @@ def stated_bytes(begin: bytes) -> int | None:
     return None
 
 
+def codec_of_padded_wav(begin: bytes) -> str | None:
+    """Return the codec of a WAV file whose samples have unused bits, such as 24 bits of 32.
+
+    FFmpeg takes such samples for smaller ones.
+    """
+    header = begin[begin.find(b"fmt ") + 8 :]
+    kind, valid, subtype = (int.from_bytes(header[at : at + 2], "little") for at in (0, 18, 24))
+    bits = int.from_bytes(header[14:16], "little")
+    is_padded = kind == 0xFFFE and subtype == 1 and bits in (24, 32) and 8 < valid < bits
+    return f"pcm_s{bits}le" if begin[8:12] == b"WAVE" and is_padded else None
+
+
 def needs_whole_file(begin: bytes) -> bool:
     """Return whether a file can be decoded only once its end is there."""
     if begin.startswith((b"caff", b"wvpk", b"\xb7\xd8\0\x20")):
@@ -128,7 +155,8 @@ def _has_index_first(begin: bytes) -> bool:
     return False
 
 
-def _is_transport_stream(begin: bytes) -> bool:
+def is_transport_stream(begin: bytes) -> bool:
+    """Return whether the first bytes are packets of MPEG."""
     return any(
         len(syncs := begin[place::size]) >= 5 and set(syncs[:5]) == {_TS_SYNC}
         for place, size in _TS_PACKETS

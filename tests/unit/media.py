@@ -32,6 +32,7 @@ def write_tracks(
     rate_hz: int,
     *,
     titles: Sequence[str] = (),
+    default_track: int = 1,
     video_s: float = 0.0,
     options: dict[str, str] | None = None,
 ) -> None:
@@ -43,11 +44,12 @@ def write_tracks(
             video.width = video.height = 32
             video.pix_fmt = "yuv420p"
         # These encoders of FFmpeg have no default bit rate.
-        encoding = {"b": "128k"} if codec in ("sbc", "wmav2") else {}
+        encoding = {"b": "160k"} if codec in ("sbc", "wmav2", "mp2") else {}
         streams = [
             container.add_stream(codec, rate=rate_hz, layout="mono", options=encoding)
             for _ in tracks
         ]
+        streams[default_track - 1].disposition = av.stream.Disposition.default
         for stream, title in zip(streams, titles, strict=False):
             stream.metadata["title"] = title
         if video_s:

@@ -147,6 +147,14 @@ def test_reads_the_formats_of_phones_and_browsers(
     assert source.remarks == []
 
 
+@pytest.mark.parametrize("suffix", ["ul", "al", "sw"])
+def test_does_not_guess_the_rate_of_samples_without_a_header(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"call.{suffix}"
+    path.write_bytes(bytes(range(1, 200)) * 50)
+    with pytest.raises(UserError, match="samples without a header; convert them to wav"):
+        open_audio(path)
+
+
 def test_rejects_media_without_audio_and_playlists(tmp_path: Path) -> None:
     with av.open(tmp_path / "mute.mp4", "w") as container:
         stream = container.add_stream("mpeg4", rate=25)

@@ -13,7 +13,7 @@ import soundfile
 from kouxing.shared.audio_file import AudioSource, open_audio, read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import RawFormat
-from kouxing.shared.sound_formats import is_sound
+from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, is_sound
 from tests.system import DEMO
 from tests.unit.media import write_media
 
@@ -49,8 +49,9 @@ CODECS = {  # of formats that soundfile cannot write
         "amr": "libopencore_amrnb",
         "wma": "wmav2",
     },
+    **{"adx": "adpcm_adx", "mp2": "mp2"},
 }
-RATES_HZ = {"amr": 8_000, "mmf": 8_000, "sbc": 16_000}
+RATES_HZ = {"amr": 8_000, "mmf": 8_000, "sbc": 16_000, "mp2": 16_000}
 
 
 @pytest.mark.parametrize(
@@ -69,6 +70,7 @@ def test_decodes_a_pipe_like_a_file(
     else:
         soundfile.write(path, SPEECH, RATE_HZ)
     expected, rate_hz = read_audio(path)
+    assert is_sound(path.read_bytes()[:NUM_BEGIN_BYTES])
     source = _open(monkeypatch, path.read_bytes())
     samples = np.concatenate([*source.blocks])
     assert source.sample_rate_hz == rate_hz
@@ -89,6 +91,20 @@ def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, sub
     samples = np.concatenate([*source.blocks])
     assert len(samples) == 3000
     np.testing.assert_allclose(samples, 0.25, atol=0.01)
+
+
+@pytest.mark.parametrize(("bits", "valid_bits"), [(32, 24), (32, 20), (32, 16), (24, 20)])
+def test_reads_wav_samples_with_unused_bits(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bits: int, valid_bits: int
+) -> None:
+    file = io.BytesIO()
+    soundfile.write(file, SPEECH, RATE_HZ, f"PCM_{bits}", format="WAVEX")
+    data = bytearray(file.getvalue())
+    place = data.find(b"fmt ") + 8 + 18
+    data[place : place + 2] = valid_bits.to_bytes(2, "little")
+    (tmp_path / "a.wav").write_bytes(data)
+    for source in (open_audio(tmp_path / "a.wav"), _open(monkeypatch, bytes(data))):
+        np.testing.assert_allclose(np.concatenate([*source.blocks])[:, 0], SPEECH, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -190,6 +206,7 @@ def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
         (b"", {}, "no sound arrived"),
         (b'{"error": "invalid key"}', {}, 'this is text, not sound: \'{"error": "invalid key'),
         (b"\x1f\x8b\x08" + bytes(99), {}, "gzip archive; unpack"),
+        (b"\2#!SILK_V3" + bytes(99), {}, "SILK voice message"),
         (b"OggS" + bytes(99), {"raw": RawFormat(24_000)}, "leave out --rate"),
         (b"\0" * 99, {"raw": RawFormat(4_000)}, "4000 Hz is too low"),
     ],

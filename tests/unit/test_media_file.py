@@ -121,6 +121,14 @@ def test_mixes_eight_channels(tmp_path: Path, codec: str) -> None:
     assert np.abs(mixed[2000:-2000]).max() == pytest.approx(0.35, abs=0.02)
 
 
+def test_reads_the_default_track(tmp_path: Path) -> None:
+    tracks = [[(0.0, np.zeros_like(TONE))], [(0.0, TONE)]]
+    write_tracks(tmp_path / "a.mkv", "pcm_s16le", tracks, RATE_HZ, default_track=2)
+    source = open_audio(tmp_path / "a.mkv")
+    np.testing.assert_allclose(_read(source), TONE, atol=1e-4)
+    assert "This reads track 2" in source.notices[0]
+
+
 def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
     path = tmp_path / "obs.mkv"
     tracks = [[(0.0, np.zeros_like(TONE))], [(0.0, TONE)]]
