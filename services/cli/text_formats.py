@@ -9,6 +9,7 @@ import contextlib
 import html
 import re
 from collections.abc import Callable
+from itertools import groupby, pairwise
 from typing import NamedTuple
 
 from kouxing.shared.errors import UserError
@@ -48,14 +49,23 @@ _MIN_COMMON = 0.8  # share of common characters in a text that was decoded corre
 _TIME = r"(?:\d{1,3}:)?\d{1,2}:\d{2}(?:[.,:]\d{1,3})?"
 _LRC_TIME = r"\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
 _FRAMES = r"(?:\{\d+\}\{\d*\}|\[\d+\]\[\d*\])"
-_LABEL = r"\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t"
-_TIMED_LINE = rf"[(\[]?{_TIME}[)\]]?(?:[ \t]+|$)"
+_LABEL = (  # times of Audacity or CTM, or the name of a recording
+    r"(?:\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t|(?:\S+ \d )?\d+\.\d+ +\d+\.\d+ +"
+    r"|[A-Za-z]+(?:[\w.-]*?\d){6}[\w.-]*[ \t]+)"
+)
+_TIMES = rf"{_TIME}(?:[ \t]*(?:-->|[-–—~→])[ \t]*{_TIME})?"
+_TIMED_LINE = (  # also the line of a speaker, with the time at its end
+    rf"(?:[(\[【]{_TIMES}[)\]】]|{_TIMES}(?=[ \t]|$)|\S.{{,30}}?[ \t]+{_TIMES}[ \t]*$)[ \t]*"
+)
+_LYRICS_TIME = r"\[\d+,\d+\]"
 
 _CUE_TIMES = re.compile(rf"^[ \t]*{_TIME}[ \t]*-->[ \t]*{_TIME}", re.MULTILINE)
 _SBV_TIMES = re.compile(r"^\d+:\d{2}:\d{2}\.\d{3},\d+:\d{2}:\d{2}\.\d{3}[ \t]*$", re.MULTILINE)
 _LRC_FIELD = re.compile(r"\[[A-Za-z#]+:[^\]]*\]")
 _LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
 _BRACES = re.compile(r"\{[^{}]*\}")
+_CUE_NUMBER = re.compile(rf"^\d+[ \t]*\n\s*(?={_TIME}[ \t]*-->)", re.MULTILINE)
+_SOUND_NAME = re.compile(r"\[[^][\n]*\]|【[^【】\n]*】|[♪♫]")
 _INLINE_TIME = re.compile(r"<\d{1,3}:[\d:.]+>")
 _TAG = re.compile(r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--")
 _MARKUP = re.compile(  # matches in linear time
@@ -137,18 +147,31 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
 
 
 def _read_cues(text: str) -> str:
-    """Extract the text from SubRip or WebVTT."""
-    spoken: list[str] = []
-    for block in re.split(r"\n[ \t]*\n", text):
+    """Extract the text from SubRip or WebVTT, without the names of sounds, such as [掌声]."""
+    cues: list[list[str]] = [[]]
+    for block in re.split(r"\n[ \t]*\n", _CUE_NUMBER.sub("", text)):
         lines = block.strip("\n").split("\n")
         if re.match(r"WEBVTT|NOTE\b|STYLE$|REGION$", lines[0]):
             continue
         for number, line in enumerate(lines):
             if not _CUE_TIMES.match(line):
-                spoken.append(_BRACES.sub("", line))
-            elif number == 1 or (number and lines[number - 1].strip().isdigit()):
-                spoken.pop()  # the name of the cue
-    return _read_markup("\n".join(spoken))
+                cues[-1].append(_SOUND_NAME.sub("", _BRACES.sub("", line)))
+                continue
+            if number == 1 or (number and lines[number - 1].strip().isdigit()):
+                cues[-1].pop()  # the name of the cue
+            cues.append([])
+    return "\n".join(_without_repeats([_read_markup("\n".join(cue)).split("\n") for cue in cues]))
+
+
+def _without_repeats(cues: list[list[str]]) -> list[str]:
+    """Return the lines of cues. In rolling captions, a cue repeats the last line of the one before.
+
+    Cues of a single line can also be spoken twice. They are repeats only if others roll.
+    """
+    cues = [lines for cue in cues if (lines := [line.strip() for line in cue if line.strip()])]
+    is_rolling = any(len(cue) > 1 and cue[0] == last[-1] for last, cue in pairwise(cues))
+    lines = [line for cue in cues for line in cue]
+    return [line for line, _ in groupby(lines)] if is_rolling else lines
 
 
 def _read_sbv(text: str) -> str:
@@ -193,8 +216,12 @@ def _read_events(text: str) -> str:
 
 
 def _read_labels(text: str) -> str:
-    """Extract the labels of Audacity or Whisper: start, end and label, separated by tabs."""
+    """Extract the labels of Audacity, Whisper, CTM or a list of recordings."""
     return "\n".join(re.findall(rf"^{_LABEL}(.*)", text, re.MULTILINE))
+
+
+def _read_timed_lyrics(text: str) -> str:
+    return re.sub(rf"{_LYRICS_TIME}|[(<]\d+(?:,\d+)+[)>]", "", text)
 
 
 def _read_timed_lines(text: str) -> str:
@@ -302,21 +329,25 @@ _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (
     ("ASS or SSA", re.compile(r"\A\[(Script Info|V4\+? Styles|Events)\]", re.I), _read_events),
     ("JSON", re.compile(r'\A(\{\s*"|\[\s*[{"])'), _read_json),
     ("SubRip (SRT)", _CUE_TIMES, _read_cues),
+    ("lyrics with times", re.compile(rf"^{_LYRICS_TIME}", re.MULTILINE), _read_timed_lyrics),
     ("SBV", _SBV_TIMES, _read_sbv),
     ("LRC", re.compile(rf"^[ \t]*{_LRC_TIME}", re.MULTILINE), _read_lrc),
     ("MicroDVD or MPL2", re.compile(rf"\A{_FRAMES}"), _read_frame_numbers),
     ("a table of labels", re.compile(rf"\A([^\n]*\n)?{_LABEL}"), _read_labels),
     ("SSML", re.compile(r"<speak\b", re.I), _read_markup),
     ("TTML", re.compile(r"<(\w+:)?tt\b", re.I), _read_markup),
-    ("HTML", re.compile(r"<(!DOCTYPE html|html|body)\b", re.I), _read_markup),
     ("SAMI", re.compile(r"<sami\b", re.I), _read_markup),
     ("a transcript in XML", re.compile(r"<(transcript|timedtext)\b", re.I), _read_markup),
+    ("HTML", re.compile(r"<(!DOCTYPE html|html|body)\b", re.I), _read_markup),
     ("XML", re.compile(r"\A<\?xml"), _reject_xml),
     ("Markdown", re.compile(r"^#{1,6} |^```|\]\([^)\s]+\)", re.MULTILINE), _read_markdown),
     ("text with tags", _TAG, _read_markup),
     (
         "a transcript with times",
-        re.compile(rf"\A[(\[]?0?0:.*\n(.*\n)?{_TIMED_LINE}", re.MULTILINE),
+        re.compile(
+            rf"\A(?=(?:.{{,30}}[ \t])?[(\[【]?0?0:){_TIMED_LINE}.*\n(.*\n){{,3}}?{_TIMED_LINE}",
+            re.MULTILINE,
+        ),
         _read_timed_lines,
     ),
 )

@@ -42,7 +42,6 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 BUILT_IN = {"mandarin": "kouxing.shared.phones.mandarin"}
 DEFAULT_LANGUAGE = "mandarin"
 ENTRY_POINTS = "kouxing.languages"
-SILENCE = "sil"  # the phone of a pause, in every language, as in kouxing_client
 KINDS = ("initial", "vowel", "silence")
 MAX_PHONES = 255  # model files count phones in 8 bits
 SILENCE = "sil"  # also in kouxing_client, which is slow to import

@@ -102,6 +102,10 @@ def test_pronounces_text() -> None:
         ("增长12.25，3.14", "增长十二点二五三点一四"),
         ("2024-12-25，02-05，12月25日", "二零二四年十二月二十五日二月五日十二月二十五日"),
         ("0571-1234567，10-3=7", "零五七一一二三四五六七十减三等于七"),
+        ("2024-01-02世", "二零二四年一月二日世"),
+        ("(021)55556666，010 6552 9988", "零二一五五五五六六六六零一零六五五二九九八八"),
+        ("编号0123，6222021234567890", "编号零一二三六二二二零二一二三四五六七八九零"),
+        ("1.2.3版，9·11，08:05，0.25", "一点二点三版九一一八点零五分零点二五"),
     ],
 )
 def test_reads_numbers(text: str, read: str) -> None:
@@ -120,6 +124,9 @@ def test_reads_numbers(text: str, read: str) -> None:
         ("nĭ hɑ̌o ɡuó", "ni3 hao3 guo2"),
         ("pāris café résumé banana mp3", ""),
         ("nihao, hello", ""),
+        ("no so", ""),
+        ("他說ㄏㄠˇ ㄖㄜˋ，你ㄋㄧˇ好(ㄏㄠˇ)", "ta1 shuo1 hao3 re4 ni3 hao3"),
+        ("重（ㄔㄨㄥˊ）慶", "chong2 qing4"),
         ("Nihao Zhongguo! Tom", "ni hao zhong guo"),
         ("tiananmen fangan yidianr lüxing", "tian an men fan gan yi dian r lv xing"),
         ("ㄋㄧˇㄏㄠˇ ㄓㄨㄥㄍㄨㄛˊ˙ㄇㄚ ㄇㄚ˙", "ni3 hao3 zhong1 guo2 ma5 ma5"),

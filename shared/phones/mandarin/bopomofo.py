@@ -19,6 +19,7 @@ _FINALS = _RIMES | {
 _WITHOUT_FINAL = dict.fromkeys("ㄓㄔㄕㄖ", "iii") | dict.fromkeys("ㄗㄘㄙ", "ii")
 _TONES = {"": "1", "ˉ": "1", "ˊ": "2", "ˇ": "3", "ˋ": "4", "˙": "5"}
 _SYLLABLE = re.compile("(˙?)(?=[ㄅ-ㄩ])([ㄅ-ㄙ]?)([ㄧㄨㄩ]?[ㄚ-ㄦ]?)([ˉˊˇˋ˙]?)")
+WORDS_IN_BOPOMOFO = re.compile("([(（]?[ㄅ-ㄩˉˊˇˋ˙](?:[ㄅ-ㄩˉˊˇˋ˙ ]*[ㄅ-ㄩˉˊˇˋ˙])?[)）]?)")
 
 
 def read_bopomofo(text: str, spell: Callable[[tuple[str, ...]], str]) -> str:

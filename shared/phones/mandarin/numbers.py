@@ -14,8 +14,19 @@ _SENTENCE = re.compile(
     r"[^。！？]{1,500}(?![^。！？])[。！？]*|.{1,500}(?<!\d)|.{1,500}", re.DOTALL
 )
 _HALF_WIDTH = str.maketrans("０１２３４５６７８９．％￥", "0123456789.%¥")
-_PHONE_NUMBER = re.compile(r"(?<!\d)(1\d\d) (\d{4}) (\d{4})(?!\d)")
-_DIGITS = str.maketrans("0123456789", "零一二三四五六七八九")
+_PHONE_NUMBER = re.compile(r"(?<!\d)(1\d\d|0\d{2,3}) (\d{4}) (\d{4})(?!\d)")
+_DIGITS = str.maketrans("0123456789.", "零一二三四五六七八九点", "·")
+_DATE = (
+    r"(?<![\d.:/-])((?:19|20)\d\d)([-/.])(0?[1-9]|1[0-2])\2(0?[1-9]|[12]\d|3[01])"
+    r"(?![\d./-])[日号號]?"
+)
+# Telephone and account numbers, numbers with a leading zero, versions such as 1.2.3, and 9·11.
+_READ_DIGIT_BY_DIGIT = (
+    r"(?<![\d.])\d{13,}(?![\d.])"
+    r"|(?<![\d.,:/-])0\d+(?![\d.,:/%-]|[月日号號])"
+    r"|(?<![\d.])(?!(?:19|20)\d\d\.)\d+(?:\.\d+){2,}(?![\d.])"
+    r"|(?<!\d)\d{1,2}·\d{1,2}(?!\d)"
+)
 # Two numbers with a hyphen that are not a date (2024-12, 02-05), a time or a telephone number.
 _RANGE = (
     r"(比[分数]\D{0,3})?(?<![\d.:/-])(?!(?:19|20)\d\d-(?:0?[1-9]|1[0-2])(?!\d)|0\d-)"
@@ -54,6 +65,11 @@ def _read_range(match: re.Match[str]) -> str:
     return f"{before}{first}{'比' if is_score else '~'}"
 
 
+def _read_date(match: re.Match[str]) -> str:
+    year, _, month, day = match.groups()
+    return f"{year}年{int(month)}月{int(day)}日"
+
+
 def _read_digits(number: str) -> str:
     return number.translate(_DIGITS)
 
@@ -66,7 +82,9 @@ _NUMBER_SPELLINGS = tuple(
         (r"(?<![\d.,])(\d{1,3}(?:,\d{3})+)(?![\d,])", lambda match: match[1].replace(",", "")),
         (r"(?<=[%℃度])[-−–—－~～](?=\d)", "到"),
         (r"(?<=\d)[–—－～](?=\d)", "~"),
-        (r"(?<!\d)(0\d{2,3})-(\d{7,8})(?!\d)", lambda match: _read_digits(match[1] + match[2])),
+        (r"(?<!\d)[(（]?(0\d{2,3})[)）-](?=\d{7,8}(?!\d))", r"\1"),
+        (_DATE, _read_date),
+        (_READ_DIGIT_BY_DIGIT, lambda match: _read_digits(match[0])),
         (r"(?<=\d) - (?=\d)", "减"),
         (_RANGE, _read_range),
         (

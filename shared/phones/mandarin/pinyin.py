@@ -21,7 +21,7 @@ import unicodedata
 from functools import lru_cache
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.mandarin.bopomofo import read_bopomofo
+from kouxing.shared.phones.mandarin.bopomofo import WORDS_IN_BOPOMOFO, read_bopomofo
 from kouxing.shared.phones.mandarin.numbers import numbers_as_words, unambiguous_numbers
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
@@ -29,8 +29,9 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 _INITIALS_BY_LENGTH = tuple("zh ch sh b p m f d t n l g k h j q x r z c s".split())
 
 # Rows of finals: spelling after an initial -> phone, and the initials that the row follows.
-_OPEN_ROW = {phone: phone for phone in "a o e ai ei ao ou an en ang eng ong".split()}
+_OPEN_ROW = {phone: phone for phone in "a e ai ei ao ou an en ang eng ong".split()}
 _OPEN_INITIALS = set("b p m f d t n l g k h zh ch sh r z c s".split())
+_O_INITIALS = set("b p m f l".split())
 _I_ROW = {phone: phone for phone in "i ia ie iao ian in iang ing iong".split()} | {"iu": "iou"}
 _I_INITIALS = set("b p m f d t n l j q x".split())
 _U_ROW = {phone: phone for phone in "ua uo uai uan uang".split()} | {"ui": "uei", "un": "uen"}
@@ -167,6 +168,7 @@ def write(spelling: str) -> str:
 def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
 
+    Bopomofo in brackets, or with the sound of the characters before it, is their reading.
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
     dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
     (``nihao``) are split only if most letters are pinyin, because words of other languages may look
@@ -180,7 +182,9 @@ def transcribe(text: str) -> Transcript:
     ('Tom',)
     """
     text = _KEYCAP.sub(" ", text)
-    if _CHINESE.search(text) or not any(letter.isalpha() for letter in text):
+    if _CHINESE.search(text):
+        return _read_with_bopomofo(text)
+    if not any(letter.isalpha() for letter in text):
         return _read_characters(text)
     text = read_bopomofo(text, spell)
     words = _PINYIN_WORD.findall(unicodedata.normalize("NFKC", text))
@@ -259,6 +263,22 @@ def _is_syllable(word: str) -> bool:
     except UserError:
         return False
     return True
+
+
+def _read_with_bopomofo(text: str) -> Transcript:
+    """Read characters with words in bopomofo, or with bopomofo as the reading of characters."""
+    syllables: list[SpokenSyllable] = []
+    dropped: list[str] = []
+    for place, part in enumerate(WORDS_IN_BOPOMOFO.split(text)):
+        transcript = transcribe(part) if place % 2 else _read_characters(part)
+        if place % 2:
+            before = max(0, len(syllables) - len(transcript.syllables))
+            annotated = [syllable.phones for syllable in syllables[before:]]
+            if part[0] in "(（" or annotated == transcript.phones:
+                del syllables[before:]
+        syllables += transcript.syllables
+        dropped += transcript.dropped
+    return Transcript(tuple(syllables), tuple(dropped))
 
 
 def _read_characters(text: str) -> Transcript:
@@ -355,6 +375,7 @@ def _final_of(initial: str, spelling: str) -> str | None:
         (_J_INITIALS, _J_ROW),  # before the u row, which j q x do not take
         (_V_INITIALS, _V_ROW),
         (_OPEN_INITIALS, _OPEN_ROW),
+        (_O_INITIALS, {"o": "o"}),
         (_I_INITIALS, _I_ROW),
         (_U_INITIALS, _U_ROW),
     )
