@@ -72,10 +72,10 @@ def is_sound(begin: bytes) -> bool:
 
 def unprobed_format(begin: bytes) -> str | None:
     """Return FFmpeg's name of a format that FFmpeg does not recognize by its first bytes."""
+    names = [name for name, (place, mark) in _UNPROBED.items() if begin.startswith(mark, place)]
     if begin.startswith(b"\x9c") and is_sound(begin):
-        return "sbc"
-    names = (name for name, (place, mark) in _UNPROBED.items() if begin.startswith(mark, place))
-    return next(names, None)
+        names = ["sbc"]
+    return names[0] if names else None
 
 
 def needs_more(begin: bytes) -> bool:

@@ -36,17 +36,21 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
         for target in targets:
             senders.start(target)
             print_message(f"sending {target.contents} to {target.url}; press Ctrl-C to stop")
-        with _Search(session, client) as search:
+        with _Search(session, client, senders) as search:
             _send_frames(search, client, senders)
 
 
 class _Search:
-    """Asks control for the session to follow, in a thread because answers may take long."""
+    """Asks control for the session to follow, in a thread because answers may take long.
 
-    def __init__(self, session: str, client: Client) -> None:
+    The targets' face at rest shows the expressions that control states.
+    """
+
+    def __init__(self, session: str, client: Client, senders: Senders) -> None:
         self.newest: SessionState | None = None
         self._session = session
         self._client = client
+        self._senders = senders
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -60,13 +64,17 @@ class _Search:
 
     def _run(self) -> None:
         while not self._ended.wait(SEARCH_PERIOD_S):
-            with contextlib.suppress(KouxingError):  # no such session, or control restarts
+            with contextlib.suppress(KouxingError):  # control restarts
+                status = self._client.status()
                 published = [
                     state
-                    for state in self._client.status(self._session).sessions
-                    if "faps" in state.endpoints
+                    for state in status.sessions
+                    if "faps" in state.endpoints and self._session in ("", state.session)
                 ]
                 self.newest = min(published, key=lambda state: state.age_s, default=self.newest)
+                face = status.resting_face
+                if face.get("expressions") is not None:
+                    self._senders.express(face["expressions"], face["hold_s"])
 
 
 def _send_frames(search: _Search, client: Client, senders: Senders) -> None:

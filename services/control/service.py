@@ -31,7 +31,7 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
 from kouxing.shared.wire.control import Event, EventName, Heartbeat, HeartbeatReply, SessionStarted
-from kouxing.shared.wire.face import SetFace
+from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
@@ -64,6 +64,7 @@ class ControlService(Service):
         self._status = Status(self._registry, self._sessions)
         self._process_id = secrets.token_hex(8)  # the instance may be a setting
         self._faults = Faults()
+        self._resting_face = CurrentFace(FaceSettings(), now_s)
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
         self._keys_version = (0, 0)  # of the list whose revoked keys have no sessions
@@ -176,6 +177,7 @@ class ControlService(Service):
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
         if message.session == "":  # the face at rest, which only observers show
+            self._resting_face.change(message.face, time.monotonic())
             for instance in self._registry.observers():
                 peer = self._registry[instance].peer
                 self._commands.send(replace(message, request=None), to=peer)
@@ -191,7 +193,11 @@ class ControlService(Service):
 
     def _report_status(self, message: StatusRequest, sender: Peer) -> Message:
         shows_token = self._requests.may_see_token(sender)
-        return self._status.report(message, time.monotonic(), shows_token=shows_token)
+        now_s = time.monotonic()
+        resting_face = self._resting_face.at(now_s)
+        return self._status.report(
+            message, now_s, resting_face=resting_face, shows_token=shows_token
+        )
 
     # --- messages of services ---
 

@@ -6,6 +6,7 @@ from kouxing.services.control.registry import Registry, ServiceRecord
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.sessions import Sessions
 from kouxing.shared.wire.codec import encoded_size
+from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ServiceState, SessionState, StatusReport, StatusRequest
 
 PAGE_BYTES = 512 * 1024  # the largest state after that still fits into a message
@@ -19,7 +20,14 @@ class Status:
         self._registry = registry
         self._sessions = sessions
 
-    def report(self, message: StatusRequest, now_s: float, *, shows_token: bool) -> StatusReport:
+    def report(
+        self,
+        message: StatusRequest,
+        now_s: float,
+        *,
+        resting_face: FaceSettings,
+        shows_token: bool,
+    ) -> StatusReport:
         """Return one page, or the state of one session and its services.
 
         The address of the web page contains its token only if ``shows_token``: with the token,
@@ -42,7 +50,11 @@ class Status:
                 next_number = number + 1
                 break
         return StatusReport(
-            request=message.request, services=services, sessions=sessions, next=next_number
+            request=message.request,
+            services=services,
+            sessions=sessions,
+            next=next_number,
+            resting_face=resting_face,
         )
 
     def _records(

@@ -178,6 +178,7 @@ class StatusReport(Message):
     services: Annotated[list[ServiceState], Meta(max_length=10000)]
     sessions: Annotated[list[SessionState], Meta(max_length=10000)]
     next: Count | None = None  # ``after`` of the request for the next page; None: the last page
+    resting_face: FaceSettings | None = None  # settings of the face at rest that are in effect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -155,15 +155,17 @@ def test_all_outputs_have_the_same_phones(system: System, command: Command, tmp_
     assert onsets_s == sorted(onsets_s)
 
 
-def test_send_sends_every_session_of_a_name(system: System) -> None:
+def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
+    system: System, command: Command
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
         program.bind(("127.0.0.1", 0))
         program.settimeout(LIMIT_S)
 
-        def jaw_opening() -> float:
-            while "/kouxing/jawOpen" not in (messages := dict(read_osc([program.recv(2000)]))):
+        def weight(shape: str) -> float:
+            while f"/kouxing/{shape}" not in (messages := dict(read_osc([program.recv(2000)]))):
                 pass
-            return float(messages["/kouxing/jawOpen"][0])
+            return float(messages[f"/kouxing/{shape}"][0])
 
         url = f"osc://127.0.0.1:{program.getsockname()[1]}"
         sender = start_python(
@@ -171,7 +173,13 @@ def test_send_sends_every_session_of_a_name(system: System) -> None:
         )
         assert sender.stderr is not None
         assert f"sending ARKit shapes and head to {url}" in sender.stderr.readline()
-        assert jaw_opening() == 0.0
+        assert weight("jawOpen") == weight("mouthSmileLeft") == 0.0
+        command("express", "smile=1", "--hold", "600")
+        while weight("mouthSmileLeft") < 0.5:
+            pass
+        command("express")
+        while weight("mouthSmileLeft") > 0.01:
+            pass
         for _ in range(2):
             with (
                 Client(system.control) as client,
@@ -180,9 +188,9 @@ def test_send_sends_every_session_of_a_name(system: System) -> None:
                 assert sender.stderr.readline() == "following session sent\n"
                 session.push(samples_of_file(SENTENCE))
                 session.finish()
-                while jaw_opening() < 0.1:
+                while weight("jawOpen") < 0.1:
                     pass
-            while jaw_opening() > 0.01:  # until the face is at rest
+            while weight("jawOpen") > 0.01:  # until the face is at rest
                 pass
         sender.send_signal(signal.SIGINT)
         output_of(sender)

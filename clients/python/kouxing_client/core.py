@@ -84,6 +84,7 @@ class ClientCore:
                 fields = page.result()
                 status.services.extend(msgspec.convert(fields["services"], list[ServiceState]))
                 status.sessions.extend(msgspec.convert(fields["sessions"], list[SessionState]))
+                status.resting_face.update(fields.get("resting_face") or {})
                 if fields.get("next"):
                     request_page(fields["next"])
                 else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
@@ -229,6 +229,8 @@ class Status:
 
     services: list[ServiceState]
     sessions: list[SessionState]
+    resting_face: dict[str, Any] = field(default_factory=dict)
+    """settings of the face at rest that are in effect, as in ``Client.set_face``"""
 
 
 M = TypeVar("M", bound=Message)
