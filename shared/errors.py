@@ -5,11 +5,13 @@ import importlib.util
 import sys
 from collections.abc import Iterator
 
+USER_ERROR = 2  # exit status of a program after a ``UserError``
+
 
 class UserError(Exception):
     """A mistake in the user's input. The text names the cause and the remedy.
 
-    The command line prints the text without a traceback and exits with status 2.
+    The command line prints the text without a traceback and exits with ``USER_ERROR``.
     """
 
 

@@ -19,13 +19,12 @@ from kouxing.services.cli.log_file import LogFile
 from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
 from kouxing.services.kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.control_client import connect
-from kouxing.shared.errors import UserError, with_name
+from kouxing.shared.errors import USER_ERROR, UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
 STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
-USER_ERROR = 2  # exit status of a service with a wrong configuration
 
 
 class Supervisor:

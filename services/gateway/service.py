@@ -172,8 +172,8 @@ class GatewayService(Service):
             self._sound_upload.close()
             if self._sample is not None:
                 self._sample[1].cancel()
-        is_decoding = self._sound_upload.is_decoding
-        is_busy = self._mouth_learner.is_learning or is_decoding or self._sample is not None
+        is_uploading = self._mouth_learner.is_running or self._sound_upload.is_running
+        is_busy = is_uploading or self._sample is not None
         is_connected = self._web_sockets or self._whip_clients
         return self._closing.done() and not is_busy and not is_connected
 

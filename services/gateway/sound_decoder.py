@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.shared.audio_file import clipping_remarks, limited_blocks, num_clipped, open_audio
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import USER_ERROR, UserError
 
-REJECTED = 2  # exit status after an error of the user
 MAX_DURATION_S = 3600
 MAX_CPU_S = 60
 MAX_MEMORY_BYTES = 4 << 30
@@ -42,4 +41,4 @@ if __name__ == "__main__":
         decode(Path(sys.argv[1]))
     except UserError as error:
         print(error, file=sys.stderr)
-        sys.exit(REJECTED)
+        sys.exit(USER_ERROR)

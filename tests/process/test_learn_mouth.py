@@ -1,10 +1,9 @@
-"""The gateway's learning of a mouth, with other functions in place of the real learning."""
+"""The gateway's learning of a mouth, with other programs in place of the real learning."""
 
 import asyncio
-import base64
 import io
 import os
-import time
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,34 +15,24 @@ from aiohttp import web
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.http import make_application
 from kouxing.services.gateway.learn_mouth import MAX_BYTES, MouthLearner
-from kouxing.services.mouth_profiles.worker import Learn
-from kouxing.shared.errors import UserError
 from tests.process.web_clients import async_test
 
-Learned = tuple[bytes, dict[str, object]]
-
-
-def reverse(recording: bytes) -> Learned:
-    return recording[::-1], {"after": {"opening": 0.5}}
-
-
-def refuse(_recording: bytes) -> Learned:
-    raise UserError("too little speech; read for 20 s or more")
-
-
-def fail(_recording: bytes) -> Learned:
-    raise RuntimeError("a bug")
-
-
-def crash(_recording: bytes) -> Learned:
-    os._exit(1)
-
-
-def hang(recording: bytes) -> Learned:
-    """Write the process id to the file that the recording names, and hang."""
-    Path(recording.decode()).write_text(str(os.getpid()))
-    time.sleep(60)
-    return b"", {}
+REVERSE = """
+import json, sys
+json.dump({"mouth_profile": sys.stdin.read()[::-1]}, sys.stdout)
+"""
+REFUSE = """
+import sys
+sys.exit(print("too little speech; read for 20 s or more", file=sys.stderr) or 2)
+"""
+FAIL = "raise RuntimeError('a bug')"
+CRASH = "import os; os.abort()"
+# writes the process id to the file that the recording names
+HANG = """
+import os, pathlib, sys, time
+pathlib.Path(sys.stdin.read()).write_text(str(os.getpid()))
+time.sleep(60)
+"""
 
 
 class Gateway:
@@ -60,8 +49,8 @@ class Gateway:
 
 
 @asynccontextmanager
-async def serve(learn: Learn) -> AsyncIterator[Gateway]:
-    learner = MouthLearner(learn)
+async def serve(program: str) -> AsyncIterator[Gateway]:
+    learner = MouthLearner((sys.executable, "-c", program))
     route = web.post("/learn-mouth", learner.serve)
     runner = web.AppRunner(make_application(head_file="", routes=[route], access=AccessPolicy()))
     await runner.setup()
@@ -85,30 +74,29 @@ async def wait_until_ended(process: int) -> None:
 
 
 @async_test
-async def test_answers_with_the_profile_and_its_figures() -> None:
-    async with serve(reverse) as gateway:
-        profile = base64.b64encode(b"cba").decode()
-        assert await gateway.post() == (200, {"mouth_profile": profile, "after": {"opening": 0.5}})
+async def test_answers_with_the_result_of_the_process() -> None:
+    async with serve(REVERSE) as gateway:
+        assert await gateway.post() == (200, {"mouth_profile": "cba"})
 
 
 @pytest.mark.parametrize(
-    ("learn", "error"),
+    ("program", "error"),
     [
-        (refuse, "too little speech; read for 20 s or more"),
-        (fail, "learning failed; see the gateway's log"),
-        (crash, "learning failed; see the gateway's log"),
+        (REFUSE, "too little speech; read for 20 s or more"),
+        (FAIL, "learning failed; see the gateway's log"),
+        (CRASH, "learning failed; see the gateway's log"),
     ],
 )
 @async_test
-async def test_answers_with_the_error(learn: Learn, error: str) -> None:
-    async with serve(learn) as gateway:
+async def test_answers_with_the_error(program: str, error: str) -> None:
+    async with serve(program) as gateway:
         assert await gateway.post() == (422, {"error": error})
         assert await gateway.post() == (422, {"error": error})  # and accepts the next one
 
 
 @async_test
 async def test_rejects_a_recording_that_is_too_large() -> None:
-    async with serve(reverse) as gateway:
+    async with serve(REVERSE) as gateway:
         status, answer = await gateway.post(bytes(MAX_BYTES + 1))
         assert (status, answer) == (413, {"error": "the recording is larger than 8 MiB"})
         assert (await gateway.post(bytes(MAX_BYTES)))[0] == 200
@@ -118,24 +106,24 @@ async def test_rejects_a_recording_that_is_too_large() -> None:
 async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
     tmp_path: Path,
 ) -> None:
-    async with serve(hang) as gateway:
+    async with serve(HANG) as gateway:
         path = tmp_path / "process"
         first = asyncio.create_task(gateway.post(str(path).encode()))
         process = await process_in(path)
         assert os.getpriority(os.PRIO_PROCESS, process) == 19
-        assert gateway.learner.is_learning
+        assert gateway.learner.is_running
         status, answer = await gateway.post()
         assert (status, "try again" in str(answer["error"])) == (503, True)
         gateway.learner.close()
         assert await first == (422, {"error": "the gateway is stopping"})
         await wait_until_ended(process)
-        assert not gateway.learner.is_learning
+        assert not gateway.learner.is_running
         assert await gateway.post() == (503, {"error": "the gateway is stopping"})
 
 
 @async_test
 async def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> None:
-    async with serve(hang) as gateway:
+    async with serve(HANG) as gateway:
         path = tmp_path / "process"
         request = asyncio.create_task(gateway.post(str(path).encode()))
         process = await process_in(path)
