@@ -1,9 +1,9 @@
 """Clips of lip motion with audio: tracked video, or an animator's rig.
 
 A folder contains for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame with
-``t`` in seconds) and ``<clip>.json`` (licence, speaker, language, transcript). Columns are FAPs of
-a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig (``mouth_stretch_c``). A
-clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
+``t`` in seconds) and ``<clip>.json`` (kind, licence, speaker, language, transcript). Columns are
+FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig
+(``mouth_stretch_c``). A clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
 
 Every clip has one part: training (``train``), choosing settings (``choice``), or scoring
 (``held``). The rule `part_of` decides, so clips cannot be picked by hand. ``held.txt`` in the
@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 SAMPLE_RATE_HZ = 16_000
 _MAX_BYTES = 64 << 20  # of a table
 _MAX_ROWS = 1_000_000
+_FILMED = "tracked video"  # start of the kind of a filmed clip
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
 # Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
@@ -86,6 +87,8 @@ class LipClip:
     language: str = ""  # "zh", "en", ...
     part: str = "train"  # "train", "choice" or "held"
     is_in_sync: bool = True  # otherwise only shapes can be compared, not times
+    is_filmed: bool = True  # otherwise captured with sensors, or animated
+    is_rig: bool = False  # an animator's rig, whose mouth rests at 0
     transcript: str = ""  # empty if unknown
     time_s: Array  # (num_frames,)
     faps: Array  # (num_frames, num_mouth_faps), FAP units, NaN if not measured
@@ -182,6 +185,8 @@ def _read_clip(
             language=clip_language,
             part="held" if {path.stem, speaker} & {*held_out} else part,
             is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
+            is_filmed=str(about.get("kind", _FILMED)).startswith(_FILMED),
+            is_rig=is_rig,
             transcript=about.get("transcript") or "",
             time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
             faps=faps,

@@ -181,24 +181,41 @@ def _models(
 @app.command()
 def lips(
     clips: Clips,
-    parameters: Parameters = None,
-    source: Annotated[
-        list[str] | None, typer.Option(help="Use only clips named SOURCE_...; repeatable.")
+    lips: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Lip model, or file of a lip predictor (.npz) or of visemes (.json); repeatable."
+            " Default: all lip models."
+        ),
+    ] = None,
+    delay_ms: Annotated[
+        list[float] | None,
+        typer.Option(min=0.0, help="Delay of the face; repeatable. Default: the lip model's."),
+    ] = None,
+    sounds: Sounds = None,
+    condition: Annotated[
+        list[str] | None,
+        typer.Option(help='"clean", "babble 10 dB" or "music 10 dB"; repeatable. Default: all.'),
     ] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Compare every lip model with tracked lips, at several delays, on held-out clips.
+    """Compare live lips with the real ones on held-out clips, in one table.
 
-    The JSON file also contains the figures by language, source and speaker.
+    Every third clip is also scored with disturbed sound. The JSON file also contains the figures by
+    source and speaker.
     """
-    from kouxing.evaluation.lips.report import print_scores
-    from kouxing.evaluation.lips.scores import score_lip_models
+    from kouxing.evaluation.lips.lip_scores import CONDITIONS, score_lips
+    from kouxing.evaluation.lips.lip_table import print_scores
+    from kouxing.evaluation.recognizer.disturbances import check_conditions, music_from
 
     check_output(json_file, force=force)
-    scores = score_lip_models(clips, parameters, source or ())
-    print_scores(scores, Console())
-    write_json(json_file, [asdict(score) for score in scores])
+    conditions = condition or CONDITIONS
+    check_conditions(conditions, CONDITIONS)
+    music = music_from(_read_sounds(sounds))
+    results = score_lips(clips, lips or (), delay_ms or (), music, conditions)
+    print_scores(results, Console())
+    write_json(json_file, results)
 
 
 @app.command()
@@ -237,7 +254,7 @@ def schemes(
     """
     from kouxing.evaluation.lips import sentences
     from kouxing.evaluation.lips.four_schemes import load_recognizers, print_missing, recognize_all
-    from kouxing.evaluation.lips.report import print_outcome
+    from kouxing.evaluation.lips.scheme_report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos
     from kouxing.services.lip_models import lip_models

@@ -24,7 +24,7 @@ from pathlib import Path
 from rich.progress import track
 
 from kouxing.corpora.scoring import is_emitted
-from kouxing.evaluation.lips.schemes import animate_live, drop_first_hypotheses, live_events
+from kouxing.evaluation.lips.live_faces import animate_live, drop_first_hypotheses, live_events
 from kouxing.evaluation.lips.sentences import Sentence
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel

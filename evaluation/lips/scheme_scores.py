@@ -1,8 +1,8 @@
 """Measures of the four schemes (``four_schemes.py``) that need no judges.
 
 - Agreement of the mouth with scheme 1 with the same lip model, which is the paper's upper bound,
-  and with tracked lips: correlation, error and closures (``scores.py``). The lag of the opening
-  with the highest correlation is the sync offset.
+  and with tracked lips: correlation, error and closures. The lag of the opening with the highest
+  correlation is the sync offset.
 - The jerk of the opening.
 - The phone delay: from a phone's onset in scheme 1 to the moment when the face receives the phone,
   in steps of 20 ms. Only phones whose first hypothesis is right count. The face adds its own delay.
@@ -13,14 +13,14 @@ Only the mouth moves, with an expressiveness of 1.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
-from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.scoring import matched_pairs
+from kouxing.evaluation.lips.agreement import Agreement, Pair, agreement_of, moments
+from kouxing.evaluation.lips.curves import rms_jerk
 from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
     RECOGNIZED,
@@ -32,20 +32,17 @@ from kouxing.evaluation.lips.four_schemes import (
     face_input,
     make_frames,
 )
-from kouxing.evaluation.lips.measures import rms_jerk
-from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, RecognizedClip, Scheme
-from kouxing.evaluation.lips.scores import MEASURES, ClipScore, LipScore, pool, score_clip
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.evaluation.lips.mouths import made_mouth, real_faps, real_mouth
 from kouxing.services.lip_models import lip_model_info
-from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent
 from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
-Scores = dict[Condition, dict[int, ClipScore]]  # by condition and number of the sentence
+Pairs = dict[Condition, dict[int, Pair]]  # by condition and number of the sentence
 
 
 @dataclass(slots=True, kw_only=True)
@@ -60,8 +57,8 @@ class ConditionScore:
     phone_delay_p50_ms: float | None
     phone_delay_p95_ms: float | None
     jerk: float | None  # of the opening, FAP units per second cubed
-    like_scheme_1: LipScore | None
-    like_real_lips: LipScore | None
+    like_scheme_1: Agreement | None
+    like_real_lips: Agreement | None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -95,30 +92,29 @@ def score_schemes(
     if all(s.aligned is None and not len(s.sentence.clip.time_s) for s in sentences):
         raise UserError("no sentence has a text or tracked lips; use other sentences")
     conditions = all_conditions(recognizers, lips)
-    mouths = {
-        (condition, number): _mouth(condition, sentence)
+    frames = {
+        (condition, number): _mouth_frames(condition, sentence)
         for condition in conditions
         for number, sentence in enumerate(sentences)
     }
-    clips = [_recognized_clip(sentence, recognizers[0]) for sentence in sentences]
     inventory = recognizers[0].model.inventory
-    like_aligned: Scores = {condition: {} for condition in conditions}
-    like_real: Scores = {condition: {} for condition in conditions}
-    for condition in track(conditions, description="measuring", transient=True):
-        for number, clip in enumerate(clips):
-            made = mouths[condition, number]
-            reference = mouths[Condition(ALIGNED, condition.lips, ""), number]
-            if made is not None and reference is not None:
-                against = replace(clip, clip=_with_lips(clip.clip, reference))
-                like_aligned[condition][number] = _score(condition, against, made)
-            if made is not None and len(clip.clip.time_s):
-                like_real[condition][number] = _score(condition, clip, made)
+    like_aligned: Pairs = {condition: {} for condition in conditions}
+    like_real: Pairs = {condition: {} for condition in conditions}
+    for (condition, number), faps in frames.items():
+        clip = sentences[number].sentence.clip
+        reference = frames[Condition(ALIGNED, condition.lips, ""), number]
+        if faps is not None and reference is not None:
+            time_s = np.arange(len(reference)) / FRAME_RATE_HZ
+            like_aligned[condition][number] = made_mouth(faps), real_mouth(time_s, reference)
+        if faps is not None and len(clip.time_s):
+            real = real_mouth(clip.time_s, real_faps(clip))
+            like_real[condition][number] = made_mouth(faps), real
     return Outcome(
         sentences=[sentence.sentence.clip.name for sentence in sentences],
         scores=[
             _condition_score(
                 condition,
-                [m for n in range(len(sentences)) if (m := mouths[condition, n]) is not None],
+                [f for n in range(len(sentences)) if (f := frames[condition, n]) is not None],
                 [d for s in sentences for d in phone_delays_s(condition, s, inventory)],
                 like_aligned[condition],
                 like_real[condition],
@@ -132,43 +128,18 @@ def score_schemes(
     )
 
 
-def _mouth(condition: Condition, sentence: RecognizedSentence) -> Array | None:
+def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array | None:
     config = SynthesizerConfig(lips=condition.lips, idle_motion_seed=0, expressiveness=1.0)
     frames = make_frames(condition, sentence, config)
     return None if frames is None else np.array([faps for _, faps in frames], dtype=float)
 
 
-def _recognized_clip(sentence: RecognizedSentence, recognizer: TestedRecognizer) -> RecognizedClip:
-    clip, output = sentence.sentence.clip, sentence.outputs[recognizer.name]
-    return RecognizedClip(
-        clip=clip,
-        num_frames=0,
-        levels=level_track(clip.samples),
-        events=output.live,
-        inventory=recognizer.model.inventory,
-        recognized=output.offline.phones,
-        aligned=sentence.sentence.aligned,
-    )
-
-
-def _with_lips(clip: LipClip, made: Array) -> LipClip:
-    """Return a clip whose tracked lips are made ones."""
-    mouth = made[:, np.array(MOUTH_FAPS) - 1]
-    return replace(clip, time_s=np.arange(len(mouth)) / FRAME_RATE_HZ, faps=mouth, is_in_sync=True)
-
-
-def _score(condition: Condition, clip: RecognizedClip, made: Array) -> ClipScore:
-    score = score_clip(clip, Scheme(condition.name, None, lambda _clip: made))
-    assert score is not None  # noqa: S101 - this scheme applies to every clip
-    return score
-
-
 def _condition_score(
     condition: Condition,
-    mouths: Sequence[Array],
+    frames: Sequence[Array],
     delays_s: Sequence[float],
-    like_aligned: Mapping[int, ClipScore],
-    like_real: Mapping[int, ClipScore],
+    like_aligned: Mapping[int, Pair],
+    like_real: Mapping[int, Pair],
 ) -> ConditionScore:
     p50, p95 = np.percentile(delays_s, [50, 95]) * 1e3 if delays_s else (None, None)
     is_live = condition.scheme > RECOGNIZED
@@ -176,19 +147,14 @@ def _condition_score(
         scheme=condition.scheme,
         lips=condition.lips,
         recognizer=condition.recognizer,
-        num_sentences=len(mouths),
+        num_sentences=len(frames),
         face_delay_ms=lip_model_info(condition.lips).delay_ms if is_live else None,
         phone_delay_p50_ms=p50,
         phone_delay_p95_ms=p95,
-        jerk=rms_jerk([MEASURES["opening"](mouth) for mouth in mouths], FRAME_RATE_HZ),
-        like_scheme_1=_pool_all(like_aligned),
-        like_real_lips=_pool_all(like_real),
+        jerk=rms_jerk([made_mouth(faps).opening for faps in frames], FRAME_RATE_HZ),
+        like_scheme_1=agreement_of([*like_aligned.values()]) if like_aligned else None,
+        like_real_lips=agreement_of([*like_real.values()]) if like_real else None,
     )
-
-
-def _pool_all(scores: Mapping[int, ClipScore]) -> LipScore | None:
-    pooled = pool(list(scores.values()))
-    return next((score for score in pooled if score.kind == "all"), None)
 
 
 def phone_delays_s(
@@ -222,14 +188,14 @@ def first_hypotheses(events: Sequence[SoundEvent]) -> list[tuple[Phone, float]]:
 
 def _orders(
     reference: str,
-    scores: Scores,
+    pairs: Pairs,
     recognizers: Sequence[TestedRecognizer],
     lips: Sequence[str],
 ) -> Iterator[Order]:
     for name in lips:
         for recognizer in recognizers:
-            schemes = [scores.get(Condition(ALIGNED, name, ""), {})]
-            schemes += [scores.get(Condition(n, name, recognizer.name), {}) for n in SCHEMES[1:]]
+            schemes = [pairs.get(Condition(ALIGNED, name, ""), {})]
+            schemes += [pairs.get(Condition(n, name, recognizer.name), {}) for n in SCHEMES[1:]]
             rows = [[_correlation(by_number.get(n)) for by_number in schemes] for n in schemes[0]]
             table = np.array([row for row in rows if None not in row], dtype=float)
             if len(table):
@@ -245,9 +211,8 @@ def _orders(
                 )
 
 
-def _correlation(score: ClipScore | None) -> float | None:
-    opening = score.curves.get("opening") if score else None
-    return opening.everything.correlation if opening else None
+def _correlation(pair: Pair | None) -> float | None:
+    return moments([pair], "opening").correlation if pair else None
 
 
 def is_decreasing(figures: Array) -> bool:

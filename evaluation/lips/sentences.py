@@ -14,7 +14,7 @@ import numpy as np
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
-from kouxing.evaluation.lips.scores import clips_to_score
+from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_phones
 from kouxing.shared.errors import UserError
@@ -73,7 +73,7 @@ def choose(utterances: Sequence[Utterance], number: int = NUM_SENTENCES) -> list
 
 def clip_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
     """Read all held-out clips of tracked lips in the model's language."""
-    clips = clips_to_score(folder, None, language=model.inventory.code)
+    clips = clips_to_score(folder, language=model.inventory.code)
     return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
 
 

@@ -34,7 +34,7 @@ from rich.progress import track
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
-from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -190,7 +190,7 @@ def _methods(
     events = live_events(model, samples, lip_predictor_for(model), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)
-        frames = live_frames(lips, events[delay_s], delay_s, FRAME_RATE_HZ)
+        frames = live_frames(lips, events[delay_s], delay_s)
         mouth = frames[:, np.array(MOUTH_FAPS) - 1]
         frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
         yield f"{name}, live", partial(_interpolate, frame_s=frame_s, mouths=mouth)

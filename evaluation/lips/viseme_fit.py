@@ -23,8 +23,9 @@ from rich.progress import track
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.full_model import synthesize
-from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
-from kouxing.evaluation.lips.scores import MEASURES, clips_to_score, real_faps
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.evaluation.lips.mouths import CURVES, real_faps
+from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -65,9 +66,9 @@ class FittedClip:
 
     def curves(self, measure: str) -> tuple[Array, Array, Array]:
         """Return measured, learnt and guessed values, (num_frames,), without the clip's means."""
-        real = MEASURES[measure](real_faps(self.clip))
+        real = CURVES[measure](real_faps(self.clip))
         is_known = ~np.isnan(real)
-        learnt, guessed = MEASURES[measure](self.learnt), MEASURES[measure](self.guessed)
+        learnt, guessed = CURVES[measure](self.learnt), CURVES[measure](self.guessed)
         if is_known.any():
             real, learnt, guessed = (v - v[is_known].mean() for v in (real, learnt, guessed))
         return real, learnt, guessed
@@ -80,7 +81,7 @@ def fit_folder(folder: Path, parameters: Path | None) -> list[FittedClip]:
         DynamicVisemes(values, model.inventory)
         for values in (load_parameters(parameters), initial_parameters())
     )
-    clips = clips_to_score(folder, parameters, language=model.inventory.code)
+    clips = clips_to_score(folder, [parameters], language=model.inventory.code)
     return [
         fit_clip(clip, label_clip(model, clip), learnt, guessed)
         for clip in track(clips, description="clips", transient=True)
@@ -108,7 +109,7 @@ def viseme_errors(fitted: Sequence[FittedClip]) -> list[VisemeError]:
     """Return the errors of each viseme, and of all together, for every measure."""
     viseme = np.concatenate([_nearest_visemes(clip) for clip in fitted])
     errors = []
-    for measure in MEASURES:
+    for measure in CURVES:
         curves = zip(*(clip.curves(measure) for clip in fitted), strict=True)
         real, learnt, guessed = (np.concatenate(values) for values in curves)
         for name in ("all", *VISEMES):
@@ -154,16 +155,16 @@ def print_errors(errors: Sequence[VisemeError], console: Console) -> None:
             for measure, error in of_viseme.items()
         }
         num_frames = max(error.num_frames for error in of_viseme.values())
-        rows.append([viseme, str(num_frames), *(cells.get(measure, "") for measure in MEASURES)])
+        rows.append([viseme, str(num_frames), *(cells.get(measure, "") for measure in CURVES)])
     title = "error in FAP units: learnt (initial); standard deviation of the measured values"
-    print_table(console, title, ("viseme", "frames", *MEASURES), rows)
+    print_table(console, title, ("viseme", "frames", *CURVES), rows)
 
 
 def fit_figure(fitted: Sequence[FittedClip]) -> Any:
     """Plot measured and modeled curves: of a long vowel, and of a sentence."""
     figure = new_figure(14.0, 6.0)
     axes = figure.subplots(
-        1 + len(MEASURES), 2, sharex="col", sharey="row", width_ratios=(1.0, 2.2), squeeze=False
+        1 + len(CURVES), 2, sharex="col", sharey="row", width_ratios=(1.0, 2.2), squeeze=False
     )
     clip = max(fitted, key=lambda clip: _long_vowel(clip)[2])
     start_s, length_s, _ = _long_vowel(clip)
@@ -171,7 +172,7 @@ def fit_figure(fitted: Sequence[FittedClip]) -> Any:
     clip = max(fitted, key=lambda clip: _busiest_stretch(clip)[1])
     start_s, _ = _busiest_stretch(clip)
     _draw_fit(axes[:, 1], clip, start_s, start_s + _SENTENCE_S)
-    for axis, measure in zip(axes[1:, 0], MEASURES, strict=True):
+    for axis, measure in zip(axes[1:, 0], CURVES, strict=True):
         axis.set_ylabel(f"{measure}, FAP units", fontsize=8)
     axes[1, 1].legend(fontsize=8, loc="upper right")
     return figure
@@ -223,7 +224,7 @@ def _draw_fit(axes: Any, fitted: FittedClip, start_s: float, end_s: float) -> No
     axes[0].set_title(fitted.clip.name, fontsize=9)
     is_shown = (fitted.clip.time_s >= start_s) & (fitted.clip.time_s <= end_s)
     time_s = fitted.clip.time_s[is_shown]
-    for axis, measure in zip(axes[1:], MEASURES, strict=True):
+    for axis, measure in zip(axes[1:], CURVES, strict=True):
         real, learnt, guessed = (curve[is_shown] for curve in fitted.curves(measure))
         axis.plot(time_s, guessed, color="C1", linewidth=0.8, label="initial parameters")
         axis.plot(time_s, real, color="0.6", linewidth=2.5, label="measured")

@@ -58,10 +58,10 @@ def disturbances_for(
     return {name: known[name] for name in CONDITIONS if name in (CLEAN, *(names or CONDITIONS))}
 
 
-def check_conditions(names: Sequence[str]) -> None:
-    """Raise UserError if a name is not one of ``CONDITIONS``."""
-    if unknown := [name for name in names if name not in CONDITIONS]:
-        raise UserError(f"unknown condition {unknown[0]!r}; choose from: {', '.join(CONDITIONS)}")
+def check_conditions(names: Sequence[str], known: Sequence[str] = CONDITIONS) -> None:
+    """Raise UserError if a name is not one of ``known``."""
+    if unknown := [name for name in names if name not in known]:
+        raise UserError(f"unknown condition {unknown[0]!r}; choose from: {', '.join(known)}")
 
 
 def music_from(sounds: Sequence[Sound]) -> Samples:

@@ -3,14 +3,13 @@
 import itertools
 import signal
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from kouxing_client import Client, FapFrame
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, live_scheme, recognize_clip
+from kouxing.evaluation.lips.live_faces import live_events, live_frames
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -22,7 +21,7 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
 from tests.e2e.following import Stream, samples_of_file, stream
-from tests.lips import LIPS, clip_of
+from tests.lips import LIPS
 from tests.system import DEMO, VOWELS_FILE, System
 
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
@@ -192,9 +191,8 @@ def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     samples = samples_of_file(VOWELS_FILE)
     chain = LiveChain(load_live_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
     frames = chain.accept_waveform(samples) + chain.input_finished()
-    clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    scheme = live_scheme("lips", LIPS, DEFAULT_DELAY_S)
-    scored = scheme.frames(recognize_clip(load_live_model(), clip, None))
-    assert scored is not None
+    delay_s = SynthesizerConfig().delay_ms / 1e3
+    events = live_events(load_live_model(), samples, None, [delay_s])
+    scored = live_frames(LIPS, events[delay_s], delay_s)
     np.testing.assert_array_equal(scored[:, MOUTH], np.array([faps[MOUTH] for _, faps in frames]))
     assert scored[:, MOUTH].any()

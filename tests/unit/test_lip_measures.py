@@ -1,30 +1,161 @@
-"""Measures of curves with known results."""
+"""Measures of mouths with known results."""
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.measures import Detections, closures, is_closed_at
+from kouxing.evaluation.lips import lip_measures as measures
+from kouxing.evaluation.lips.agreement import agreement_of
+from kouxing.evaluation.lips.closures import Detections, closures, contacts, is_closed_at
+from kouxing.evaluation.lips.curves import num_turns, pooled_moments
+from kouxing.evaluation.lips.effort import correlate_by_speaker, lip_intensity, opening_range
+from kouxing.evaluation.lips.extrema import match_extrema, misalignment_s, warping_path
+from kouxing.evaluation.lips.lip_measures import Take
+from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_mouth
+from kouxing.evaluation.lips.references import Reference
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import Phone, SpeechChange
+from tests.lips import INVENTORY, clip_of, phone
 
 TIME_S = np.arange(0.0, 4.0, 0.02)
+Array = NDArray[np.float64]
 
 
-def mouth(*closed: tuple[float, float], opening: float = 300.0) -> NDArray[np.float64]:
-    """Open, but for some spans of time that are shut, a frame's slope each side."""
+def mouth_of(opening: Array) -> Mouth:
+    """Return made lips with an opening at ``TIME_S``; width and jaw follow it."""
+    faps = np.zeros((len(opening), NUM_FAPS))
+    faps[:, 4] = -opening
+    faps[:, 5] = faps[:, 2] = opening
+    return made_mouth(faps)
+
+
+def mouth(*closed: tuple[float, float], opening: float = 300.0) -> Mouth:
+    """Return open lips that are closed for some spans of time, seconds."""
     curve = np.full(len(TIME_S), opening)
     for start_s, end_s in closed:
         curve[(start_s - 1e-6 <= TIME_S) & (end_s + 1e-6 >= TIME_S)] = 0.0
-    return curve
+    return mouth_of(curve)
+
+
+def reference(
+    real: Mouth, phones: Sequence[Phone] = (), *, loud: tuple[float, float] = (0.0, 4.0)
+) -> Reference:
+    """Return a clip of 4 s whose sound is loud for a span of time, seconds."""
+    samples = np.zeros(64_000, dtype=np.float32)
+    samples[round(16_000 * loud[0]) : round(16_000 * loud[1])] = 0.1
+    clip = clip_of(TIME_S, np.zeros((len(TIME_S), len(MOUTH_FAPS))))
+    return Reference(
+        clip=replace(clip, samples=samples),
+        mouth=real,
+        phones=phones,
+        voice=[SpeechChange(active=True, time_s=0.0)],
+        visemes=INVENTORY.visemes,
+    )
+
+
+def test_correlation_error_and_turns_of_curves() -> None:
+    # without means: made (-1, 0, 1), real (-1, 1, 0)
+    pair = np.array([1.0, 2.0, 3.0]), np.array([10.0, 12.0, 11.0])
+    moments = pooled_moments([pair, (np.array([np.nan]), np.array([1.0]))])
+    assert moments.correlation == pytest.approx(0.5)
+    assert moments.rmse == pytest.approx(np.sqrt(2 / 3))
+    assert pooled_moments([(np.ones(3), np.arange(3.0))]).correlation is None
+    assert num_turns(np.array([0.0, 1.0, 1.0, 2.0, 1.0, 3.0])) == 2
+
+
+def test_agreement_measures_the_lag() -> None:
+    curve = 150.0 + 150.0 * np.sin(2 * np.pi * TIME_S)
+    real = mouth_of(curve)
+    late = mouth_of(150.0 + 150.0 * np.sin(2 * np.pi * (TIME_S - 0.06)))
+    agreement = agreement_of([(late, real)])
+    assert agreement.lag_ms == 60
+    assert agreement.correlation["opening"] == pytest.approx(np.cos(0.12 * np.pi), abs=0.01)
+    assert agreement_of([(mouth(), real)]).lag_ms is None
 
 
 def test_counts_missed_and_false_closures() -> None:
-    real_s = np.array([0.5, 1.5, 2.5])
+    real = mouth((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
     made = mouth((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
-    hits = closures(real_s, real_s, TIME_S, made)
+    hits = closures(made, real)
     assert hits == Detections(real=3, met=2, made=4, true=2)
     assert hits.recall == pytest.approx(2 / 3)
     assert hits.precision == 0.5
     assert hits.f1 == pytest.approx(4 / 7)
-    np.testing.assert_array_equal(is_closed_at(real_s, TIME_S, made), [True, False, True])
+    np.testing.assert_array_equal(
+        is_closed_at(np.array([0.5, 1.5, 2.5]), made), [True, False, True]
+    )
     assert (hits + hits).f1 == hits.f1
     assert hits + hits == Detections(6, 4, 8, 4)
+    second = contacts(made, real)[1]
+    assert (second.time_s, second.is_true) == (pytest.approx(2.05), False)
+
+
+def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:
+    faps = np.zeros((4, NUM_FAPS))
+    faps[:, 4] = [-100.0, -110.0, np.nan, -300.0]
+    tracked = real_mouth(np.arange(4.0), faps)
+    np.testing.assert_array_equal(tracked.time_s, [0.0, 1.0, 3.0])
+    np.testing.assert_array_equal(tracked.is_closed, [True, True, False])
+
+
+def test_closures_count_for_the_phones_around_them() -> None:
+    real = mouth((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
+    made = mouth((0.5, 0.5), (1.0, 1.0), (2.5, 2.5), (3.5, 3.5))
+    phones = [phone(0, "b", 0.48), phone(1, "a", 0.6, 0.9), phone(2, "u", 2.4), phone(3, "m", 3.0)]
+    takes = [Take(reference(real, phones), made)]
+    assert measures.class_precision(takes, "bpm") == 1.0
+    assert measures.class_precision(takes, "aei") == 0.0
+    assert measures.class_precision(takes, "uo") == 1.0
+    assert measures.class_precision(takes, "pause") == 0.0
+    assert measures.labials_shut(takes) == 0.5  # the lips are open in m
+    assert measures.share_shut(takes) == 4 / 200
+
+
+def test_lips_rest_and_close_after_the_sound() -> None:
+    # sound from 1 to 2 s; the margin of speech is 0.1 s
+    made = mouth((0.0, 0.88), (2.44, 4.0))
+    quiet = reference(mouth(), loud=(1.0, 2.0))
+    takes = [Take(quiet, made)]
+    assert measures.closing_time_ms(takes) == pytest.approx(440.0)
+    # of 141 frames without speech, those at 0.9 s and from 2.1 to 2.42 s are open
+    assert measures.rest_opening(takes) == pytest.approx(300 * 18 / 141)
+    rig = replace(quiet, clip=replace(quiet.clip, is_rig=True))
+    assert measures.rest_opening([Take(rig, made)]) is None
+    never = measures.closing_time_ms([Take(quiet, mouth())])
+    assert never == pytest.approx(1980.0, abs=25.0)  # the whole pause
+
+
+def test_spread_within_phones_ignores_differences_between_them() -> None:
+    curve = np.select([TIME_S < 1, TIME_S < 2, TIME_S < 3], [100.0, 300.0, 500.0], 900.0)
+    phones = [phone(k, symbol, k + 0.4, 0.2) for k, symbol in enumerate("aaei")]
+    takes = [Take(reference(mouth_of(2 * curve), phones), mouth_of(curve))]
+    assert measures.phone_spread(takes) == pytest.approx(100.0)  # of a: 100 and 300
+    assert measures.phone_correlation(takes) == pytest.approx(1.0)
+
+
+def test_turns_per_second_of_speech() -> None:
+    takes = [Take(reference(mouth()), mouth_of(30.0 * np.arange(200.0) % 300.0))]
+    assert measures.turns_per_s(takes) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
+
+
+def test_effort_correlates_within_speakers() -> None:
+    # deviations of level and range: A (-1, 0, 1) and (-1, 1, 0), r = 0.5; B the same, r = 1
+    levels, ranges = [0.0, 1.0, 2.0, 50.0, 60.0, 70.0], [1.0, 3.0, 2.0, 9.0, 10.0, 11.0]
+    assert correlate_by_speaker([*"AAABBB"], levels, ranges) == pytest.approx(0.75)
+    assert correlate_by_speaker([*"AABB"], levels[:4], ranges[:4]) is None
+    assert opening_range(np.arange(101.0)) == pytest.approx(90.0)
+    assert lip_intensity(mouth_of(np.array([0.0, 6.0, 6.0]))) == pytest.approx(300 / np.sqrt(2))
+
+
+def test_matched_extrema_of_a_late_mouth() -> None:
+    assert warping_path(np.array([0.0, 1.0]), np.array([0.0, 0.0, 1.0])) == [(0, 0), (0, 1), (1, 2)]
+    real = np.array([0.0, 1.0, 4.0, 1.0, 0.0, 2.0, 2.0, 1.0])
+    late = np.array([0.0, 0.0, 1.0, 4.0, 1.0, 0.0, 2.0, 2.0])
+    assert match_extrema(late, real) == [1, 1]  # the last plateau is not a maximum
+    time_s = np.arange(0.0, 4.0, 0.02)
+    sines = [mouth_of(200.0 + 100.0 * np.sin(2 * np.pi * (time_s - lag))) for lag in (0.0, 0.1)]
+    assert misalignment_s(sines[1], sines[0]) == pytest.approx(0.1, abs=0.02)
+    assert misalignment_s(mouth(), sines[0]) is None

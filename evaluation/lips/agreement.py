@@ -1,0 +1,51 @@
+"""How well mouths agree with others at the same times: correlation, error, lag and closures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.evaluation.lips.closures import Detections, closures
+from kouxing.evaluation.lips.curves import LAGS_S, Moments, best_lag, pooled_moments
+from kouxing.evaluation.lips.mouths import CURVES, Mouth
+
+Array = NDArray[np.float64]
+Pair = tuple[Mouth, Mouth]  # the mouth to judge, and the real one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """Agreement of several pairs; None if nothing moves or nothing was measured."""
+
+    num_clips: int
+    correlation: dict[str, float | None]  # of opening, width and jaw
+    error: float | None  # of the opening, FAP units
+    lag_ms: float | None  # of the opening
+    closure_f1: float | None
+
+
+def agreement_of(pairs: Sequence[Pair]) -> Agreement:
+    """Compare mouths."""
+    return Agreement(
+        num_clips=len(pairs),
+        correlation={name: moments(pairs, name).correlation for name in CURVES},
+        error=moments(pairs, "opening").rmse,
+        lag_ms=lag_ms(pairs),
+        closure_f1=sum((closures(*pair) for pair in pairs), Detections()).f1,
+    )
+
+
+def moments(pairs: Sequence[Pair], curve: str, lag_s: float = 0.0) -> Moments:
+    """Compare a curve over all frames, after removal of each clip's means."""
+    return pooled_moments(
+        (made.at(curve, real.time_s + lag_s), real.curves[curve]) for made, real in pairs
+    )
+
+
+def lag_ms(pairs: Sequence[Pair]) -> float | None:
+    """Return the lag of the opening with the highest correlation, ms; positive: late."""
+    lag_s = best_lag([moments(pairs, "opening", lag_s) for lag_s in LAGS_S])
+    return None if lag_s is None else round(1e3 * lag_s)

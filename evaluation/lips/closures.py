@@ -1,0 +1,108 @@
+"""Closures of lips: how many real ones a mouth makes, and how many of its closures are real.
+
+Lips that touch near an opening are a contact. Lips that touch elsewhere are at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.evaluation.lips.curves import is_near
+from kouxing.evaluation.lips.mouths import Mouth
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WINDOW_S = 0.04
+_OPEN = 100.0  # opening of made lips in FAP units: 3 mm on a face
+_OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2  # share of a real mouth's range
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """Counts of real events, of those reproduced, of made events, and of those that are true."""
+
+    real: int = 0
+    met: int = 0
+    made: int = 0
+    true: int = 0
+
+    def __add__(self, other: Detections) -> Detections:
+        return Detections(
+            self.real + other.real,
+            self.met + other.met,
+            self.made + other.made,
+            self.true + other.true,
+        )
+
+    @property
+    def recall(self) -> float | None:
+        """Share of the real events that are reproduced."""
+        return self.met / self.real if self.real else None
+
+    @property
+    def precision(self) -> float | None:
+        """Share of the made events that are true."""
+        return self.true / self.made if self.made else None
+
+    @property
+    def f1(self) -> float | None:
+        """Harmonic mean of recall and precision; 0 if no real event is reproduced."""
+        if self.recall is None:
+            return None
+        precision = self.precision or 0.0
+        return 2.0 * self.recall * precision / (self.recall + precision or 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A closure of made lips, from an opening to the next one."""
+
+    time_s: float  # middle of the frames in which the lips touch
+    is_true: bool  # real lips are closed within 40 ms of one of these frames
+
+
+def real_closures(mouth: Mouth) -> Array:
+    """Return when real lips close, seconds: minima of closed lips near an opening."""
+    before, here, after = mouth.opening[:-2], mouth.opening[1:-1], mouth.opening[2:]
+    is_minimum = (here <= before) & (here < after) & mouth.is_closed[1:-1]
+    moments_s: Array = mouth.time_s[1:-1][is_minimum]
+    if not len(moments_s):
+        return moments_s
+    low, high = np.percentile(mouth.opening, [1, 99])
+    opened_s = mouth.time_s[mouth.opening > low + _OPEN_SHARE * (high - low)]
+    return np.asarray(moments_s[is_near(moments_s, opened_s, _OPEN_WINDOW_S)])
+
+
+def is_closed_at(moments_s: Array, mouth: Mouth) -> Mask:
+    """Whether lips close within 40 ms of each moment and are open within 0.2 s."""
+    near = is_near(moments_s, mouth.time_s[mouth.is_closed], WINDOW_S)
+    return near & is_near(moments_s, mouth.time_s[mouth.opening > _OPEN], _OPEN_WINDOW_S)
+
+
+def contacts(made: Mouth, real: Mouth) -> list[Contact]:
+    """Return the closures of made lips. A contact starts when open lips close."""
+    is_open = made.opening > _OPEN
+    opened_s = made.time_s[is_open]
+    touching = made.is_closed & ~is_open & is_near(made.time_s, opened_s, _OPEN_WINDOW_S)
+    # A contact's number is how often the lips have opened before it. Contact 0 is the initial rest.
+    state = np.where(is_open, 1, -1)[is_open | touching]
+    number = np.cumsum(np.diff(state, prepend=-1) > 0)[state < 0]
+    time_s = made.time_s[touching]
+    is_true = is_near(time_s, real.time_s[real.is_closed], WINDOW_S)
+    return [
+        Contact(float(time_s[frames].mean()), bool(is_true[frames].any()))
+        for k in np.unique(number[number > 0])
+        if len(frames := np.flatnonzero(number == k))
+    ]
+
+
+def closures(made: Mouth, real: Mouth) -> Detections:
+    """Compare closures: a real one is reproduced if made lips close within 40 ms."""
+    real_s, made_contacts = real_closures(real), contacts(made, real)
+    num_met = int(is_closed_at(real_s, made).sum())
+    num_true = sum(contact.is_true for contact in made_contacts)
+    return Detections(len(real_s), num_met, len(made_contacts), num_true)

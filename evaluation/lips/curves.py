@@ -1,0 +1,92 @@
+"""Curves of a mouth: correlation, error and lag of two curves, and how often a curve turns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LAGS_S = np.arange(-30, 31) / 100.0
+_NO_POWER = 1e-12  # per frame: what filters leave of a constant curve
+_ROUNDING_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Second moments of a made and a real curve, after removal of each clip's mean."""
+
+    num_frames: int = 0
+    products: float = 0.0
+    made_power: float = 0.0
+    real_power: float = 0.0
+
+    @property
+    def correlation(self) -> float | None:
+        """Pearson correlation; None if a curve is constant."""
+        if min(self.made_power, self.real_power) <= _NO_POWER * self.num_frames:
+            return None
+        return self.products / float(np.sqrt(self.made_power * self.real_power))
+
+    @property
+    def rmse(self) -> float | None:
+        """Root mean square error; None without frames."""
+        if not self.num_frames:
+            return None
+        squares = self.made_power + self.real_power - 2.0 * self.products
+        return float(np.sqrt(max(squares, 0.0) / self.num_frames))
+
+
+def pooled_moments(pairs: Iterable[tuple[Array, Array]]) -> Moments:
+    """Compare made and real curves, a pair per clip. NaN values are ignored."""
+    sums = np.zeros(4)
+    for made, real in pairs:
+        is_known = ~np.isnan(made + real)
+        if is_known.any():
+            x, y = (curve[is_known] - curve[is_known].mean() for curve in (made, real))
+            sums += len(x), x @ y, x @ x, y @ y
+    return Moments(int(sums[0]), *map(float, sums[1:]))
+
+
+def best_lag(lagged: Sequence[Moments]) -> float | None:
+    """Return which of ``LAGS_S`` has the highest correlation, seconds.
+
+    None if the curve is constant, or if the highest correlation is at an end of the lags, where it
+    is not a maximum.
+    """
+    candidates = [
+        (moments.correlation, float(lag_s))
+        for moments, lag_s in zip(lagged, LAGS_S, strict=True)
+        if moments.correlation is not None
+    ]
+    best = max(candidates, default=None)
+    return best[1] if best in candidates[1:-1] else None
+
+
+def num_turns(curve: Array) -> int:
+    """Count the changes of direction of a curve."""
+    direction = np.sign(np.diff(curve))
+    return int((np.diff(direction[direction != 0.0]) != 0.0).sum())
+
+
+def rms_jerk(curves: Sequence[Array], rate_hz: float) -> float | None:
+    """Root mean square of the third derivative of curves; None if none has four frames."""
+    jerks = np.concatenate([np.zeros(0), *(np.diff(curve, n=3) for curve in curves)]) * rate_hz**3
+    return float(np.sqrt(np.mean(jerks**2))) if len(jerks) else None
+
+
+def is_near(moments_s: Array, others_s: Array, window_s: float) -> Mask:
+    """Whether one of the others, which are sorted, is within a window around each moment."""
+    if not len(others_s):
+        return np.zeros(len(moments_s), dtype=bool)
+    after = np.searchsorted(others_s, moments_s)
+    gaps = [
+        np.abs(others_s[np.clip(index, 0, len(others_s) - 1)] - moments_s)
+        for index in (after - 1, after)
+    ]
+    near: Mask = np.minimum(*gaps) <= window_s + _ROUNDING_S
+    return near

@@ -1,0 +1,56 @@
+"""Whether a mouth moves more when the voice is louder: correlations over clips.
+
+Both figures are normalized for each speaker, because microphones and faces differ.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.evaluation.lips.mouths import Mouth
+
+Array = NDArray[np.float64]
+
+_MIN_CLIPS = 3  # of a speaker
+
+
+def correlate_by_speaker(
+    speakers: Sequence[str], levels: Sequence[float], extents: Sequence[float]
+) -> float | None:
+    """Correlate the clips' levels with the extents of the mouth's motion.
+
+    Each speaker's values get a mean of 0 and a standard deviation of 1 first. Speakers with fewer
+    than three clips are left out. None if no speaker remains.
+    """
+    by_speaker: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    for speaker, level, extent in zip(speakers, levels, extents, strict=True):
+        by_speaker[speaker].append((level, extent))
+    total, num_clips = 0.0, 0
+    for values in by_speaker.values():
+        clips = np.array(values)
+        deviation = clips.std(axis=0)
+        if len(clips) >= _MIN_CLIPS and deviation.all():
+            total += float(np.prod((clips - clips.mean(axis=0)) / deviation, axis=1).sum())
+            num_clips += len(clips)
+    return total / num_clips if num_clips else None
+
+
+def opening_range(opening: Array) -> float:
+    """Return the range of an opening without its extreme twentieths."""
+    low, high = np.percentile(opening, [5, 95])
+    return float(high - low)
+
+
+def lip_intensity(mouth: Mouth) -> float:
+    """Return the lips' intensity for the speech-lip intensity correlation coefficient (SLCC).
+
+    Source: Lee et al., "Perceptually accurate 3D talking head generation", CVPR 2025: the root mean
+    square of the lips' displacement between frames. Here it is the opening's, per second. The
+    intensity of speech is the root mean square of the samples.
+    """
+    speed = np.diff(mouth.opening) / np.diff(mouth.time_s)
+    return float(np.sqrt(np.mean(speed**2)))

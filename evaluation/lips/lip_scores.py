@@ -1,0 +1,165 @@
+"""Score lip models live on held-out clips, next to the real lips.
+
+The frames are those that the services would send, with clean sound, and with other voices or music
+10 dB below the speech. Clips form groups by language, source and speaker. *New* speakers have no
+clip that a shipped model may be trained on. *Mocap* is motion capture: clips that were not filmed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.progress import track
+
+from kouxing.corpora.lip_clips import LipClip, aligned_phones, read_clips
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES, Take
+from kouxing.evaluation.lips.live_faces import Samples, events_of_faces, live_frames
+from kouxing.evaluation.lips.mouths import Mouth, made_mouth
+from kouxing.evaluation.lips.references import clips_to_score, reference_of
+from kouxing.evaluation.recognizer.disturbances import (
+    BABBLE,
+    CLEAN,
+    MUSIC,
+    Disturb,
+    add_sound,
+    babble,
+)
+from kouxing.services.lip_models import lip_model_info, lip_models
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lip_frames import LipFrameModel
+from kouxing.services.recognizer.lip_predictor import LIPS_PATH, load_lip_predictor
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.phones.events import SoundEvent
+from kouxing.shared.phones.inventory import PhoneInventory
+
+REAL = "real"
+CONDITIONS = CLEAN, BABBLE, MUSIC
+ALL, MOCAP = "all", "mocap"
+_BELOW_DB = 10.0
+
+Scores = dict[str, float | None]  # by measure
+Results = dict[str, dict[str, dict[str, Scores]]]  # by face, condition and group of clips
+
+
+@dataclass(frozen=True, slots=True)
+class Face:
+    """A lip model with a delay, and with its predictor if it needs one."""
+
+    name: str
+    lips: LipModel
+    predictor: LipFrameModel | None
+    delay_ms: float
+
+    def mouth(self, events: Sequence[SoundEvent]) -> Mouth:
+        """Return the mouth that the face shows for a recognizer's output."""
+        return made_mouth(live_frames(self.lips, events, self.delay_ms / 1e3))
+
+
+def load_faces(
+    names: Sequence[str], delays_ms: Sequence[float], inventory: PhoneInventory
+) -> dict[str, Face]:
+    """Load faces by title. A name is a lip model, a lip predictor (.npz) or visemes (.json).
+
+    Without names, all lip models are loaded. Without delays, each has its default delay. Raises
+    UserError if a lip model is not installed, or a file cannot be read.
+    """
+    faces = {}
+    for name in names or list(lip_models()):
+        path = Path(name)
+        kind = {".npz": "learnt", ".json": "dynamic-visemes"}.get(path.suffix, name)
+        lips: LipModel = load_lip_model(inventory.language, kind)
+        if path.suffix == ".json":
+            lips = DynamicVisemes(load_parameters(path), inventory)
+        predictor = None
+        if kind == "learnt":
+            predictor = load_lip_predictor(path if path.suffix == ".npz" else LIPS_PATH)
+        for delay_ms in delays_ms or [lip_model_info(kind).delay_ms]:
+            faces[f"{name}, {delay_ms:g} ms"] = Face(name, lips, predictor, delay_ms)
+    return faces
+
+
+def score_lips(
+    folder: Path,
+    names: Sequence[str],
+    delays_ms: Sequence[float],
+    music: Samples,
+    conditions: Sequence[str],
+) -> Results:
+    """Score faces (see ``load_faces``) on the held-out clips of a folder."""
+    model = load_live_model()
+    faces = load_faces(names, delays_ms, model.inventory)
+    clips = clips_to_score(folder, [Path(name) for name in names if name.endswith(".json")])
+    known = known_speakers(folder)
+    voices = babble([clip.samples for clip in clips])
+    disturbances: dict[str, Disturb] = {
+        CLEAN: lambda samples: samples,
+        BABBLE: lambda samples: add_sound(samples, voices, _BELOW_DB),
+        MUSIC: lambda samples: add_sound(samples, music, _BELOW_DB),
+    }
+    used = {name: disturbances[name] for name in CONDITIONS if name in (CLEAN, *conditions)}
+    takes: dict[tuple[str, str, str], list[Take]] = {}
+    for clip in track(clips, description="clips", transient=True):
+        for title, condition, take in takes_of(model, clip, faces, used):
+            for group in groups_of(clip, known):
+                takes.setdefault((title, condition, group), []).append(take)
+    results: Results = {}
+    for (title, condition, group), members in takes.items():
+        scores = {
+            name: measure(members)
+            for name, measure in MEASURES.items()
+            if title != REAL or name not in COMPARISONS
+        }
+        by_group = results.setdefault(title, {}).setdefault(condition, {})
+        by_group[group] = {"clips": len(members), **scores}
+    return results
+
+
+def takes_of(
+    model: AcousticModel,
+    clip: LipClip,
+    faces: Mapping[str, Face],
+    disturbances: Mapping[str, Disturb],
+) -> Iterator[tuple[str, str, Take]]:
+    """Yield title, condition and take of the real mouth, and of each face in each condition.
+
+    The first condition must be CLEAN.
+    """
+    sources = [(face.predictor, face.delay_ms / 1e3) for face in faces.values()]
+    reference = None
+    for condition, disturb in disturbances.items():
+        events = events_of_faces(model, disturb(clip.samples), sources)
+        if reference is None:
+            aligned = aligned_phones(model, clip)
+            reference = reference_of(clip, events[0], model.inventory, aligned)
+            yield REAL, condition, Take(reference, reference.mouth)
+        for (title, face), received in zip(faces.items(), events, strict=True):
+            yield title, condition, Take(reference, face.mouth(received))
+
+
+def known_speakers(folder: Path) -> set[str]:
+    """Return the speakers of clips that a shipped model may be trained on."""
+    return {
+        clip.speaker
+        for clip in read_clips(folder, language=None)
+        if clip.part != "held" and may_ship(clip.license)
+    }
+
+
+def groups_of(clip: LipClip, known: set[str]) -> list[str]:
+    """Return the groups that a clip belongs to."""
+    is_new = clip.speaker not in known
+    return [
+        ALL,
+        clip.language,
+        f"{clip.language} {'new' if is_new else 'known'}",
+        *([] if clip.is_filmed else [MOCAP]),
+        f"source {clip.source}",
+        f"speaker {clip.speaker}",
+    ]

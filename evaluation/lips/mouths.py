@@ -1,0 +1,69 @@
+"""Mouths to compare: tracked ones, and those that a lip model makes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CURVES: dict[str, Callable[[Array], Array]] = {  # of FAPs (num_frames, 68), in FAP units
+    "opening": lambda faps: -faps[:, 3] - faps[:, 4],
+    "width": lambda faps: faps[:, 5] + faps[:, 6],
+    "jaw": lambda faps: faps[:, 2],
+}
+_CLOSED = 20.0  # opening of made lips in FAP units: 0.6 mm on a face
+_CLOSED_SHARE = 0.1  # of a real mouth's range
+
+
+@dataclass(frozen=True, slots=True)
+class Mouth:
+    """The motion of a mouth; frames without an opening are left out."""
+
+    time_s: Array  # (num_frames,), rising
+    curves: dict[str, Array]  # opening, width and jaw; width and jaw may be NaN
+    is_closed: Mask
+
+    @property
+    def opening(self) -> Array:
+        """Distance of the lips, FAP units."""
+        return self.curves["opening"]
+
+    def at(self, name: str, time_s: Array) -> Array:
+        """Return a curve at other times."""
+        return np.interp(time_s, self.time_s, self.curves[name])
+
+
+def made_mouth(faps: Array) -> Mouth:
+    """Return the mouth of frames (num_frames, 68) at ``FRAME_RATE_HZ``."""
+    curves = {name: curve(faps) for name, curve in CURVES.items()}
+    return Mouth(np.arange(len(faps)) / FRAME_RATE_HZ, curves, curves["opening"] < _CLOSED)
+
+
+def real_mouth(time_s: Array, faps: Array) -> Mouth:
+    """Return the mouth of tracked FAPs (num_frames, 68), NaN where not measured.
+
+    Its lips are closed while the opening is in the lowest tenth of its range, because a tracked
+    face at rest is never exactly at 0.
+    """
+    curves = {name: curve(faps) for name, curve in CURVES.items()}
+    is_known = ~np.isnan(curves["opening"])
+    curves = {name: curve[is_known] for name, curve in curves.items()}
+    opening = curves["opening"]
+    low, high = np.percentile(opening, [1, 99]) if len(opening) else (0.0, 0.0)
+    return Mouth(time_s[is_known], curves, opening < low + _CLOSED_SHARE * (high - low))
+
+
+def real_faps(clip: LipClip) -> Array:
+    """Return the tracked FAPs of a clip, (num_frames, 68), NaN where not measured."""
+    faps = np.full((len(clip.time_s), NUM_FAPS), np.nan)
+    faps[:, np.array(MOUTH_FAPS) - 1] = clip.faps
+    return faps

@@ -1,0 +1,149 @@
+"""Clips with tracked lips, their phones, and when somebody speaks in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
+from kouxing.corpora.scoring import final_hypothesis
+from kouxing.evaluation.lips.curves import is_near
+from kouxing.evaluation.lips.mouths import CURVES, Mouth, real_faps, real_mouth
+from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.inventory import PhoneInventory
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PAUSE = "pause"
+_SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
+_MIN_PAUSE_S = 0.3
+_POWER_STEP_S = 0.01
+_LABIAL = "b"  # viseme of b p m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A clip with its real mouth and the recognizer's output for its undisturbed audio."""
+
+    clip: LipClip
+    mouth: Mouth
+    phones: Sequence[Phone]  # aligned with the text, or recognized
+    voice: Sequence[SpeechChange]  # the recognizer's voice activity
+    visemes: Mapping[str, Sequence[tuple[str, float]]]  # of phones, with shares of the duration
+
+    @cached_property
+    def loud_s(self) -> Array:
+        """When the sound is less than 30 dB below the loudest, seconds."""
+        end_s, level_db = np.array(level_track(self.clip.samples)).reshape(-1, 2).T
+        if not len(end_s):
+            return end_s
+        is_loud = level_db > np.percentile(level_db, 95) - _SPEECH_RANGE_DB
+        return np.asarray(end_s[is_loud] - LEVEL_STEP_S / 2.0)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the samples."""
+        return float(np.sqrt(np.mean(np.square(self.clip.samples, dtype=float))))
+
+    def is_speech(self, time_s: Array) -> Mask:
+        """Whether somebody speaks at the given times.
+
+        Voice activity is on, and a loud sound is within 0.1 s. Voice activity alone spans pauses of
+        half a second; the level alone takes noise for speech.
+        """
+        after = np.searchsorted([change.time_s for change in self.voice], time_s, side="right")
+        is_active = np.array([False, *(change.active for change in self.voice)])[after]
+        return np.asarray(is_active & is_near(time_s, self.loud_s, _SPEECH_MARGIN_S))
+
+    def pauses(self) -> list[tuple[float, float]]:
+        """Return start and end of each silence of at least 0.3 s after a sound, seconds."""
+        if not len(self.loud_s):
+            return []
+        sounds_s = [*self.loud_s, self.clip.time_s[-1] + LEVEL_STEP_S / 2.0]
+        edges = ((a + LEVEL_STEP_S / 2.0, b - LEVEL_STEP_S / 2.0) for a, b in pairwise(sounds_s))
+        return [(start, end) for start, end in edges if end - start >= _MIN_PAUSE_S]
+
+    def viseme_at(self, time_s: float) -> str:
+        """Return the viseme at a time, or ``PAUSE``."""
+        for phone in self.phones:
+            share = (time_s - phone.onset_s) / max(phone.duration_s, 1e-9)
+            if 0.0 <= share < 1.0:
+                for viseme, extent in self.visemes[phone.symbol]:
+                    if share < extent + 1e-9:
+                        return PAUSE if viseme == "rest" else viseme
+                    share -= extent
+        return PAUSE
+
+    def labials(self) -> list[Phone]:
+        """Return the phones b p m."""
+        return [phone for phone in self.phones if self.visemes[phone.symbol][0][0] == _LABIAL]
+
+    def quietest_moments(self, phones: Sequence[Phone]) -> Array:
+        """Return when each phone is quietest, seconds."""
+        hop = round(_POWER_STEP_S * SAMPLE_RATE_HZ)
+        samples = self.clip.samples
+        power = np.square(samples[: len(samples) // hop * hop], dtype=float)
+        level = power.reshape(-1, hop).mean(axis=1)
+        moments = []
+        for phone in phones:
+            first = round(phone.onset_s / _POWER_STEP_S)
+            last = max(round((phone.onset_s + phone.duration_s) / _POWER_STEP_S), first + 1)
+            if first < len(level):
+                moments.append((first + int(np.argmin(level[first:last])) + 0.5) * _POWER_STEP_S)
+        return np.array(moments)
+
+
+def reference_of(
+    clip: LipClip,
+    events: Sequence[SoundEvent],
+    inventory: PhoneInventory,
+    aligned: Sequence[Phone] | None,
+) -> Reference:
+    """Return the reference of a clip from a live recognizer's output for it."""
+    return Reference(
+        clip=clip,
+        mouth=real_mouth(clip.time_s, real_faps(clip)),
+        phones=aligned or final_hypothesis(events),
+        voice=[event for event in events if isinstance(event, SpeechChange)],
+        visemes=inventory.visemes,
+    )
+
+
+def clips_to_score(
+    folder: Path,
+    parameters: Collection[Path | None] = (),
+    *,
+    language: str | None = None,
+) -> list[LipClip]:
+    """Read the held-out clips of a folder that no viseme parameters were trained on.
+
+    ``parameters`` are files; those of the package are always included. Clips with sound out of sync
+    are left out. Raises UserError if no clip is left.
+    """
+    seen = {name for path in {None, *parameters} for name in clips_seen(path)}
+    filters: dict[str, Callable[[LipClip], bool]] = {
+        "no clip is held out; list clips or speakers in held.txt": lambda clip: clip.part == "held",
+        "the parameters were trained on all clips; use other clips": lambda clip: (
+            clip.name not in seen
+        ),
+        "no clip has its sound in sync; use other clips": lambda clip: clip.is_in_sync,
+        "no clip measures the lip opening (FAP 4 and 5); add such columns": lambda clip: (
+            not np.isnan(CURVES["opening"](real_faps(clip))).all()
+        ),
+    }
+    clips = read_clips(folder, language=language)
+    for message, is_kept in filters.items():
+        clips = [clip for clip in clips if is_kept(clip)]
+        if not clips:
+            raise UserError(f"{folder}: {message}")
+    return clips

@@ -1,0 +1,70 @@
+"""Print the comparison of the four schemes of Li et al. 2011."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import groupby, pairwise
+
+from rich.console import Console
+
+from kouxing.evaluation.lips.agreement import Agreement
+from kouxing.evaluation.lips.scheme_scores import ConditionScore, Order, Outcome
+from kouxing.evaluation.tables import format_number
+from kouxing.shared.terminal import plural, print_table
+
+# Table 2: mean opinion scores of sync and realism, and the minimum delay in theory, ms.
+PAPER = {1: (4.34, 4.01, 0), 2: (3.98, 3.81, 0), 3: (3.42, 3.50, 45), 4: (3.21, 3.16, 110)}
+
+AGREEMENT = ("of", "correlation", "error", "lag", "F1")
+LEGEND = (
+    "correlation: opening, width, jaw; opening: error in FAP units, lag in ms and jerk in million "
+    "FAP units / s³; F1: of closures; phone: median phone delay, ms; face: delay of the face, ms; "
+    "paper: mean opinion scores of sync and realism, minimum delay in theory, ms"
+)
+
+
+def print_outcome(outcome: Outcome, console: Console) -> None:
+    """Print each lip model against scheme 1 and real lips, then whether the order holds."""
+    references: dict[str, Callable[[ConditionScore], Agreement | None]] = {
+        "scheme 1": lambda score: score.like_scheme_1,
+        "real lips": lambda score: score.like_real_lips,
+    }
+    for name, agreement in references.items():
+        for lips, scores in groupby(outcome.scores, lambda score: score.lips):
+            rows = [(score, like) for score in scores if (like := agreement(score))]
+            if rows:
+                columns = ("scheme", *AGREEMENT, "jerk", "phone", "face", "paper")
+                print_table(console, f"{lips} against {name}", columns, map(_row, rows))
+    console.print(LEGEND, highlight=False)
+    for order in outcome.orders:
+        console.print(describe(order), highlight=False)
+
+
+def describe(order: Order) -> str:
+    """Say whether an order holds, and how much correlation each step costs."""
+    figures = " ".join(f"{figure:.2f}" for figure in order.correlations)
+    steps = [before - after for before, after in pairwise(order.correlations)]
+    costs = ("recognition errors cost", "live output", "waiting for the next phone")
+    return (
+        f"{order.lips}, {order.recognizer}, opening against {order.reference} ({figures}): "
+        f"1 > 2 > 3 > 4 {'holds' if order.holds else 'does not hold'}, in "
+        f"{order.num_holding} of {plural(order.num_sentences, 'sentence')}; "
+        + ", ".join(f"{cost} {step:.2f}" for cost, step in zip(costs, steps, strict=True))
+    )
+
+
+def _row(pair: tuple[ConditionScore, Agreement]) -> list[str]:
+    score, like = pair
+    sync, realism, min_ms = PAPER[score.scheme]
+    return [
+        f"{score.scheme} {score.recognizer}",
+        str(like.num_clips),
+        " ".join(map(format_number, like.correlation.values())),
+        format_number(like.error, ".0f"),
+        format_number(like.lag_ms, "+.0f"),
+        format_number(like.closure_f1),
+        format_number(score.jerk and score.jerk / 1e6, ".1f"),
+        format_number(score.phone_delay_p50_ms, ".0f"),
+        format_number(score.face_delay_ms, ".0f"),
+        f"{sync:.2f} {realism:.2f} {min_ms}",
+    ]
