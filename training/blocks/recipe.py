@@ -55,7 +55,7 @@ from kouxing.training.training_set import (
 BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY = 2.0  # most of the network's errors are deletions
-_MIX = Mix({"sentence": 0.38, "word": 0.05, "synthetic": 0.14}, 0.43)
+_MIX = Mix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
 _BACKGROUNDS = ("music", "noise", "babble")
 _SUNG_SHARE, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # of a recording, that are sung
