@@ -1,0 +1,185 @@
+"""Uploads of mouths, with other programs in place of the real learning, and of sound files."""
+
+import asyncio
+import io
+import json
+import os
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import unquote
+
+import aiohttp
+import numpy as np
+import pytest
+import soundfile
+from aiohttp import web
+
+from kouxing.services.gateway import sound_upload
+from kouxing.services.gateway.access import AccessPolicy
+from kouxing.services.gateway.http import make_application
+from kouxing.services.gateway.learn_mouth import MAX_BYTES, MouthLearner
+from kouxing.services.gateway.sound_upload import REMARKS_HEADER, SoundUpload
+from kouxing.services.gateway.uploads import Uploads
+from tests.process.web_clients import async_test
+
+REVERSE = """
+import sys
+print(sys.stdin.read()[::-1], end="")
+"""
+REFUSE = """
+import sys
+sys.exit(print("too little speech; read for 20 s or more", file=sys.stderr) or 2)
+"""
+FAIL = "raise RuntimeError('a bug')"
+CRASH = "import os; os.abort()"
+# writes the process id to the file that the recording names
+HANG = """
+import os, pathlib, sys, time
+pathlib.Path(sys.stdin.read()).write_text(str(os.getpid()))
+time.sleep(60)
+"""
+
+
+Answer = tuple[int, bytes, str]  # status, body, remarks
+Post = Callable[..., Awaitable[Answer]]
+SINE = 0.5 * np.sin(np.arange(32_000) * 0.1)
+
+
+@asynccontextmanager
+async def serve(uploads: Uploads) -> AsyncIterator[Post]:
+    route = web.post("/upload", uploads.serve)
+    runner = web.AppRunner(make_application(head_file="", routes=[route], access=AccessPolicy()))
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.1", 0).start()
+    address = f"http://127.0.0.1:{runner.addresses[0][1]}/upload"
+    async with aiohttp.ClientSession() as http, asyncio.timeout(100):
+
+        async def post(data: bytes = b"abc", name: str = "") -> Answer:
+            async with http.post(address, params={"name": name}, data=io.BytesIO(data)) as answer:
+                remarks = unquote(answer.headers.get(REMARKS_HEADER, ""))
+                return answer.status, await answer.read(), remarks
+
+        yield post
+    await runner.cleanup()
+
+
+def learner(program: str) -> MouthLearner:
+    return MouthLearner((sys.executable, "-c", program))
+
+
+def error(status: int, text: str) -> Answer:
+    return status, json.dumps({"error": text}).encode(), ""
+
+
+async def process_in(path: Path) -> int:
+    """Wait until the learning hangs; return its process id."""
+    while not path.is_file() or not path.read_text():
+        await asyncio.sleep(0.02)
+    return int(path.read_text())
+
+
+async def wait_until_ended(process: int) -> None:
+    while Path(f"/proc/{process}").exists():
+        await asyncio.sleep(0.02)
+
+
+@async_test
+async def test_answers_with_the_result_of_the_process() -> None:
+    async with serve(learner(REVERSE)) as post:
+        assert await post() == (200, b"cba", "")
+
+
+@pytest.mark.parametrize(
+    ("program", "text"),
+    [
+        (REFUSE, "too little speech; read for 20 s or more"),
+        (FAIL, "learning failed; see the gateway's log"),
+        (CRASH, "learning failed; see the gateway's log"),
+    ],
+)
+@async_test
+async def test_answers_with_the_error(program: str, text: str) -> None:
+    async with serve(learner(program)) as post:
+        assert await post() == error(422, text)
+        assert await post() == error(422, text)  # and accepts the next one
+
+
+@async_test
+async def test_rejects_a_recording_that_is_too_large() -> None:
+    async with serve(learner(REVERSE)) as post:
+        assert await post(bytes(MAX_BYTES + 1)) == error(413, "the recording is larger than 8 MiB")
+        assert (await post(bytes(MAX_BYTES)))[0] == 200
+
+
+@async_test
+async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
+    tmp_path: Path,
+) -> None:
+    hanging = learner(HANG)
+    async with serve(hanging) as post:
+        path = tmp_path / "process"
+        first = asyncio.ensure_future(post(str(path).encode()))
+        process = await process_in(path)
+        assert os.getpriority(os.PRIO_PROCESS, process) == 19
+        assert hanging.is_running
+        assert await post() == error(503, MouthLearner.busy_text)
+        hanging.close()
+        assert await first == error(422, "the gateway is stopping")
+        await wait_until_ended(process)
+        assert not hanging.is_running
+        assert await post() == error(503, "the gateway is stopping")
+
+
+@async_test
+async def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> None:
+    async with serve(learner(HANG)) as post:
+        path = tmp_path / "process"
+        request = asyncio.ensure_future(post(str(path).encode()))
+        process = await process_in(path)
+        request.cancel()
+        await wait_until_ended(process)
+
+
+# --- sound files
+
+
+def written(suffix: str, channels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    soundfile.write(file, channels, 16_000, format=suffix)
+    return file.getvalue()
+
+
+@async_test
+async def test_answers_a_file_with_its_sound() -> None:
+    six = np.zeros((len(SINE), 6))
+    six[:, 2] = SINE  # which browsers would mix into another sound than FFmpeg
+    async with serve(SoundUpload()) as post:
+        status, data, remarks = await post(written("FLAC", six), "a film.flac")
+    assert (status, remarks) == (200, "")
+    samples, rate_hz = soundfile.read(io.BytesIO(data))
+    assert rate_hz == 16_000
+    np.testing.assert_allclose(samples, 0.707 * SINE, atol=1e-3)
+
+
+@async_test
+async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
+    async with serve(SoundUpload()) as post:
+        for name in ("wave.py", "../../x", "-", "口型.wav"):
+            status, _, remarks = await post(written("WAV", SINE)[:40_000], name)
+            assert status == 200
+            assert "the file is cut off after 1.2 s of 2.0 s" in remarks
+            assert "/" not in remarks.partition(":")[0]
+
+
+@async_test
+async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serve(SoundUpload()) as post:
+        status, data, _ = await post(b'{"error": "no key"}', "a.mp3")
+        assert status == 422
+        assert b"a.mp3: cannot read audio: this is text, not sound" in data
+        monkeypatch.setattr(sound_upload, "MAX_BYTES", 1000)
+        status, data, _ = await post(written("WAV", SINE), "a.wav")
+        assert status == 413
+        assert b"larger than" in data
