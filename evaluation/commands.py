@@ -293,21 +293,15 @@ def schemes(
 @app.command()
 def ferguson(
     clips: Clips,
-    picture: Annotated[
-        Path | None, typer.Option(help="Plot accuracy against speaking rate (.png).")
-    ] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Compare lip models with tracked lips at several speaking rates, as in Zhang et al. 2021."""
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.speaking_rates import print_rates, rates_figure, score_rates
+    from kouxing.evaluation.lips.speaking_rates import print_rates, score_rates
 
-    check_output(picture, json_file, force=force)
+    check_output(json_file, force=force)
     scores = score_rates(clips)
     print_rates(scores, Console())
-    if picture is not None:
-        save_figure(rates_figure(scores), picture)
     write_json(json_file, [asdict(score) for score in scores])
 
 

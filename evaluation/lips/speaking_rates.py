@@ -25,14 +25,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import change_speed
@@ -70,7 +68,6 @@ _LIP_COLUMNS = [
     if fap != 3
 ]
 _MIDDLES = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
-_BOUND_STYLES = {BEST_OPENING: "--", STILL: ":"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,22 +224,6 @@ def print_rates(scores: Sequence[RateScore], console: Console) -> None:
         for name in accuracies(scores[0]):
             rows.append([name, *(f"{100 * accuracies(score)[name]:.0f} %" for score in scores)])
         print_table(console, "", (title, *(f"{score.rate:g}" for score in scores)), rows)
-
-
-def rates_figure(scores: Sequence[RateScore]) -> Any:
-    """Plot the accuracies over the speaking rate."""
-    figure = new_figure(11.0, 4.5)
-    rates = [score.rate for score in scores]
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, (title, accuracies) in zip(axes, _TITLES.items(), strict=True):
-        for name in accuracies(scores[0]):
-            percents = [100 * accuracies(score)[name] for score in scores]
-            color = "0.6" if name in _BOUND_STYLES else None
-            axis.plot(rates, percents, _BOUND_STYLES.get(name, "o-"), color=color, label=name)
-        axis.set(title=title, xlabel="speaking rate, relative to the recording")
-    axes[0].set_ylabel("accuracy, %")
-    axes[1].legend(fontsize=8)
-    return figure
 
 
 _TITLES: dict[str, Callable[[RateScore], dict[str, float]]] = {

@@ -1,17 +1,15 @@
 """How well the visemes fit lips that they were not trained on.
 
-Source: Wang & Cai 2003, section 4. Their figure 4 shows measured and modeled curves of a single
-final and of a sentence. Here the full model runs over the phones of each clip. The phones are
-aligned if the text is known, and recognized otherwise. The model runs with the learnt parameters
-and with the initial ones, which were set by hand. Each frame counts for the nearest viseme. The
-level of the voice is not used.
+Source: Wang & Cai 2003, section 4; their figure 4 shows measured and modeled curves. Here the full
+model runs over the phones of each clip. The phones are aligned if the text is known, and recognized
+otherwise. The model runs with the learnt parameters and with the initial ones, which were set by
+hand. Each frame counts for the nearest viseme. The level of the voice is not used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from rich.console import Console
 from rich.progress import track
 
 from kouxing.corpora.figures import new_figure
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
+from kouxing.corpora.lip_clips import LipClip, label_clip
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import CURVES, real_faps
@@ -39,7 +37,6 @@ from kouxing.shared.terminal import print_table
 Array = NDArray[np.float64]
 
 _SENTENCE_S = 6.0
-_LONG_VOWEL_S, _CONTEXT_S = 0.2, 0.4
 
 
 @dataclass(slots=True, kw_only=True)
@@ -96,11 +93,8 @@ def fit_clip(
     def curves(lips: DynamicVisemes) -> Array:
         num_frames = int(max(clip.time_s[-1], 0.0) * FRAME_RATE_HZ) + 2
         frames = synthesize(lips, phones, num_frames, FRAME_RATE_HZ)
-        position = np.clip(clip.time_s * FRAME_RATE_HZ, 0.0, num_frames - 1.001)
-        before = position.astype(int)
-        share = (position - before)[:, None]
-        mixed: Array = (1.0 - share) * frames[before] + share * frames[before + 1]
-        return mixed
+        frame_s = np.arange(num_frames) / FRAME_RATE_HZ
+        return np.stack([np.interp(clip.time_s, frame_s, fap) for fap in frames.T], axis=1)
 
     return FittedClip(clip, phones, learnt.inventory, curves(learnt), curves(guessed))
 
@@ -161,72 +155,29 @@ def print_errors(errors: Sequence[VisemeError], console: Console) -> None:
 
 
 def fit_figure(fitted: Sequence[FittedClip]) -> Any:
-    """Plot measured and modeled curves: of a long vowel, and of a sentence."""
-    figure = new_figure(14.0, 6.0)
-    axes = figure.subplots(
-        1 + len(CURVES), 2, sharex="col", sharey="row", width_ratios=(1.0, 2.2), squeeze=False
-    )
-    clip = max(fitted, key=lambda clip: _long_vowel(clip)[2])
-    start_s, length_s, _ = _long_vowel(clip)
-    _draw_fit(axes[:, 0], clip, start_s - _CONTEXT_S, start_s + length_s + _CONTEXT_S)
-    clip = max(fitted, key=lambda clip: _busiest_stretch(clip)[1])
-    start_s, _ = _busiest_stretch(clip)
-    _draw_fit(axes[:, 1], clip, start_s, start_s + _SENTENCE_S)
-    for axis, measure in zip(axes[1:, 0], CURVES, strict=True):
-        axis.set_ylabel(f"{measure}, FAP units", fontsize=8)
-    axes[1, 1].legend(fontsize=8, loc="upper right")
-    return figure
-
-
-def _long_vowel(fitted: FittedClip) -> tuple[float, float, float]:
-    """Return onset, duration and confidence of the best long vowel before a pause."""
-    inventory = fitted.inventory
-    return max(
-        (
-            (phone.onset_s, phone.duration_s, phone.confidence)
-            for phone, after in pairwise(fitted.phones)
-            if phone.symbol in inventory.vowels
-            and len(inventory.visemes[phone.symbol]) == 1
-            and phone.duration_s > _LONG_VOWEL_S
-            and after.symbol == inventory.silence
-        ),
-        key=lambda vowel: vowel[2],
-        default=(0.0, 0.0, 0.0),
-    )
-
-
-def _busiest_stretch(fitted: FittedClip) -> tuple[float, int]:
-    """Return the start of the 6 s with the most phones, and their number."""
-    silence = fitted.inventory.silence
-    onsets_s = np.array([phone.onset_s for phone in fitted.phones if phone.symbol != silence])
-    if not onsets_s.size:
-        return 0.0, 0
-    until = np.searchsorted(onsets_s, onsets_s + _SENTENCE_S)
-    count = until - np.arange(len(onsets_s))
-    best = int(np.argmax(count))
-    return max(float(onsets_s[best]) - 0.1, 0.0), int(count[best])
-
-
-def _draw_fit(axes: Any, fitted: FittedClip, start_s: float, end_s: float) -> None:
-    first, last = (round(max(time_s, 0.0) * SAMPLE_RATE_HZ) for time_s in (start_s, end_s))
-    phones = [phone for phone in fitted.phones if start_s <= phone.onset_s < end_s]
-    samples = fitted.clip.samples[first:last]
-    axes[0].plot((first + np.arange(len(samples))) / SAMPLE_RATE_HZ, samples, color="0.6", lw=0.3)
-    bottom = -1.1 * float(np.abs(samples).max(initial=1e-3))
-    top = -1.5 * bottom
-    axes[0].set(ylim=(bottom, top), yticks=[])
-    for number, phone in enumerate(phones):
-        for axis in axes:
-            axis.axvline(phone.onset_s, color="0.92", zorder=0)
-        if phone.symbol != fitted.inventory.silence:
-            # two heights, so that labels of short phones do not overlap
-            axes[0].text(phone.onset_s, top * (0.7 + 0.15 * (number % 2)), phone.symbol, fontsize=8)
-    axes[0].set_title(fitted.clip.name, fontsize=9)
-    is_shown = (fitted.clip.time_s >= start_s) & (fitted.clip.time_s <= end_s)
-    time_s = fitted.clip.time_s[is_shown]
-    for axis, measure in zip(axes[1:], CURVES, strict=True):
-        real, learnt, guessed = (curve[is_shown] for curve in fitted.curves(measure))
+    """Plot measured and modeled curves of the clip with the most phones in the first 6 s."""
+    figure = new_figure(10.0, 6.0)
+    axes = figure.subplots(len(CURVES), sharex=True)
+    clip = max(fitted, key=lambda clip: len(_first_phones(clip)))
+    is_shown = clip.clip.time_s <= _SENTENCE_S
+    for axis, name in zip(axes, CURVES, strict=True):
+        real, learnt, guessed = (curve[is_shown] for curve in clip.curves(name))
+        time_s = clip.clip.time_s[is_shown]
         axis.plot(time_s, guessed, color="C1", linewidth=0.8, label="initial parameters")
         axis.plot(time_s, real, color="0.6", linewidth=2.5, label="measured")
         axis.plot(time_s, learnt, color="black", linewidth=1.2, label="learnt parameters")
+        axis.set_ylabel(f"{name}, FAP units", fontsize=8)
+    top = axes[0].get_ylim()[1]
+    for number, phone in enumerate(_first_phones(clip)):
+        label = phone.symbol + "\n" * (number % 2)  # two heights, so that labels do not overlap
+        axes[0].text(phone.onset_s, top, label, fontsize=8)
+    axes[0].set_title(clip.clip.name, fontsize=9, pad=25)
+    axes[0].legend(fontsize=8, loc="upper right")
     axes[-1].set_xlabel("s")
+    return figure
+
+
+def _first_phones(fitted: FittedClip) -> list[Phone]:
+    silence = fitted.inventory.silence
+    phones = [phone for phone in fitted.phones if phone.symbol != silence]
+    return [phone for phone in phones if phone.onset_s < _SENTENCE_S]

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
-from kouxing.evaluation.lips.lip_scores import groups_of
+from kouxing.evaluation.lips.lip_scores import Scores, groups_of
 from kouxing.evaluation.lips.lip_table import print_scores
 from kouxing.evaluation.recognizer.disturbances import BABBLE, CLEAN, MUSIC
 from kouxing.shared.errors import UserError
@@ -52,7 +52,7 @@ def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
 
 
 def test_the_table_fits_a_screen() -> None:
-    scores = {
+    scores: Scores = {
         "clips": 99.0,
         **dict.fromkeys(MEASURES, 0.99),
         "effort_correlation": -0.99,
