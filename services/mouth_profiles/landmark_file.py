@@ -11,8 +11,6 @@ A file contains only frames with a face. It may come from an untrusted source, s
 every size.
 """
 
-import json
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,22 +40,6 @@ def parse_landmark_file(content: bytes) -> FilmedSpeech:
     levels = np.array(level_track(samples))
     faps = mouth_faps(landmarks, np.interp(time_s, levels[:, 0], levels[:, 1]))
     return FilmedSpeech(samples=samples, frame_s=time_s, lip_track=lip_tracks(faps))
-
-
-def landmark_file(
-    time_s: NDArray[np.float64],
-    landmarks: NDArray[np.float32],
-    pcm: NDArray[np.int16],
-    sample_rate_hz: int,
-) -> bytes:
-    """Write frame times, (n,), landmarks, (n, 43, 3), and mono audio, (num_samples,), as a file."""
-    header = json.dumps(
-        {"times": len(time_s), "points": len(LANDMARKS), "sample_rate_hz": sample_rate_hz}
-    ).encode()
-    parts = (time_s.astype("<f8"), landmarks.astype("<f4"), pcm.astype("<i2"))
-    return b"".join(
-        (len(header).to_bytes(4, "little"), header, *(part.tobytes() for part in parts))
-    )
 
 
 def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:

@@ -13,13 +13,12 @@ from kouxing.corpora.commands import adapt_app, track_app
 from kouxing.corpora.lip_clips import read_clip
 from kouxing.services.driver.video.writer import VideoWriter
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
-from kouxing.services.mouth_profiles.landmark_file import landmark_file
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO
-from tests.unit.test_face_landmarks import FACE
+from tests.unit.test_face_landmarks import FACE, landmark_file
 
 PICTURES = Path(__file__).parents[1] / "golden"
 RUNNER = CliRunner()
@@ -88,7 +87,8 @@ def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     for point in (14, 17, 152, 178, 402):
         points[:, LANDMARKS.index(point), 1] -= 5 * loudness
     pcm = (32767 * samples).astype(np.int16)
-    seen = landmark_file(time_s, (20 * points * (1, -1, -1)).astype(np.float32), pcm, 16_000)
+    frames = (20 * points * (1, -1, -1)).astype(np.float32)
+    seen = landmark_file(time_s, frames, pcm, sample_rate_hz=16_000)
     (tmp_path / "me.landmarks").write_bytes(seen)
     profile, figures = tmp_path / "me.mouth", tmp_path / "me.json"
     run(adapt_app, tmp_path / "me.landmarks", "-o", profile, "--json", figures)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from kouxing.services.mouth_profiles.face_landmarks import _STEADY, LANDMARKS, mouth_faps
-from kouxing.services.mouth_profiles.landmark_file import landmark_file, parse_landmark_file
+from kouxing.services.mouth_profiles.landmark_file import parse_landmark_file
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -86,15 +86,23 @@ def test_rejects_landmarks_that_form_no_face() -> None:
 
 TIMES = np.arange(NUM_FRAMES) / 25
 PCM = np.random.default_rng(0).integers(-9000, 9000, 3 * 48_000).astype(np.int16)
-CONTENT = landmark_file(TIMES, film({14: (0, -1, 0)}), PCM, 48_000)
+FRAMES = film({14: (0, -1, 0)})
+
+
+def landmark_file(
+    time_s: NDArray[np.float64] = TIMES,
+    frames: NDArray[np.float32] = FRAMES,
+    pcm: NDArray[np.int16] = PCM,
+    **header: object,
+) -> bytes:
+    given = {"times": len(time_s), "points": len(LANDMARKS), "sample_rate_hz": 48_000} | header
+    text = json.dumps(given).encode()
+    body = time_s.astype("<f8").tobytes() + frames.tobytes() + pcm.tobytes()
+    return len(text).to_bytes(4, "little") + text + body
+
+
+CONTENT = landmark_file()
 HEADER_BYTES = int.from_bytes(CONTENT[:4], "little")
-BODY = CONTENT[4 + HEADER_BYTES :]
-
-
-def with_header(**changes: object) -> bytes:
-    fields = json.loads(CONTENT[4 : 4 + HEADER_BYTES]) | changes
-    header = json.dumps(fields).encode()
-    return len(header).to_bytes(4, "little") + header + BODY
 
 
 def test_parses_a_landmark_file() -> None:
@@ -114,11 +122,11 @@ def replaced(at: int, part: bytes) -> bytes:
         (b"", "not a landmark file"),
         (b"\xff\xff\xff\xff" + CONTENT[4:], "not a landmark file"),
         (CONTENT[: 4 + HEADER_BYTES], "truncated"),
-        (with_header(times=2**60), "truncated"),
-        (with_header(times=49), "only 49 frames"),
-        (with_header(points=468), "468 landmarks"),
-        (with_header(sample_rate_hz=4000), "4000 Hz"),
-        (b"\x04\x00\x00\x00null" + BODY, "whole numbers"),
+        (landmark_file(times=2**60), "truncated"),
+        (landmark_file(times=49), "only 49 frames"),
+        (landmark_file(points=468), "468 landmarks"),
+        (landmark_file(sample_rate_hz=4000), "4000 Hz"),
+        (b"\x04\x00\x00\x00null" + CONTENT[4 + HEADER_BYTES :], "whole numbers"),
         (replaced(8, np.float64(np.nan).tobytes()), "times"),
         (replaced(8 * NUM_FRAMES, np.float32(np.nan).tobytes()), "pixels"),
         (CONTENT[: 4 + HEADER_BYTES + NUM_FRAMES * (8 + 12 * 43) + 20], "second of audio"),
