@@ -262,8 +262,9 @@ class GatewayService(Service):
         for name in self._needed_sessions() & self._sessions.keys():
             if not self._sessions[name].is_followed:
                 self._follow(self._sessions[name])
-        if self._viewers.has_viewers and now_s >= self._rest_due_s:
-            self._rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
+        rest_due_s = max(self._rest_due_s, self._viewers.rest_from_s)
+        if now_s >= rest_due_s:
+            self._rest_due_s = rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
             self._viewers.show_rest(self._resting_face, now_s)
         is_answered = self._report_s >= self._request_s
         interval_s = STATUS_INTERVAL_S if self._viewers.has_viewers else STATUS_TIMEOUT_S
@@ -273,7 +274,7 @@ class GatewayService(Service):
             self.send_to_control(StatusRequest(request=secrets.token_hex(8)))
         if now_s - self._report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
-        return min(due_s, self._rest_due_s) if self._viewers.has_viewers else due_s
+        return min(due_s, rest_due_s)
 
     def _on_status(self, report: StatusReport, _sender: Peer) -> None:
         """Announce missing services to the viewers."""

@@ -133,14 +133,17 @@ class Viewers:
 
     def show_rest(self, face: RestingFace, now_s: float) -> None:
         """Send the face at rest to viewers without recent frames of a session."""
-        viewers = [viewer for viewer in self._viewers if now_s > viewer.moved_s + PAUSE_S]
-        if not viewers:
-            return
+        viewers = [viewer for viewer in self._viewers if now_s >= viewer.moved_s + PAUSE_S]
         faps = face.faps(now_s).astype("<f4").tobytes()
         message = wire.binary(wire.REST_TYPE, 0, 0, faps)
         for viewer in viewers:
             self._put(viewer, MessageKind.REST, message)
         self._put_shapes(viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
+
+    @property
+    def rest_from_s(self) -> float:
+        """When the first viewer is due to get the face at rest; infinite without viewers."""
+        return min((viewer.moved_s for viewer in self._viewers), default=math.inf) + PAUSE_S
 
     @property
     def newest(self) -> str:
