@@ -292,16 +292,20 @@ class FaceAnimator:
             goal = faps if rehearsed is None else rehearsed
             self._start_transition(FapState(self._shown - goal, _ZERO))
         self._transition_s += 1.0 / self._frame_rate_hz
-        difference = self._transition.at(self._transition_s).value
+        if self._transition_s < self._transition.longest_s:
+            self._add_difference(faps, self._transition.value_at(self._transition_s))
+        shown = faps.astype(np.float64)
+        self._previously_shown = shown if self._shown is None else self._shown
+        self._shown = shown
+        return self._time_s, faps
+
+    def _add_difference(self, faps: NDArray[np.float32], difference: Faps) -> None:
+        """Add the remaining difference of a transition to a frame, in place."""
         if difference.any():
             free = max(self._expression.free, 1.0 - self._transition_s / _BIND_S)
             jaw = faps[JAW] + difference[JAW]  # the jaw does not open the lips
             mix(faps, difference.astype(np.float32), free)
             faps[JAW] = max(jaw, 0.0)
-        shown = faps.astype(np.float64)
-        self._previously_shown = shown if self._shown is None else self._shown
-        self._shown = shown
-        return self._time_s, faps
 
     def _make_goal(self, mouth: MouthFrame) -> NDArray[np.float32]:
         """Return the next frame, FAPs (68,), without the transition."""

@@ -49,11 +49,17 @@ _LISTENING_HEAD = 0.35  # head motion while listening, relative to speaking
 _SPEAKING_S = 0.8  # time constant of the change between them
 _BREATH_HZ, _BREATH_DEG = 0.23, 0.35
 
-_LIDS_UPPER = [FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_t_r_eyelid"] - 1]
-_LIDS_LOWER = [FAP_NUMBER["close_b_l_eyelid"] - 1, FAP_NUMBER["close_b_r_eyelid"] - 1]
-_EYES_YAW = [FAP_NUMBER["yaw_l_eyeball"] - 1, FAP_NUMBER["yaw_r_eyeball"] - 1]
-_EYES_PITCH = [FAP_NUMBER["pitch_l_eyeball"] - 1, FAP_NUMBER["pitch_r_eyeball"] - 1]
-_HEAD = [FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw", "roll")]
+
+def span(first: str, last: str) -> slice:
+    """Return where successive FAPs are in an array (68,)."""
+    return slice(FAP_NUMBER[first] - 1, FAP_NUMBER[last])
+
+
+_LIDS_UPPER = span("close_t_l_eyelid", "close_t_r_eyelid")
+_LIDS_LOWER = span("close_b_l_eyelid", "close_b_r_eyelid")
+_EYES_YAW = span("yaw_l_eyeball", "yaw_r_eyeball")
+EYES_PITCH = span("pitch_l_eyeball", "pitch_r_eyeball")
+_HEAD = span("head_pitch", "head_roll")
 
 
 class State(Enum):
@@ -114,7 +120,7 @@ class IdleMotion:
         lid = self._lid(time_s)
         faps[_HEAD] += head.astype(np.float32)
         # the gaze target stays in place while the head turns
-        faps[_EYES_PITCH] += pitch - head[0]
+        faps[EYES_PITCH] += pitch - head[0]
         faps[_EYES_YAW] += yaw - head[1]
         faps[_LIDS_UPPER] += _LID_PER_GAZE * (pitch - head[0])
         # start from the lid position that an expression has set

@@ -237,10 +237,9 @@ class _FapFit:
         """Compute the log weights of the silences, (num_frames, 2)."""
         theta_left, theta_right = np.exp(silences[:2])
         start, end = self._silence
-        one = np.ones(1)
         return log_pause(
-            log_right_silence(start + silences[3], one, theta_right, self.c),
-            log_left_silence(end + silences[2], one, theta_left, self.c),
+            log_right_silence(start + silences[3], 0.0, theta_right, self.c),
+            log_left_silence(end + silences[2], 0.0, theta_left, self.c),
             end - start,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,19 +37,31 @@ class Transition:
 
     difference: FapState
     duration_s: Array
+    longest_s: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "longest_s", float(self.duration_s.max()))
 
     def at(self, elapsed_s: float) -> FapState:
         """Return the remaining difference after ``elapsed_s``."""
-        if elapsed_s >= self.duration_s.max():
-            return FapState(*np.zeros((2, len(self.duration_s))))
+        u = np.minimum(elapsed_s / self.duration_s, 1.0)
+        velocity = (1.0 - u) * (
+            -6.0 * u * self.difference.value / self.duration_s
+            + (1.0 - 3.0 * u) * self.difference.velocity
+        )
+        return FapState(self.value_at(elapsed_s), velocity)
+
+    def value_at(self, elapsed_s: float) -> Array:
+        """Return the value of the remaining difference."""
+        if elapsed_s >= self.longest_s:
+            return np.zeros(len(self.duration_s))
         u = np.minimum(elapsed_s / self.duration_s, 1.0)
         start, duration_s = self.difference, self.duration_s
         # cubic Hermite spline from (value, velocity) to (0, 0)
-        value = (1.0 - u) ** 2 * ((1.0 + 2.0 * u) * start.value + u * duration_s * start.velocity)
-        velocity = (1.0 - u) * (
-            -6.0 * u * start.value / duration_s + (1.0 - 3.0 * u) * start.velocity
+        value: Array = (1.0 - u) ** 2 * (
+            (1.0 + 2.0 * u) * start.value + u * duration_s * start.velocity
         )
-        return FapState(value, velocity)
+        return value
 
 
 NO_TRANSITION = Transition(still(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FAPS))

@@ -34,7 +34,7 @@ _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
 _WIDTH = np.array([6, 7, 53, 54]) - 1  # positive is outward
-_PUSH = np.array([16, 17]) - 1  # positive is forward
+_PUSH = slice(16 - 1, 17)  # positive is forward
 
 
 class Expressiveness:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.idle_motion import IdleMotion, State
+from kouxing.shared.face.idle_motion import EYES_PITCH, IdleMotion, State, span
 from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_share
 
 _LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
@@ -43,15 +43,14 @@ _BROW_HOLD_S, _BEAT_HOLD_S, _NOD_HOLD_S = 0.22, 0.12, 0.2
 _FILTER_S = 0.08  # time constant of each filter pole
 _BROW = {  # FAP units of a full movement
     f"raise_{side}_{part}_eyebrow": units
-    for side in "lr"
     for part, units in (("i", 45.0), ("m", 55.0), ("o", 35.0))
+    for side in "lr"
 }
 _BEAT_DEG, _NOD_DEG = 2.4, 3.2  # downwards; the filter halves these sizes
 
-_BROWS = np.array([FAP_NUMBER[name] - 1 for name in _BROW])
+_BROWS = span("raise_l_i_eyebrow", "raise_r_o_eyebrow")
 _BROW_UNITS = np.array([*_BROW.values()], np.float32)
 _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
-_EYES_PITCH = [FAP_NUMBER["pitch_l_eyeball"] - 1, FAP_NUMBER["pitch_r_eyeball"] - 1]
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
@@ -97,7 +96,7 @@ class SpeechIdleMotion:
         faps[_BROWS] += np.float32(self._brow.at(now_s, step_s)) * _BROW_UNITS
         pitch = np.float32(self._head.at(now_s, step_s) * _DEGREE)
         faps[_HEAD_PITCH] += pitch
-        faps[_EYES_PITCH] -= pitch  # the gaze target stays in place
+        faps[EYES_PITCH] -= pitch  # the gaze target stays in place
 
     def _state(self) -> State:
         if self._silence_s < _THINKING_S[0]:

@@ -29,8 +29,8 @@ _STEP_S = 1e-3  # of the numerical derivative
 
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return weights that sum to one along the first axis."""
-    weights: NDArray[np.float64] = np.exp(log_weights - np.max(log_weights, axis=0))
-    weights /= np.sum(weights, axis=0)
+    weights: NDArray[np.float64] = np.exp(log_weights - log_weights.max(axis=0))
+    weights /= weights.sum(axis=0)
     return weights
 
 
@@ -44,24 +44,24 @@ def log_weights(
     p, c = parameters, parameters.c
     time = time_s[:, None]  # (F, 1)
     viseme = timeline.viseme
-    offset = p.offset_s[viseme][:, None, :]  # (E, 1, P)
+    offset, log_alpha, theta_minus, theta_plus = p.dominance[viseme, :, None].swapaxes(0, 1)
     # signed distance to the apex: positive before it, negative after it, 0 inside
     before = timeline.apex_start_s[:, None, None] + offset - time
     after = timeline.apex_end_s[:, None, None] + offset - time
     tau = np.maximum(before, 0.0) + np.minimum(after, 0.0)  # (E, F, P)
     spoken = log_dominance(
         tau,
-        p.alpha[viseme][:, None, :],
-        p.theta_minus[viseme][:, None, :],
-        p.theta_plus[viseme][:, None, :],
+        log_alpha,
+        theta_minus,
+        theta_plus,
         c,
     )
     start_s = timeline.silence_start_s[:, None, None]  # (S, 1, 1)
     end_s = timeline.silence_end_s[:, None, None]
     # before and after all speech, one of the two is infinite and only the other remains
     silent = log_pause(
-        log_right_silence(start_s + p.offset_right_s - time, p.alpha_right, p.theta_right, c),
-        log_left_silence(end_s + p.offset_left_s - time, p.alpha_left, p.theta_left, c),
+        log_right_silence(start_s + p.offset_right_s - time, p.log_alpha_right, p.theta_right, c),
+        log_left_silence(end_s + p.offset_left_s - time, p.log_alpha_left, p.theta_left, c),
         end_s - start_s,
     )
     weights = np.concatenate([spoken, silent])
@@ -76,7 +76,7 @@ def _close_lips(
 ) -> NDArray[np.float64]:
     """Apply the closure rule (Wang & Cai 2003, eq. 7) to closing visemes."""
     closed = weights
-    for row in np.flatnonzero(parameters.closes[viseme].any(axis=1)):
+    for row in parameters.any_closes[viseme].nonzero()[0]:
         faps = np.flatnonzero(parameters.closes[viseme[row]])
         near = np.flatnonzero((np.abs(tau[row][:, faps]) < parameters.closure_reach_s).any(axis=1))
         if not near.size:
@@ -138,3 +138,8 @@ class TargetTrajectory:
         times = np.array([time_s - _STEP_S, time_s, time_s + _STEP_S])
         before, here, after = blend(self.parameters, self.timeline, times)
         return FapState(here, (after - before) / (2.0 * _STEP_S))
+
+    def value_at(self, time_s: float) -> NDArray[np.float64]:
+        """Return the position at a media time."""
+        value: NDArray[np.float64] = blend(self.parameters, self.timeline, np.array([time_s]))[0]
+        return value

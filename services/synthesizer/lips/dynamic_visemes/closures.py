@@ -25,7 +25,7 @@ class ClosureTracker:
         self._target = parameters.target
         self._frame_s = 1.0 / frame_rate_hz
         self._closes: NDArray[np.bool_] = parameters.closes > 0.0  # (num_visemes, num_mouth_faps)
-        self._any_closes = np.logical_or.reduce(self._closes, axis=1)  # (num_visemes,)
+        self._any_closes = parameters.any_closes
         self._shown: set[int] = set()  # phone indices
         self._postponed_s: dict[int, float] = {}  # phone index -> apex
 
@@ -35,7 +35,7 @@ class ClosureTracker:
         ``last_s`` and ``time_s`` are the times of the last and the next frame. Returns the timeline
         with late closures moved, and whether a closure was moved for the first time.
         """
-        start_s, end_s = timeline.apex_start_s.copy(), timeline.apex_end_s.copy()
+        start_s, end_s = timeline.apex_start_s, timeline.apex_end_s
         is_new = is_moved = False
         for row in self._closing_rows(timeline):
             index = int(timeline.phone_index[row])
@@ -44,7 +44,8 @@ class ClosureTracker:
                     continue
                 self._postponed_s[index] = last_s + _CATCH_UP_S
                 is_new = True
-            is_moved = True
+            if not is_moved:
+                start_s, end_s, is_moved = start_s.copy(), end_s.copy(), True
             end_s[row] = max(end_s[row], self._postponed_s[index])
             start_s[row] = max(start_s[row], min(self._postponed_s[index], end_s[row]))
         if not is_moved:
@@ -90,4 +91,4 @@ class ClosureTracker:
         self._postponed_s.clear()
 
     def _closing_rows(self, timeline: Timeline) -> NDArray[np.intp]:
-        return np.flatnonzero(self._any_closes[timeline.viseme])
+        return self._any_closes[timeline.viseme].nonzero()[0]

@@ -28,21 +28,21 @@ _PAUSE_SCALE_S = 0.05  # the silence of a pause this long has 63 % of the full d
 
 
 def log_dominance(
-    tau_s: Array, alpha: Array, theta_minus: Array, theta_plus: Array, c: float
+    tau_s: Array, log_alpha: Array, theta_minus: Array, theta_plus: Array, c: float
 ) -> Array:
     """Return the log dominance of a viseme (Li 2011, eq. 5); all shapes broadcast."""
     theta = np.where(tau_s >= 0.0, theta_minus, theta_plus)
-    return np.log(alpha) - theta * np.abs(tau_s) ** c  # Li 2011, eq. 5
+    return log_alpha - theta * np.abs(tau_s) ** c  # Li 2011, eq. 5
 
 
-def log_left_silence(sigma_s: Array, alpha: Array, theta: Array, c: float) -> Array:
+def log_left_silence(sigma_s: Array, log_alpha: Array | float, theta: Array, c: float) -> Array:
     """Return the log dominance of the silence before speech (Li 2011, eq. 6)."""
-    return np.log(alpha) + np.sign(sigma_s) * theta * np.abs(sigma_s) ** c  # Li 2011, eq. 6
+    return log_alpha + np.copysign(theta * np.abs(sigma_s) ** c, sigma_s)  # Li 2011, eq. 6
 
 
-def log_right_silence(nu_s: Array, alpha: Array, theta: Array, c: float) -> Array:
+def log_right_silence(nu_s: Array, log_alpha: Array | float, theta: Array, c: float) -> Array:
     """Return the log dominance of the silence after speech (Li 2011, eq. 7)."""
-    weights: Array = np.log(alpha) - np.sign(nu_s) * theta * np.abs(nu_s) ** c  # Li 2011, eq. 7
+    weights: Array = log_alpha - np.copysign(theta * np.abs(nu_s) ** c, nu_s)  # Li 2011, eq. 7
     return weights
 
 

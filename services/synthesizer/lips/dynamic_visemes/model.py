@@ -19,6 +19,7 @@ recognized. This halves the lag of the lips at short delays.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -112,7 +113,7 @@ class VisemeStream:
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # while media time stands still
         self._time_s = start_s  # of the last frame
-        self._mouth = still(parameters.neutral)
+        self._mouth: Callable[[], FapState] = lambda: still(parameters.neutral)
 
     def add_event(self, event: SoundEvent) -> None:
         """Add a phone, a revision, or the end of speech."""
@@ -140,19 +141,23 @@ class VisemeStream:
         self._trajectory = TargetTrajectory(self._parameters, active)
         if self._pending_s is not None or is_postponed or not is_same or self._rest is not None:
             self._start_transition()
-        difference = self._transition.at(time_s - self._transition_start_s)
-        self._mouth = self._within_hull(self._trajectory.at(time_s) + difference)
+        trajectory, transition = self._trajectory, self._transition
+        elapsed_s = time_s - self._transition_start_s
+        # most frames need no velocity
+        self._mouth = lambda: self._within_hull(trajectory.at(time_s) + transition.at(elapsed_s))
+        faps = self._clip(trajectory.value_at(time_s) + transition.value_at(elapsed_s))
         self._time_s = time_s
-        self._closures.record_closures(active, time_s, self._mouth.value)
-        return self._frame()
+        self._closures.record_closures(active, time_s, faps)
+        return self._frame(faps)
 
     def relax(self, step_s: float) -> MouthFrame:
         """Return the mouth one step closer to rest."""
         if self._rest is None:
             duration_s = _REST_S if len(self._known) else _SLOW_TRANSITION_S
-            self._rest = RestTransition(self._mouth, self._parameters.neutral, duration_s)
-        self._mouth = self._within_hull(self._rest.step(step_s))
-        return self._frame()
+            self._rest = RestTransition(self._mouth(), self._parameters.neutral, duration_s)
+        mouth = self._within_hull(self._rest.step(step_s))
+        self._mouth = lambda: mouth
+        return self._frame(mouth.value)
 
     def _build_timeline(self) -> Timeline:
         phones = self._known.in_order()
@@ -163,7 +168,7 @@ class VisemeStream:
         requested_s = self._pending_s or _TRANSITION_S
         duration_s = _SLOW_TRANSITION_S if self._rest is not None else requested_s
         self._transition = Transition(
-            self._mouth - self._trajectory.at(self._time_s),
+            self._mouth() - self._trajectory.at(self._time_s),
             self._closures.shorten(
                 np.full(NUM_MOUTH_FAPS, duration_s), self._trajectory.timeline, self._time_s
             ),
@@ -172,9 +177,12 @@ class VisemeStream:
         self._pending_s = self._rest = None
 
     def _within_hull(self, state: FapState) -> FapState:
-        value = np.clip(state.value, self._lowest, self._highest)
+        value = self._clip(state.value)
         return FapState(value, np.where(value == state.value, state.velocity, 0.0))
 
-    def _frame(self) -> MouthFrame:
-        articulation = VisemeArticulation(self._current, self._parameters.level_db)
-        return MouthFrame(self._mouth.value, articulation)
+    def _clip(self, faps: NDArray[np.float64]) -> NDArray[np.float64]:
+        clipped: NDArray[np.float64] = np.minimum(np.maximum(faps, self._lowest), self._highest)
+        return clipped
+
+    def _frame(self, faps: NDArray[np.float64]) -> MouthFrame:
+        return MouthFrame(faps, VisemeArticulation(self._current, self._parameters.level_db))

@@ -4,6 +4,7 @@ Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta
 for closures C and T; per FAP the silence models; one exponent c.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -65,29 +66,42 @@ class VisemeParameters:
     c: float
     closure_ratio: float  # C of Wang & Cai 2003, eq. 7
     closure_reach_s: float  # T of Wang & Cai 2003, eq. 7, seconds
+    # of each viseme: offset_s, log alpha, theta_minus and theta_plus
+    dominance: NDArray[np.float64] = dataclasses.field(
+        init=False
+    )  # (num_visemes, 4, num_mouth_faps)
+    log_alpha_left: NDArray[np.float64] = dataclasses.field(init=False)
+    log_alpha_right: NDArray[np.float64] = dataclasses.field(init=False)
+    any_closes: NDArray[np.bool_] = dataclasses.field(
+        init=False
+    )  # (num_visemes,) whether any FAP closes
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = np.asarray(getattr(self, field.name), dtype=float)
+        for name in (field.name for field in fields(self) if field.init):
+            value = np.asarray(getattr(self, name), dtype=float)
             shape: tuple[int, ...] = ()
-            if field.name in PER_VISEME:
+            if name in PER_VISEME:
                 shape = (len(VISEMES), NUM_MOUTH_FAPS)
-            elif field.name in PER_SILENCE:
+            elif name in PER_SILENCE:
                 shape = (NUM_MOUTH_FAPS,)
-            elif field.name == "level_db":
+            elif name == "level_db":
                 shape = (len(VISEMES),)
             if value.shape != shape:
                 raise UserError(
-                    f"viseme parameters: {field.name} has shape {value.shape}, expected {shape}; "
+                    f"viseme parameters: {name} has shape {value.shape}, expected {shape}; "
                     "restore the file, or train again"
                 )
-            key = field.name if field.name in _LIMITS else field.name.split("_")[0]
-            low, high = _LIMITS[key]
+            low, high = _LIMITS[name if name in _LIMITS else name.split("_")[0]]
             if not np.all((value >= low) & (value <= high)):
                 raise UserError(
-                    f"viseme parameters: {field.name} is not between {low:g} and {high:g}; "
+                    f"viseme parameters: {name} is not between {low:g} and {high:g}; "
                     "restore the file, or train again"
                 )
+        of_visemes = (self.offset_s, np.log(self.alpha), self.theta_minus, self.theta_plus)
+        object.__setattr__(self, "dominance", np.stack(of_visemes, axis=1))
+        object.__setattr__(self, "log_alpha_left", np.log(self.alpha_left))
+        object.__setattr__(self, "log_alpha_right", np.log(self.alpha_right))
+        object.__setattr__(self, "any_closes", (self.closes > 0.0).any(axis=1))
 
 
 def load_parameters(path: Path | None = None) -> VisemeParameters:

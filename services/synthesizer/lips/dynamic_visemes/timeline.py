@@ -78,8 +78,9 @@ class Timeline:
 
     def same_visemes(self, other: Timeline) -> bool:
         """Return whether another timeline has the same visemes of the same phones, at any times."""
-        return np.array_equal(self.viseme, other.viseme) and np.array_equal(
-            self.phone_index, other.phone_index
+        return (self.viseme.tobytes(), self.phone_index.tobytes()) == (
+            other.viseme.tobytes(),
+            other.phone_index.tobytes(),
         )
 
     def nearest(self, time_s: float) -> int | None:

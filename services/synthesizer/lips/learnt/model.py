@@ -177,13 +177,14 @@ class LearntStream:
         return self._frame(visemes.articulation)
 
     def _follow_track(self, time_s: float) -> None:
-        before = self._on_track
+        continues = self._track.end_s >= self._time_s
         self._extend_track(time_s)
-        now = self._track.at(self._time_s)
-        if self._rest is not None:
-            self._start_transition(now, _SLOW_TRANSITION_S)
-        elif _is_different(before, now):
-            self._start_transition(now, _TRANSITION_S)
+        if self._rest is not None or not continues:
+            now = self._track.at(self._time_s)
+            if self._rest is not None:
+                self._start_transition(now, _SLOW_TRANSITION_S)
+            elif _is_different(self._on_track, now):
+                self._start_transition(now, _TRANSITION_S)
         difference = self._transition.at(time_s - self._transition_start_s)
         self._on_track = self._track.at(time_s)
         self._mouth = self._on_track + difference
