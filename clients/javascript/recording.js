@@ -4,7 +4,7 @@
 const RATE_HZ = 16000;
 // A time code counts frames, but the file does not name their rate. It is the lowest of these above
 // all counts, or the app's default if the take does not cross a full second.
-const TIME_CODE_RATES_HZ = [24, 25, 30, 48, 50, 60];
+const TIME_CODE_RATES_HZ = [24, 25, 30, 48, 50, 60, 100, 120];
 const DAY_S = 86400;
 
 /**
@@ -65,7 +65,8 @@ function readTimeCodes(codes) {
   const fields = codes.map((code) => code.split(":").map(Number));
   const crossesSecond = fields.some(([, , second]) => second !== fields[0][2]);
   const lastFrame = fields.reduce((last, [, , , frame]) => Math.max(last, frame), 0);
-  const rate = (crossesSecond && TIME_CODE_RATES_HZ.find((rateHz) => lastFrame < rateHz)) || 60;
+  const lowestHz = crossesSecond ? lastFrame : Math.max(59, lastFrame);
+  const rate = TIME_CODE_RATES_HZ.find((rateHz) => lowestHz < rateHz) ?? 60;
   const timesS = fields.map(([hours, minutes, seconds, frame]) => 3600 * hours + 60 * minutes + seconds + frame / rate);
   return timesS.map((timeS) => timeS - timesS[0] + (timeS < timesS[0] ? DAY_S : 0));
 }

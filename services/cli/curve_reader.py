@@ -30,7 +30,7 @@ MAX_FRAMES = 1_000_000
 _MAX_FAP = 1e6
 _MAX_WEIGHT = 10.0  # of a shape; percentages are larger
 _TIME_CODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+(?:\.\d+)?)")  # ";" if frames are dropped
-_TIME_CODE_RATES_HZ = (24, 25, 30, 48, 50, 60)
+_TIME_CODE_RATES_HZ = (24, 25, 30, 48, 50, 60, 100, 120)  # the app's default is 60
 _DAY_S = 86400.0
 _HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
 
@@ -155,11 +155,8 @@ def _times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
     if not is_time_code:
         return fields
     hours, minutes, seconds, frames = fields.T
-    crosses_a_second = len(np.unique(seconds)) > 1
-    rate_hz = next(
-        (rate for rate in _TIME_CODE_RATES_HZ if crosses_a_second and frames.max() < rate),
-        _TIME_CODE_RATES_HZ[-1],
-    )
+    lowest_hz = frames.max() if len(np.unique(seconds)) > 1 else max(59, frames.max())
+    rate_hz = next((rate for rate in _TIME_CODE_RATES_HZ if lowest_hz < rate), 60)
     times_s: Float64 = 3600 * hours + 60 * minutes + seconds + frames / rate_hz
     midnights = np.cumsum(np.diff(times_s, prepend=times_s[0]) < -_DAY_S / 2)
     return times_s + midnights * _DAY_S

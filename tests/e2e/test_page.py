@@ -189,24 +189,36 @@ def test_the_mouth_in_the_image_follows_the_faps(
     assert not [text for text in page.complaints if any(mark in text for mark in wrong)]
 
 
+@pytest.mark.parametrize(
+    ("size", "covers", "edge"), [((320, 568), "caption", "top"), ((667, 375), "settings", "left")]
+)
 def test_controls_do_not_cover_the_mouth_on_a_phone(
-    control: PageControl, session: Session, page: Browser, gateway: Gateway
+    control: PageControl,
+    session: Session,
+    page: Browser,
+    gateway: Gateway,
+    size: tuple[int, int],
+    covers: str,
+    edge: str,
 ) -> None:
-    page.resize(320, 568, mobile=True)
+    page.resize(*size, mobile=True)
     page.open(gateway.page)
+    if covers == "settings":
+        page.click("open-settings")
+        page.evaluate("document.getElementById('settings').style.opacity = 0")
     show_controls(page, 0)
     images = []
     for shown, jaw in ((B_FACE, 0), (A_FACE, 450)):
         control.talk(session.name, shown, "a")
         page.wait_for(f"Math.abs({STATE}.faps[2] - {jaw}) < 1")
-        images.append(page.steady_image()[:, 106:-106])
+        images.append(page.steady_image())
     closed, opened = images
     show_controls(page, 1)
-    caption_top = page.evaluate("document.getElementById('caption').getBoundingClientRect().top")
-    rows, _ = np.nonzero(teeth(opened) & (colorfulness(closed) > 50))
+    limit = page.evaluate(f"document.getElementById('{covers}').getBoundingClientRect().{edge}")
+    rows, columns = np.nonzero(teeth(opened) & (colorfulness(closed) > 50))
     page.resize(*SIZE_PX)
     assert len(rows) > 20
-    assert np.percentile(rows, 90) < caption_top
+    assert np.percentile(rows if edge == "top" else columns, 90) < limit
 
 
 @pytest.mark.parametrize(("width", "is_phone"), [(1280, False), (390, True)])

@@ -18,6 +18,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
 const OVERLAY_SHARE = 0.6; // fraction of the overlay that the head avoids
+const HEAD_HALF_WIDTH = 0.3; // relative to the window's height
 const PORTRAIT_ASPECT = 0.66; // in narrower windows the camera moves back, so that the face fits
 
 export class Head {
@@ -211,17 +212,19 @@ export class Head {
     if (!this.#isFilmed) this.#size = [clientWidth, clientHeight];
     const [width, height] = this.#size;
     if (width === 0 || height === 0) return;
-    // The head fits into the area above the controls, with a small overlap.
+    // The head fits into the area above the controls, with a small overlap, and left of the panel.
     const { controls, panel } = this.#overlays;
-    const { left, right, height: panelHeight } = panel.getBoundingClientRect();
-    const isBelow = left < width / 2 && width / 2 < right; // otherwise the panel is at one side
+    const { left, height: panelHeight } = panel.getBoundingClientRect();
+    const isBelow = left <= 0 && panelHeight > 0;
+    const beside = left > 0 ? width - left : 0; // the panel is at the right
+    const moved = Math.min(beside / 2, Math.max(0, beside + HEAD_HALF_WIDTH * height - width / 2));
     const covered = isBelow ? panelHeight : controls.offsetHeight * OVERLAY_SHARE;
     const free = Math.max(0.5 * height, height - covered);
     const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
     const widened = half * Math.max(height / free, PORTRAIT_ASPECT * (height / width));
     this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
     this.#camera.aspect = width / height;
-    this.#camera.setViewOffset(width, height, 0, (height - free) / 2, width, height);
+    this.#camera.setViewOffset(width, height, moved, (height - free) / 2, width, height);
     this.#needsDrawing = true;
     if (this.#isFilmed) return;
     this.#renderer.setPixelRatio(this.#drawRate.ratio);
