@@ -190,7 +190,9 @@ def lips(
     ] = None,
     delay_ms: Annotated[
         list[float] | None,
-        typer.Option(min=0.0, help="Delay of the face; repeatable. Default: the lip model's."),
+        typer.Option(
+            min=0.0, max=300.0, help="Delay of the face; repeatable. Default: the lip model's."
+        ),
     ] = None,
     sounds: Sounds = None,
     condition: Annotated[

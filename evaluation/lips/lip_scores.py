@@ -31,11 +31,12 @@ from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.lip_predictor import LIPS_PATH, load_lip_predictor
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import SoundEvent
 from kouxing.shared.phones.inventory import PhoneInventory
 
@@ -50,11 +51,10 @@ Results = dict[str, dict[str, dict[str, Scores]]]  # by face, condition and grou
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """A lip model with a delay, and with its predictor if it needs one."""
+    """A lip model with its lip predictor and its delay."""
 
-    name: str
     lips: LipModel
-    predictor: LipFrameModel | None
+    predictor: LipFrameModel
     delay_ms: float
 
     def mouth(self, events: Sequence[SoundEvent]) -> Mouth:
@@ -71,17 +71,18 @@ def load_faces(
     UserError if a lip model is not installed, or a file cannot be read.
     """
     faces = {}
+    default_predictor = load_lip_predictor()
     for name in names or list(lip_models()):
         path = Path(name)
+        if path.suffix == ".npz" and not path.is_file():
+            raise UserError(f"{path}: no such file")
         kind = {".npz": "learnt", ".json": "dynamic-visemes"}.get(path.suffix, name)
         lips: LipModel = load_lip_model(inventory.language, kind)
         if path.suffix == ".json":
             lips = DynamicVisemes(load_parameters(path), inventory)
-        predictor = None
-        if kind == "learnt":
-            predictor = load_lip_predictor(path if path.suffix == ".npz" else LIPS_PATH)
+        predictor = load_lip_predictor(path) if path.suffix == ".npz" else default_predictor
         for delay_ms in delays_ms or [lip_model_info(kind).delay_ms]:
-            faces[f"{name}, {delay_ms:g} ms"] = Face(name, lips, predictor, delay_ms)
+            faces[f"{name}, {delay_ms:g} ms"] = Face(lips, predictor, delay_ms)
     return faces
 
 

@@ -23,11 +23,12 @@ COLUMNS = {
     "spread": "{phone_spread:.0f}/{turns_per_s:.1f}/{mtm_ms:.0f}",
 }
 LEGEND = """\
-First row of a group: real lips. new: speakers not in training. In %: r of
-opening/width/jaw in speech; closures, F1 precision/recall; their precision at
-b p m/a e i u o/pauses; lips shut at b p m/in speech; effort: r of range and
-level/SLCC, over clips. rest: opening, FAP units/time to close in pauses, ms.
-spread: of the opening within phone classes, FAP units/turns per s/MTM, ms."""
+First row of a group: real lips. new: speakers not in training. +b, +m: babble,
+music. In %: r of opening/width/jaw in speech; closures, F1 precision/recall;
+their precision at b p m/a e i u o/pauses; lips shut at b p m/in speech; effort:
+r of range and level/SLCC, over clips. rest: opening, FAP units/ms to close in
+pauses. spread: within phone classes, FAP units/turns per s/MTM, ms."""
+_MARKS = {CLEAN: "", BABBLE: "+b", MUSIC: "+m"}
 
 
 def print_scores(results: Results, console: Console) -> None:
@@ -45,13 +46,9 @@ def _rows(results: Results, letters: Mapping[str, str]) -> Iterator[list[str]]:
     for group in _main_groups(real):
         yield [group, *_cells(real[group])]
         for face, letter in letters.items():
-            yield [f"  {letter}", *_cells(results[face][CLEAN][group])]
-    for condition in (BABBLE, MUSIC):
-        label = f"{condition.partition(' ')[0]} "
-        for face, letter in letters.items():
-            if condition in results[face]:
-                yield [f"{label}{letter}", *_cells(results[face][condition][ALL])]
-                label = "  "
+            for condition, scores in results[face].items():
+                if condition == CLEAN or group == ALL:
+                    yield [f"  {letter}{_MARKS[condition]}", *_cells(scores[group])]
 
 
 def _main_groups(real: Mapping[str, Scores]) -> list[str]:
