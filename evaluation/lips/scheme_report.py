@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby, pairwise
 
 from rich.console import Console
 
 from kouxing.evaluation.lips.agreement import Agreement
-from kouxing.evaluation.lips.scheme_scores import ConditionScore, Order, Outcome
+from kouxing.evaluation.lips.scheme_scores import ConditionScore, Outcome
 from kouxing.evaluation.tables import format_number
-from kouxing.shared.terminal import plural, print_table
+from kouxing.shared.terminal import print_table
 
 # Table 2: mean opinion scores of sync and realism, and the minimum delay in theory, ms.
 PAPER = {1: (4.34, 4.01, 0), 2: (3.98, 3.81, 0), 3: (3.42, 3.50, 45), 4: (3.21, 3.16, 110)}
@@ -24,7 +24,7 @@ LEGEND = (
 
 
 def print_outcome(outcome: Outcome, console: Console) -> None:
-    """Print each lip model against scheme 1 and real lips, then whether the order holds."""
+    """Print each lip model against scheme 1 and real lips, then the cost of each step."""
     references: dict[str, Callable[[ConditionScore], Agreement | None]] = {
         "scheme 1": lambda score: score.like_scheme_1,
         "real lips": lambda score: score.like_real_lips,
@@ -36,21 +36,25 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
                 columns = ("scheme", *AGREEMENT, "jerk", "phone", "face", "paper")
                 print_table(console, f"{lips} against {name}", columns, map(_row, rows))
     console.print(LEGEND, highlight=False)
-    for order in outcome.orders:
-        console.print(describe(order), highlight=False)
+    for line in describe_steps(outcome.scores):
+        console.print(line, highlight=False)
 
 
-def describe(order: Order) -> str:
-    """Say whether an order holds, and how much correlation each step costs."""
-    figures = " ".join(f"{figure:.2f}" for figure in order.correlations)
-    steps = [before - after for before, after in pairwise(order.correlations)]
+def describe_steps(scores: Sequence[ConditionScore]) -> Iterator[str]:
+    """Yield how much of the opening's correlation with scheme 1 each later scheme costs."""
+    figures = {
+        (score.lips, score.recognizer, score.scheme): score.like_scheme_1.correlation["opening"]
+        for score in scores
+        if score.like_scheme_1
+    }
     costs = ("recognition errors cost", "live output", "waiting for the next phone")
-    return (
-        f"{order.lips}, {order.recognizer}, opening against {order.reference} ({figures}): "
-        f"1 > 2 > 3 > 4 {'holds' if order.holds else 'does not hold'}, in "
-        f"{order.num_holding} of {plural(order.num_sentences, 'sentence')}; "
-        + ", ".join(f"{cost} {step:.2f}" for cost, step in zip(costs, steps, strict=True))
-    )
+    for lips, recognizer in dict.fromkeys(key[:2] for key in figures if key[1]):
+        keys = (lips, "", 1), *((lips, recognizer, scheme) for scheme in (2, 3, 4))
+        steps = [(figures[before], figures[after]) for before, after in pairwise(keys)]
+        yield f"{lips}, {recognizer}, opening: " + ", ".join(
+            f"{cost} {(before or 0.0) - (after or 0.0):.2f}"
+            for cost, (before, after) in zip(costs, steps, strict=True)
+        )
 
 
 def _row(pair: tuple[ConditionScore, Agreement]) -> list[str]:

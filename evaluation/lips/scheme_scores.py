@@ -12,19 +12,18 @@ Only the mouth moves, with an expressiveness of 1.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.scoring import matched_pairs
-from kouxing.evaluation.lips.agreement import Agreement, Pair, agreement_of, moments
+from kouxing.evaluation.lips.agreement import Agreement, Pair, agreement_of
 from kouxing.evaluation.lips.curves import rms_jerk
 from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
     RECOGNIZED,
-    SCHEMES,
     Condition,
     RecognizedSentence,
     TestedRecognizer,
@@ -42,7 +41,6 @@ from kouxing.shared.phones.events import Phone, Progress, SoundEvent
 from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
-Pairs = dict[Condition, dict[int, Pair]]  # by condition and number of the sentence
 
 
 @dataclass(slots=True, kw_only=True)
@@ -62,25 +60,11 @@ class ConditionScore:
 
 
 @dataclass(slots=True, kw_only=True)
-class Order:
-    """Whether scheme 1 beats 2, 2 beats 3, and 3 beats 4, by the correlation of the opening."""
-
-    lips: str
-    recognizer: str
-    reference: str  # "scheme 1" or "real lips"
-    num_sentences: int  # with all four schemes
-    correlations: list[float]  # of schemes 1 to 4, mean over the sentences
-    holds: bool
-    num_holding: int  # sentences in which it holds
-
-
-@dataclass(slots=True, kw_only=True)
 class Outcome:
     """Results of the experiment."""
 
     sentences: list[str]
     scores: list[ConditionScore]
-    orders: list[Order]
 
 
 def score_schemes(
@@ -93,39 +77,46 @@ def score_schemes(
         raise UserError("no sentence has a text or tracked lips; use other sentences")
     conditions = all_conditions(recognizers, lips)
     frames = {
-        (condition, number): _mouth_frames(condition, sentence)
+        condition: [_mouth_frames(condition, sentence) for sentence in sentences]
         for condition in conditions
-        for number, sentence in enumerate(sentences)
     }
     inventory = recognizers[0].model.inventory
-    like_aligned: Pairs = {condition: {} for condition in conditions}
-    like_real: Pairs = {condition: {} for condition in conditions}
-    for (condition, number), faps in frames.items():
-        clip = sentences[number].sentence.clip
-        reference = frames[Condition(ALIGNED, condition.lips, ""), number]
-        if faps is not None and reference is not None:
-            time_s = np.arange(len(reference)) / FRAME_RATE_HZ
-            like_aligned[condition][number] = made_mouth(faps), real_mouth(time_s, reference)
-        if faps is not None and len(clip.time_s):
-            real = real_mouth(clip.time_s, real_faps(clip))
-            like_real[condition][number] = made_mouth(faps), real
     return Outcome(
         sentences=[sentence.sentence.clip.name for sentence in sentences],
         scores=[
             _condition_score(
                 condition,
-                [f for n in range(len(sentences)) if (f := frames[condition, n]) is not None],
+                [faps for faps in frames[condition] if faps is not None],
                 [d for s in sentences for d in phone_delays_s(condition, s, inventory)],
-                like_aligned[condition],
-                like_real[condition],
+                _pairs_with_aligned(
+                    frames[condition], frames[Condition(ALIGNED, condition.lips, "")]
+                ),
+                _pairs_with_tracked(frames[condition], sentences),
             )
             for condition in conditions
         ],
-        orders=[
-            *_orders("scheme 1", like_aligned, recognizers, lips),
-            *_orders("real lips", like_real, recognizers, lips),
-        ],
     )
+
+
+def _pairs_with_aligned(
+    frames: Sequence[Array | None], aligned: Sequence[Array | None]
+) -> list[Pair]:
+    return [
+        (made_mouth(faps), real_mouth(np.arange(len(reference)) / FRAME_RATE_HZ, reference))
+        for faps, reference in zip(frames, aligned, strict=True)
+        if faps is not None and reference is not None
+    ]
+
+
+def _pairs_with_tracked(
+    frames: Sequence[Array | None], sentences: Sequence[RecognizedSentence]
+) -> list[Pair]:
+    clips = [sentence.sentence.clip for sentence in sentences]
+    return [
+        (made_mouth(faps), real_mouth(clip.time_s, real_faps(clip)))
+        for faps, clip in zip(frames, clips, strict=True)
+        if faps is not None and len(clip.time_s)
+    ]
 
 
 def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array | None:
@@ -138,8 +129,8 @@ def _condition_score(
     condition: Condition,
     frames: Sequence[Array],
     delays_s: Sequence[float],
-    like_aligned: Mapping[int, Pair],
-    like_real: Mapping[int, Pair],
+    like_aligned: Sequence[Pair],
+    like_real: Sequence[Pair],
 ) -> ConditionScore:
     p50, p95 = np.percentile(delays_s, [50, 95]) * 1e3 if delays_s else (None, None)
     is_live = condition.scheme > RECOGNIZED
@@ -152,8 +143,8 @@ def _condition_score(
         phone_delay_p50_ms=p50,
         phone_delay_p95_ms=p95,
         jerk=rms_jerk([made_mouth(faps).opening for faps in frames], FRAME_RATE_HZ),
-        like_scheme_1=agreement_of([*like_aligned.values()]) if like_aligned else None,
-        like_real_lips=agreement_of([*like_real.values()]) if like_real else None,
+        like_scheme_1=agreement_of(like_aligned) if like_aligned else None,
+        like_real_lips=agreement_of(like_real) if like_real else None,
     )
 
 
@@ -184,37 +175,3 @@ def first_hypotheses(events: Sequence[SoundEvent]) -> list[tuple[Phone, float]]:
         elif isinstance(event, Progress):
             times_s += [event.time_s] * (len(first) - len(times_s))
     return list(zip(first.values(), times_s, strict=False))
-
-
-def _orders(
-    reference: str,
-    pairs: Pairs,
-    recognizers: Sequence[TestedRecognizer],
-    lips: Sequence[str],
-) -> Iterator[Order]:
-    for name in lips:
-        for recognizer in recognizers:
-            schemes = [pairs.get(Condition(ALIGNED, name, ""), {})]
-            schemes += [pairs.get(Condition(n, name, recognizer.name), {}) for n in SCHEMES[1:]]
-            rows = [[_correlation(by_number.get(n)) for by_number in schemes] for n in schemes[0]]
-            table = np.array([row for row in rows if None not in row], dtype=float)
-            if len(table):
-                means = table.mean(axis=0)
-                yield Order(
-                    lips=name,
-                    recognizer=recognizer.name,
-                    reference=reference,
-                    num_sentences=len(table),
-                    correlations=means.tolist(),
-                    holds=is_decreasing(means),
-                    num_holding=sum(is_decreasing(row) for row in table),
-                )
-
-
-def _correlation(pair: Pair | None) -> float | None:
-    return moments([pair], "opening").correlation if pair else None
-
-
-def is_decreasing(figures: Array) -> bool:
-    """Whether each figure is less than the one before."""
-    return bool((np.diff(figures) < 0.0).all())

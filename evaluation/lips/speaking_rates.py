@@ -58,7 +58,6 @@ Samples = NDArray[np.float32]
 Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
 RATES = (0.8, 1.0, 1.5, 2.0)
-BEST_OPENING, STILL = "best R of each mouth", "still mouth"
 _FULL_PERCENTILE = 98.0
 _MIN_MOUTHS = 3
 _LIP_COLUMNS = [
@@ -122,7 +121,7 @@ def _score_rate(
     means_of = {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()}
 
     def accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
-        return {name: accuracy_of(mouths, real) for name, mouths in made.items()} | bounds(real)
+        return {name: accuracy_of(mouths, real) for name, mouths in made.items()}
 
     return RateScore(
         rate=rate,
@@ -199,22 +198,6 @@ def _curves_of(motion: KeyFrames) -> Curves:
 
 def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:
     return np.stack([np.interp(times_s, frame_s, column) for column in mouths.T], axis=1)
-
-
-def bounds(real: Array) -> dict[str, float]:
-    """Score the best opening R for each frame, and a mouth that does not move."""
-    candidates = faps_of(np.linspace(0.0, MAX_OPENING, 51))
-    errors = np.stack(
-        [np.nansum(np.abs(real - mouth)[:, _LIP_COLUMNS], axis=1) for mouth in candidates]
-    )
-    still = np.zeros_like(real)
-    for column in _LIP_COLUMNS:
-        measured = real[np.isfinite(real[:, column]), column]
-        still[:, column] = np.median(measured) if len(measured) else 0.0
-    return {
-        BEST_OPENING: accuracy_of(candidates[errors.argmin(axis=0)], real),
-        STILL: accuracy_of(still, real),
-    }
 
 
 def print_rates(scores: Sequence[RateScore], console: Console) -> None:
