@@ -12,8 +12,9 @@ from itertools import islice
 
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.events import combine
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge
+from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5
 MAX_RESENT = 200  # messages at a time; more would delay a busy receiver further
@@ -31,10 +32,14 @@ class ReliableSender:
         self.epoch = epoch
         self._next = 1
         self.unacknowledged: deque[Message] = deque()  # oldest first; their owner limits them
+        self._waiting: list[Message] = []  # to be sent together
         self._progress_s = 0.0
 
-    def send(self, message: Message, now_s: float) -> Message:
-        """Send a message with the next number; return the numbered message."""
+    def send(self, message: Message, now_s: float) -> None:
+        """Send a message with the next number.
+
+        Results wait for the ``progress`` after them, because only that makes a frame.
+        """
         numbered = dataclasses.replace(
             message, session=self._session, epoch=self.epoch, sequence=self._next
         )
@@ -42,8 +47,15 @@ class ReliableSender:
         if not self.unacknowledged:
             self._progress_s = now_s
         self.unacknowledged.append(numbered)
-        self._socket.send(numbered)
-        return numbered
+        self._waiting.append(numbered)
+        if isinstance(message, Progress) or len(self._waiting) == MAX_TOGETHER:
+            self.flush()
+
+    def flush(self) -> None:
+        """Send the messages that wait for others."""
+        if self._waiting:
+            self._socket.send(combine(self._waiting))
+            self._waiting.clear()
 
     def acknowledge(self, up_to: int, now_s: float) -> list[Message]:
         """Drop the messages up to a number, which the receiver has; return them."""

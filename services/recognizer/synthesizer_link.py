@@ -47,6 +47,7 @@ class SynthesizerLink:
         for message in messages:
             if not is_report(message):
                 self._sender.send(message, now_s)
+        self._sender.flush()
 
     @property
     def is_full(self) -> bool:

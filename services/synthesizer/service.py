@@ -1,7 +1,7 @@
 """The synthesizer service: phones and lip frames in, FAP frames out.
 
-Reacts to: phone, lip-positions, speech, progress (recognizer), start-session, close-session,
-flush-session, set-face (control).
+Reacts to: results, phone, lip-positions, speech, progress (recognizer), start-session,
+close-session, flush-session, set-face (control).
 Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
 
 Processed audio clocks the frames. A system under load is late but makes the same frames, and so
@@ -39,11 +39,17 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import MAX_TURN_S, Handler
 from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.phones import events
-from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone
+from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.service import Service
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
-from kouxing.shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of, is_report
+from kouxing.shared.wire.events import (
+    SPEECH_MESSAGES,
+    SpeechMessage,
+    event_of,
+    is_report,
+    separate,
+)
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
@@ -51,6 +57,7 @@ from kouxing.shared.wire.speech import (
     AudioState,
     NewestFrame,
     Progress,
+    Results,
 )
 
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
@@ -86,7 +93,9 @@ class SynthesizerService(Service):
             "faps": config.reachable(self._faps.endpoint),
         }
         load_lip_model(name=config.lips)  # no delay for the first session
-        self.register(self._input, dict.fromkeys(SPEECH_MESSAGES, self._on_input))
+        handlers: dict[type[Message], Handler] = dict.fromkeys(SPEECH_MESSAGES, self._on_input)
+        handlers[Results] = self._on_results
+        self.register(self._input, handlers)
         self.register(self._faps, {})
 
     def control_handlers(self) -> dict[type[Message], Handler]:
@@ -240,6 +249,10 @@ class SynthesizerService(Service):
 
     # --- from the recognizer ---------------------------------------------------------------------
 
+    def _on_results(self, results: Results, sender: Peer) -> None:
+        for message in separate(results):
+            self._on_input(message, sender)
+
     def _on_input(self, message: SpeechMessage, sender: Peer) -> None:
         session = self._admit(message, sender)
         if session is None:
@@ -298,6 +311,9 @@ class SynthesizerService(Service):
             self.warn("unknown-phone", text, message.session)
             return
         session.final.update(event)
+        if not session.queue and isinstance(event, Phone | LipPositions | SpeechChange):
+            session.face.process(event)  # makes no frames
+            return
         session.queue.append(event)
         now_s = time.monotonic()
         if isinstance(event, events.Progress | AudioSkipped):

@@ -1,5 +1,7 @@
 """Converts a recognizer's events to messages, and back."""
 
+from collections.abc import Sequence
+from operator import attrgetter
 from typing import TypeAlias, get_args
 
 import numpy as np
@@ -7,7 +9,7 @@ import numpy as np
 from kouxing.shared.clock import duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones import events
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import AudioState, LipPositions, Phone, Progress, Speech
+from kouxing.shared.wire.speech import AudioState, LipPositions, Phone, Progress, Results, Speech
 
 # From the recognizer to the synthesizer
 SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress
@@ -20,6 +22,28 @@ def is_report(message: Message) -> bool:
         message.newest_frame is not None
         or message.state in (AudioState.STALLED, AudioState.RESUMED)
     )
+
+
+def combine(messages: Sequence[Message]) -> Message:
+    """Return one message with these messages of a session, at most ``MAX_TOGETHER``."""
+    first = messages[0]
+    if len(messages) == 1:
+        return first
+    return Results(
+        session=first.session,
+        epoch=first.epoch,
+        phones=[message for message in messages if isinstance(message, Phone)],
+        lip_positions=[message for message in messages if isinstance(message, LipPositions)],
+        speech=[message for message in messages if isinstance(message, Speech)],
+        progress=[message for message in messages if isinstance(message, Progress)],
+    )
+
+
+def separate(results: Results) -> list[SpeechMessage]:
+    """Return the messages of a combined message in order."""
+    messages: list[SpeechMessage] = [*results.phones, *results.lip_positions]
+    messages += [*results.speech, *results.progress]
+    return sorted(messages, key=attrgetter("sequence"))
 
 
 def message_of(event: events.SoundEvent) -> SpeechMessage:

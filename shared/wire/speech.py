@@ -1,6 +1,6 @@
 """The recognizer's results, and the synthesizer's acknowledgement."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
@@ -17,6 +17,8 @@ from kouxing.shared.wire.message import (
 )
 
 PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
+MAX_TOGETHER = 8  # messages in one, so that it fits into the limit of the synthesizer's socket
+_TOGETHER = Meta(max_length=MAX_TOGETHER)
 LipDelay = Annotated[int, Meta(ge=-16_000, le=16_000)]  # samples at 16 kHz
 
 
@@ -83,6 +85,16 @@ class Progress(Message):
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
     # Of the lost synthesizer: the new one continues after it. In the first message of an epoch
     newest_frame: NewestFrame | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Results(Message):
+    """Messages that the recognizer sends together; ``sequence`` is their order."""
+
+    phones: Annotated[list[Phone], _TOGETHER] = field(default_factory=list)
+    lip_positions: Annotated[list[LipPositions], _TOGETHER] = field(default_factory=list)
+    speech: Annotated[list[Speech], _TOGETHER] = field(default_factory=list)
+    progress: Annotated[list[Progress], _TOGETHER] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

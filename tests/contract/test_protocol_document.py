@@ -31,7 +31,7 @@ from kouxing.shared.wire.session import (
     SessionOpened,
     SessionState,
 )
-from kouxing.shared.wire.speech import NewestFrame
+from kouxing.shared.wire.speech import NewestFrame, Results
 from tests.samples import SAMPLES
 
 ROOT = Path(__file__).parents[2]
@@ -189,7 +189,7 @@ def test_documents_every_answer() -> None:
     assert asked - {"joined", "request"} == from_clients | {
         "heartbeat",
         "start-session",
-        *(cls.kind for cls in SPEECH_MESSAGES),
+        *(cls.kind for cls in (Results, *SPEECH_MESSAGES)),
     }
     assert answers < set(MESSAGES)
     assert errors - {"request"} < {*ErrorCode}

@@ -11,8 +11,9 @@ from kouxing.services.recognizer.synthesizer_link import (
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.events import separate
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results, Speech
 
 FAPS = bytes(range(4)) * NUM_FAPS
 
@@ -27,9 +28,12 @@ class FakeSynthesizerLink(SynthesizerLink):
     def connect_to(self, epoch: int) -> list[Message]:
         """Connect to a new synthesizer; return the list of the messages that it receives."""
         self.sent: list[Message] = []
-        socket = type("FakeSocket", (), {"send": lambda _, message: self.sent.append(message)})()
+        socket = type("FakeSocket", (), {"send": lambda _, message: self._receive(message)})()
         self.connect(cast(Socket, socket), "s", epoch, 0.0)
         return self.sent
+
+    def _receive(self, message: Message) -> None:
+        self.sent += separate(message) if isinstance(message, Results) else [message]
 
     def send_all(self, *messages: Message) -> None:
         for message in messages:
