@@ -204,8 +204,8 @@ def lips(
 ) -> None:
     """Compare live lips with the real ones on held-out clips, in one table.
 
-    Every third clip is also scored with disturbed sound. The JSON file also contains the figures by
-    source and speaker.
+    The sound is clean, or has babble or music 10 dB below the speech. The JSON file also contains
+    the figures by source and speaker.
     """
     from kouxing.evaluation.lips.lip_scores import CONDITIONS, score_lips
     from kouxing.evaluation.lips.lip_table import print_scores

@@ -37,7 +37,7 @@ CLOSURE_CLASSES = {
 
 @dataclass(frozen=True)
 class Take:
-    """A clip and the mouth to judge. What several groups of clips need is computed once."""
+    """A clip and the mouth to judge. Cached figures serve several groups of clips."""
 
     reference: Reference
     made: Mouth

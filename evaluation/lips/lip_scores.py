@@ -2,7 +2,7 @@
 
 The frames are those that the services would send, with clean sound, and with other voices or music
 10 dB below the speech. Clips form groups by language, source and speaker. *New* speakers have no
-clip that a shipped model may be trained on. *Mocap* is motion capture: clips that were not filmed.
+clip that a shipped model may be trained on. *Mocap* clips are motion capture instead of video.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ def reference_of(
     inventory: PhoneInventory,
     aligned: Sequence[Phone] | None,
 ) -> Reference:
-    """Return the reference of a clip from a live recognizer's output for it."""
+    """Return the reference of a clip, with a live recognizer's output for its audio."""
     return Reference(
         clip=clip,
         mouth=real_mouth(clip.time_s, real_faps(clip)),
