@@ -64,7 +64,9 @@ def test_the_table_fits_a_screen() -> None:
         "turns_per_s": 11.9,
         "mtm_ms": 99.0,
     }
-    clean = dict.fromkeys(("all", "zh", "zh new", "en", "en new", "mocap"), scores)
+    clean = dict.fromkeys(
+        ("all", "zh", "zh known", "zh new", "en", "en known", "en new", "mocap"), scores
+    )
     face = dict.fromkeys((CLEAN, BABBLE, MUSIC), clean)
     results = {"real": {CLEAN: clean}, **{f"face {number}, 60 ms": face for number in range(3)}}
     console = Console(width=80, record=True)
