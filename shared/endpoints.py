@@ -55,10 +55,12 @@ def is_local(host: str) -> bool:
     return True
 
 
-def reach_error(host: str, port: str, timeout_s: float = 3.0) -> str:
-    """Return why a TCP port cannot be reached from here, or an empty string."""
+def reach_error(host: str, port: str, timeout_s: float = 3.0, *, is_zeromq: bool = False) -> str:
+    """Return why a TCP port, or a ZeroMQ socket, cannot be reached from here; empty if it can."""
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout_s).close()
+        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as connection:
+            if is_zeromq and not _greets(connection):
+                return "no kouxing service answers there; correct the address, or restart it"
     except TimeoutError:
         return "no answer; open this port in the firewalls between the machines"
     except ConnectionRefusedError:
@@ -68,6 +70,13 @@ def reach_error(host: str, port: str, timeout_s: float = 3.0) -> str:
     except OSError as error:
         return f"{error.strerror}; check the address and the network"
     return ""
+
+
+def _greets(connection: socket.socket) -> bool:
+    """Return whether a peer sends the first byte of ZeroMQ's greeting."""
+    with contextlib.suppress(OSError):
+        return connection.recv(1) == b"\xff"
+    return False
 
 
 def with_host(endpoint: str, host: str) -> str:

@@ -19,7 +19,7 @@ public sealed class KouxingFace : MonoBehaviour
     void OnEnable()
     {
         _shapes.Clear();
-        var names = GetComponentsInChildren<SkinnedMeshRenderer>().ToDictionary(mesh => mesh, mesh =>
+        var names = GetComponentsInChildren<SkinnedMeshRenderer>().Where(mesh => mesh.sharedMesh).ToDictionary(mesh => mesh, mesh =>
             Enumerable.Range(0, mesh.sharedMesh.blendShapeCount).Select(mesh.sharedMesh.GetBlendShapeName).ToList());
         string set;
         try { set = KouxingShapeNames.ChooseSet(names.Values.SelectMany(list => list).ToList()); }

@@ -39,7 +39,7 @@ def examine(given: str) -> Iterator[Finding]:
     control, config = find_system(given)
     control = control or config.control
     address = control.partition(" ")[0]
-    if reason := reach_error(*split_endpoint(address, "control")):
+    if reason := reach_error(*split_endpoint(address, "control"), is_zeromq=True):
         yield Finding(f"control at {address}", "cannot be reached", reason)
         return
     yield Finding(f"control at {address}", "can be reached")
@@ -78,8 +78,11 @@ def examine(given: str) -> Iterator[Finding]:
 
 def _check_key(name: str, key: Key | None, address: str) -> Finding:
     control = with_key(address, key.control if key else "")
-    with Bus(key) as bus:
-        reach = bus.probe(control)
+    try:
+        with Bus(key) as bus:
+            reach = bus.probe(control)
+    except UserError as error:
+        return Finding(f"key {name}", "cannot be used", str(error))
     if reach is Reach.ACCEPTED:
         return Finding(f"key {name}", "control accepts it")
     running, _, running_key = find_control().partition(" ")
@@ -127,7 +130,7 @@ def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str
         page = urlsplit(endpoint)
         default = 443 if page.scheme == "https" else 80
         return reach_error(page.hostname or "", str(page.port or default))
-    if reason := reach_error(*split_endpoint(endpoint.partition(" ")[0], name)):
+    if reason := reach_error(*split_endpoint(endpoint.partition(" ")[0], name), is_zeromq=True):
         return reason
     is_publisher = name in PUBLISHERS
     for key_name, bus in buses.items():

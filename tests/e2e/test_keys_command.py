@@ -1,5 +1,6 @@
 """Services and a client on machines of their own, each with the key that was copied there."""
 
+import socket
 import subprocess
 from pathlib import Path
 
@@ -52,6 +53,10 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         assert checked.returncode == 0, checked.stdout
         assert "key client: control accepts it" in checked.stdout
         assert "0 of 5 checks failed" in checked.stdout
+        (laptop / "kouxing").chmod(0o755)
+        checked = kouxing("doctor", control=system.control)
+        assert "FAIL key client: cannot be used" in checked.stdout
+        (laptop / "kouxing").chmod(0o700)
         refused = kouxing("keys", "add", "friend")
         assert refused.returncode == 2
         assert "on control's machine" in refused.stderr
@@ -66,6 +71,14 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         advice = "kouxing keys add NAME --role service:recognizer"
         wait_until(lambda: advice in system.log("recognizer"))
         system.assert_all_alive()
+
+
+def test_doctor_recognizes_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert kouxing("keys", "init").returncode == 0
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        checked = kouxing("doctor", control=f"tcp://127.0.0.1:{other.getsockname()[1]}")
+    assert "no kouxing service answers there" in checked.stdout
 
 
 def test_a_service_waits_for_control_and_says_why(
