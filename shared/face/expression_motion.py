@@ -84,14 +84,13 @@ class ExpressionMotion:
         """Add the expressions to a frame, FAPs (68,), in place."""
         is_held = self._remaining_s > 0.0
         self._remaining_s -= step_s
-        goal = is_held * self._goal
-        shown = self._shown.step(goal, step_s, _EASE_S if is_held else _FADE_S)
         if is_speaking:
             self._free = max(self._free - step_s / _BIND_S, 0.0)
         else:
             self._free += (1.0 - self._free) * smoothing_share(step_s, _FREE_S)
-        if shown.any():
-            mix(faps, shown, self._free)
+        if is_held or self._shown.value.any():
+            goal = is_held * self._goal
+            mix(faps, self._shown.step(goal, step_s, _EASE_S if is_held else _FADE_S), self._free)
 
 
 def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:

@@ -83,11 +83,10 @@ class IdleMotion:
             np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
         )
         # pink-like noise as a sum of sines: a pure function of time
-        self._wave_hz = np.geomspace(*_HEAD_HZ, _NUM_WAVES) * waves.uniform(
-            0.85, 1.15, (3, _NUM_WAVES)
-        )
+        wave_hz = np.geomspace(*_HEAD_HZ, _NUM_WAVES) * waves.uniform(0.85, 1.15, (3, _NUM_WAVES))
+        self._wave_rate = 2.0 * np.pi * wave_hz  # radians per second
         self._wave_phase = waves.uniform(0.0, 2.0 * np.pi, (3, _NUM_WAVES))
-        size = self._wave_hz**-0.5
+        size = wave_hz**-0.5
         size *= np.sqrt(2.0 / np.sum(size**2, axis=1, keepdims=True))
         self._wave_size = size * np.array(_HEAD_SD_DEG)[:, None] * _DEGREE
         self._liveliness = _LISTENING_HEAD
@@ -112,8 +111,8 @@ class IdleMotion:
         self._time_s = time_s
         goal = _LISTENING_HEAD if state is State.LISTENING else 1.0
         self._liveliness += (goal - self._liveliness) * smoothing_share(elapsed_s, _SPEAKING_S)
-        angles = 2.0 * np.pi * self._wave_hz * time_s + self._wave_phase
-        head = self._liveliness * np.sum(self._wave_size * np.sin(angles), axis=1)
+        angles = self._wave_rate * time_s + self._wave_phase
+        head = self._liveliness * (self._wave_size * np.sin(angles)).sum(axis=1)
         breath = math.sin(2.0 * math.pi * _BREATH_HZ * time_s + self._breath_phase)
         head[0] += _BREATH_DEG * _DEGREE * breath
         yaw, pitch = self._gaze(time_s)

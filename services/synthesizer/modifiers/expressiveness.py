@@ -33,6 +33,7 @@ _USUAL_PUSH = 40.0
 _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
+_LIPS = np.stack([UPPER, LOWER])
 _WIDTH = np.array([6, 7, 53, 54]) - 1  # positive is outward
 _PUSH = slice(16 - 1, 17)  # positive is forward
 
@@ -47,24 +48,25 @@ class Expressiveness:
         """Scale the mouth of FAPs (68,), in place."""
         if self.amount == 1.0:
             return
-        upper, lower = -faps[UPPER], -faps[LOWER]  # openings
+        openings = -faps[_LIPS]  # (2, 6) of the upper and the lower lip
+        upper, lower = openings
         beyond = np.maximum(upper + lower - CLOSED, 0.0)  # (6,) excess of the gaps
-        free_upper, free_lower = (np.maximum(lip - CLOSED, 0.0) for lip in (upper, lower))
+        free_lips = np.maximum(openings - CLOSED, 0.0)  # (2, 6)
+        free_upper, free_lower = free_lips
         free = free_upper + free_lower
         # a lower lip at the teeth (f) is also a closure
         apart = np.minimum(free_lower / (OPEN - CLOSED), 1.0)
         grown = apart * self._growth(np.minimum(free, beyond))
-        share = grown / np.maximum(free, 1.0)
-        faps[UPPER] -= share * free_upper
-        faps[LOWER] -= share * free_lower
+        faps[_LIPS] -= grown / np.maximum(free, 1.0) * free_lips
         gap = float(upper[0] + lower[0])
         is_open = float(apart[0]) * min(max((gap - CLOSED) / (OPEN - CLOSED), 0.0), 1.0)
         faps[JAW] += is_open * self._growth(np.maximum(faps[JAW], 0.0))
-        width = faps[_WIDTH] - _USUAL_WIDTH
+        before = faps[_WIDTH]
+        width = before - _USUAL_WIDTH
         # at rest the mouth is wider than in speech, but not spread
         more = _SIDEWAYS * (self.amount - 1.0)
         change = more * np.where(width > 0.0, is_open * width, width)
-        faps[_WIDTH] = np.maximum(faps[_WIDTH] + change, np.minimum(faps[_WIDTH], _MIN_WIDTH))
+        faps[_WIDTH] = np.maximum(before + change, np.minimum(before, _MIN_WIDTH))
         pushed = more * np.maximum(faps[_PUSH] - _USUAL_PUSH, 0.0)
         faps[_PUSH] = np.minimum(faps[_PUSH] + pushed, np.maximum(faps[_PUSH], _MAX_PUSH))
 
