@@ -427,7 +427,7 @@ def load(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure how many live sessions control, a recognizer and a synthesizer can serve here.
+    """Measure how many live sessions all services can serve here.
 
     A single client process streams to all sessions, with different voices.
     """

@@ -24,7 +24,7 @@ from kouxing.evaluation.system.latency import percentiles
 from kouxing.evaluation.system.live import CHUNK
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.evaluation.tables import format_number
-from kouxing.services.kinds import read_settings
+from kouxing.services.kinds import KINDS, read_settings
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
@@ -34,7 +34,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import plural, print_table
 
 LIMIT_MS = 60.0  # latency limit for 95 % of the frames
-SERVICES = ("control", "recognizer", "synthesizer")  # services under load
+CLIENT = "client"  # this process
 MAX_STEPS = 8  # after the first step, which has one session
 SETTLE_S = 3.0  # start of a step, which is not measured
 DRAIN_S = 0.3  # from the last chunk to the end of the sessions
@@ -55,10 +55,9 @@ class Step:
     delay_ms: dict[str, float]  # percentiles over all sessions' frames
     worst_p95_ms: float  # of the worst session
     num_rest_frames: int  # frames at rest while the speaker spoke
-    cpu_cores: dict[str, float]  # by service
+    cpu_cores: dict[str, float]  # by service, and of the client
     memory_mb: dict[str, float]  # by service, at the end
     client_late_ms: float  # 95th percentile of how late chunks were sent
-    client_cpu_cores: float
 
     @property
     def is_served(self) -> bool:
@@ -103,7 +102,7 @@ class Load:
 
 
 def measure(paths: Sequence[Path], num_sessions: int, step_s: float, console: Console) -> Load:
-    """Start control, a recognizer and a synthesizer, put them under load, return the figures.
+    """Start all services, put them under load, return the figures.
 
     The last step has ``num_sessions``; each is measured for ``step_s``. Raises UserError if a file
     is not audio or the services cannot start.
@@ -115,7 +114,7 @@ def measure(paths: Sequence[Path], num_sessions: int, step_s: float, console: Co
     steps: list[Step] = []
     with (
         tempfile.TemporaryDirectory() as folder,
-        LocalSystem(Path(folder), console, services=SERVICES, settings=settings) as system,
+        LocalSystem(Path(folder), console, settings=settings) as system,
     ):
         for num in step_sizes(num_sessions):
             steps.append(_step(system.control, text, num, step_s, delay_s))
@@ -160,10 +159,10 @@ def _step(
             name: (usage.cpu_s - before[name].cpu_s) / max(1e-3, usage.at_s - before[name].at_s)
             for name, usage in after.items()
             if name in before
-        },
+        }
+        | {CLIENT: (client_after_s - client_before_s) / step_s},
         memory_mb={name: usage.memory_mb for name, usage in after.items()},
         client_late_ms=float(np.percentile(crowd.lateness_s or [0.0], 95)) * 1e3,
-        client_cpu_cores=(client_after_s - client_before_s) / step_s,
     )
 
 
@@ -188,17 +187,17 @@ def usage_of(client: Client) -> dict[str, Usage]:
             )
             for state in states
         }
-        if usage.keys() >= {*SERVICES}:
+        if usage.keys() >= {*KINDS}:
             return usage
         if now_s > end_s:
-            missing = ", ".join({*SERVICES} - usage.keys())
+            missing = ", ".join({*KINDS} - usage.keys())
             raise UserError(f"no heartbeat for {MAX_LOST_S:g} s: {missing}")
         time.sleep(0.1)
 
 
 def show(load: Load, console: Console) -> None:
     """Print the figures as tables, with a summary."""
-    services = list(load.steps[0].cpu_cores)
+    services = list(load.steps[0].memory_mb)
     print_table(
         console,
         "",
@@ -218,7 +217,7 @@ def show(load: Load, console: Console) -> None:
     print_table(
         console,
         "",
-        ("sessions", *(f"{name}: cores, MB" for name in services), "this client: cores"),
+        ("sessions", *(f"{name}: cores, MB" for name in services), "client: cores", "all: cores"),
         (
             [
                 str(step.num_sessions),
@@ -226,7 +225,8 @@ def show(load: Load, console: Console) -> None:
                     f"{step.cpu_cores.get(name, 0):.2f}, {step.memory_mb.get(name, 0):.0f}"
                     for name in services
                 ),
-                f"{step.client_cpu_cores:.2f}",
+                f"{step.cpu_cores[CLIENT]:.2f}",
+                f"{sum(step.cpu_cores.values()):.2f}",
             ]
             for step in load.steps
         ),
@@ -257,11 +257,12 @@ def draw(load: Load) -> Any:
     worst = [step.worst_p95_ms for step in load.steps]
     delay.plot(requested, worst, "s--", label="p95, worst session")
     delay.axhline(LIMIT_MS, color="grey", linestyle=":", label=f"limit, {LIMIT_MS:g} ms")
-    for service in load.steps[0].cpu_cores:
-        cores = [step.cpu_cores.get(service) for step in load.steps]
-        memory_mb = [step.memory_mb.get(service) for step in load.steps]
-        cpu.plot(requested, cores, "o-", label=service)
-        memory.plot(requested, memory_mb, "o-", label=service)
+    for name in load.steps[0].cpu_cores:
+        cores = [step.cpu_cores.get(name) for step in load.steps]
+        cpu.plot(requested, cores, "o-", label=name)
+    for name in load.steps[0].memory_mb:
+        memory_mb = [step.memory_mb.get(name) for step in load.steps]
+        memory.plot(requested, memory_mb, "o-", label=name)
     delay.set(ylabel="latency without the delay, ms", yscale="log")
     cpu.set(ylabel="cores busy", ylim=(0, None))
     memory.set(ylabel="memory, MB", ylim=(0, None))

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import bench_app
+from kouxing.services.kinds import KINDS
 from tests.system import VOWELS_FILE
 
 
@@ -25,7 +26,7 @@ def test_prints_writes_and_plots_the_same_figures(
     for step in load["steps"]:
         assert step["num_sessions"] + sum(step["refusals"].values()) == step["num_asked"]
         assert 0 < step["delay_ms"]["p50"] <= step["delay_ms"]["p95"]
-        assert set(step["cpu_cores"]) == {"control", "recognizer", "synthesizer"}
+        assert set(step["cpu_cores"]) == {*KINDS, "client"}
         assert step["memory_mb"]["recognizer"] > 50
     assert f"{load['steps'][0]['delay_ms']['p50']:.1f}" in result.stdout
     assert picture.read_bytes().startswith(b"\x89PNG")
