@@ -151,6 +151,18 @@ def test_effort_correlates_within_speakers() -> None:
     assert lip_intensity(mouth_of(np.array([0.0, 6.0, 6.0]))) == pytest.approx(300 / np.sqrt(2))
 
 
+def test_louder_clips_have_wider_and_faster_lips() -> None:
+    takes = []
+    for gain, extent in ((1.0, 100.0), (2.0, 300.0), (3.0, 200.0)):
+        clip = reference(mouth())
+        louder = replace(clip, clip=replace(clip.clip, samples=gain * clip.clip.samples))
+        takes.append(Take(louder, mouth_of(extent * (np.arange(200.0) % 2))))
+    level_db = 20 * np.log10([1.0, 2.0, 3.0])
+    r_db = np.corrcoef(level_db, [100.0, 300.0, 200.0])[0, 1]
+    assert measures.effort_correlation(takes) == pytest.approx(r_db)
+    assert measures.speech_lip_intensity(takes) == pytest.approx(0.5)
+
+
 def test_matched_extrema_of_a_late_mouth() -> None:
     assert warping_path(np.array([0.0, 1.0]), np.array([0.0, 0.0, 1.0])) == [(0, 0), (0, 1), (1, 2)]
     real = np.array([0.0, 1.0, 4.0, 1.0, 0.0, 2.0, 2.0, 1.0])
