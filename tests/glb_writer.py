@@ -2,10 +2,12 @@
 
 import json
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -106,9 +108,44 @@ def add_accessor(
     document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int
 ) -> int:
     """Append an accessor; return its number."""
-    document["bufferViews"].append({"byteOffset": len(binary), "byteLength": array.nbytes})
+    place = {"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes}
+    document["bufferViews"].append(place)
     view = len(document["bufferViews"]) - 1
     accessor = {"bufferView": view, "componentType": component, "type": kind, "count": len(array)}
     document["accessors"].append(accessor)
     binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    document["buffers"][0]["byteLength"] = len(binary)
     return len(document["accessors"]) - 1
+
+
+def add_skeleton(
+    path: Path,
+    bones: list[dict[str, Any]],
+    joint_of: Callable[[str], int],
+    bind: NDArray[Any] | None = None,
+) -> None:
+    """Add a chain of bones to a GLB, and skin each mesh to one of them.
+
+    ``joint_of`` returns the number of a mesh's bone; ``bind`` are the inverse bind matrices.
+    """
+    if bind is None:
+        bind = np.tile(np.eye(4, dtype="<f4"), (len(bones), 1, 1))
+    document, binary = read_chunks(path)
+    count = len(document["nodes"])
+    document["nodes"] += [
+        bone | ({"children": [count + number]} if number < len(bones) else {})
+        for number, bone in enumerate(bones, 1)
+    ]
+    document["scenes"][0]["nodes"].append(count)
+    accessor = add_accessor(document, binary, bind.reshape(-1, 16), "MAT4", 5126)
+    used = [count + number for number in range(len(bones))]
+    document["skins"] = [{"joints": used, "inverseBindMatrices": accessor}]
+    for node in document["nodes"][:count]:
+        attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
+        rows = document["accessors"][attributes["POSITION"]]["count"]
+        which, weights = np.zeros((rows, 4), "u1"), np.zeros((rows, 4), "<f4")
+        which[:, 0], weights[:, 0] = joint_of(node["name"]), 1
+        attributes["JOINTS_0"] = add_accessor(document, binary, which, "VEC4", 5121)
+        attributes["WEIGHTS_0"] = add_accessor(document, binary, weights, "VEC4", 5126)
+        node["skin"] = 0
+    write_chunks(path, document, binary)

@@ -13,6 +13,9 @@ import { chooseSet, findShapes } from "./shape-names.js";
 const UNREADABLE = { DRACOLoader: "KHR_draco_mesh_compression", KTX2: "KHR_texture_basisu" }; // by words of three.js
 const VIEW_HEIGHT = 1.6; // of the camera's view, relative to the face
 const VRM_FACE_M = 0.24;
+const JAW_BONE = /(^|[.:|_ ])(jaw|jawroot|lowerjaw)$/i;
+const JAW_RADIANS = 0.3; // at full weight of ARKit's jawOpen
+const OPENINGS = { jawOpen: 1, aa: 0.5, oh: 0.35, E: 0.2, ee: 0.2, ou: 0.2 }; // of the jaw
 // Rotation of the eyes at weight 1, degrees, and the shapes of the sets "vrm" and "arkit".
 const LOOKS = {
   left: [24.6, "lookLeft", "eyeLookOutLeft", "eyeLookInRight"],
@@ -86,6 +89,7 @@ function morphAvatar(scene, meshes) {
     const shapes = findShapes(set, names);
     return names.map((name, index) => ({ mesh, index, shape: shapes.get(name) })).filter(({ shape }) => shape);
   });
+  const turnJaw = findJaw(scene, targets);
   const region = new FaceRegion(targets);
   const upright = new THREE.Group().add(scene);
   upright.quaternion.copy(region.upright);
@@ -101,9 +105,38 @@ function morphAvatar(scene, meshes) {
       for (const { mesh, index, shape } of targets) {
         mesh.morphTargetInfluences[index] = weightOf.get(shape) ?? 0;
       }
+      turnJaw(Object.entries(OPENINGS).reduce((sum, [shape, share]) => sum + share * (weightOf.get(shape) ?? 0), 0));
     },
     update() {},
   };
+}
+
+/**
+ * Return a function that opens the jaw bone, whose argument is the opening from 0 to 1. The bone moves
+ * teeth and tongue; it stays at rest if it also moves a mesh with a shape that opens the mouth.
+ */
+function findJaw(scene, targets) {
+  let jaw = null;
+  scene.traverse((node) => {
+    if (node.isBone && JAW_BONE.test(node.userData.name ?? node.name)) jaw ??= node;
+  });
+  const skins = targets.filter(({ shape }) => shape in OPENINGS).map(({ mesh }) => mesh);
+  if (jaw === null || skins.some((mesh) => isMovedBy(mesh, jaw))) return () => {};
+  const rest = jaw.quaternion.clone();
+  const axis = new THREE.Vector3(1, 0, 0).applyQuaternion(jaw.parent.getWorldQuaternion(new THREE.Quaternion()).invert());
+  const turn = new THREE.Quaternion();
+  return (opening) => jaw.quaternion.copy(rest).premultiply(turn.setFromAxisAngle(axis, JAW_RADIANS * opening));
+}
+
+/** Return whether a bone, or one below it, moves a mesh. */
+function isMovedBy(mesh, bone) {
+  const { skinIndex, skinWeight } = mesh.geometry.attributes;
+  if (!mesh.isSkinnedMesh || !skinIndex) return false;
+  const bones = new Set();
+  bone.traverse((node) => bones.add(node));
+  return mesh.skeleton.bones.some(
+    (node, joint) => bones.has(node) && skinIndex.array.some((index, i) => index === joint && skinWeight.array[i] > 0),
+  );
 }
 
 function vrmAvatar(vrm, meshes) {

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.glb_writer import Mesh, read_chunks, write_chunks, write_glb
+from tests.glb_writer import Mesh, add_skeleton, read_chunks, write_chunks, write_glb
 from tests.system import NODE, ROOT
 
 CLIENT = ROOT / "clients" / "javascript"
@@ -26,8 +26,10 @@ const { loadPuppet } = await import("./puppet.js");
 for (const file of process.argv.slice(2)) {
   try {
     const url = "data:;base64," + readFileSync(file).toString("base64");
-    const { set, view } = await loadPuppet(url);
-    console.log(JSON.stringify({ set, target: view.target.toArray(), height: view.height }));
+    const { scene, set, view, pose } = await loadPuppet(url);
+    pose([1], ["jawOpen"]);
+    const jaw = 2 * Math.acos(scene.getObjectByName("CC_Base_JawRoot")?.quaternion.w ?? 1);
+    console.log(JSON.stringify({ set, target: view.target.toArray(), height: view.height, jaw }));
   } catch (error) {
     console.log(JSON.stringify({ error: error.message.replace(/^data:[^:]*: /, "") }));
   }
@@ -60,6 +62,10 @@ def face(shapes: list[str]) -> list[Mesh]:
 
 
 def change(path: Path, kind: str) -> None:
+    if kind == "jaw bone":
+        bones = [{"name": "CC_Base_Head"}, {"name": "CC_Base_JawRoot"}]
+        add_skeleton(path, bones, lambda name: int(name in ("Teeth", "Chin")))
+        return
     document, binary = read_chunks(path)
     nodes = document["scenes"][0]["nodes"]
     if kind == "z up":
@@ -89,6 +95,8 @@ FILES: dict[str, tuple[list[Mesh], str]] = {
     "vowels": (face(VOWELS), ""),
     "z up": (face(ARKIT), "z up"),
     "twice": (face(ARKIT), "twice"),
+    "teeth": ([*face(ARKIT), box("Teeth", (0, 1.6, 0.05), 0.04, [])], "jaw bone"),
+    "chin": ([*face(ARKIT), box("Chin", (0, 1.6, 0.05), 0.04, ["jawOpen"])], "jaw bone"),
     "unnamed": (face(ARKIT), "unnamed"),
     "no face": ([box("Box", (0, 0, 0), 1, [])], ""),
     "blink": (face(ARKIT[2:]), ""),
@@ -132,6 +140,13 @@ def test_frames_the_head_and_not_an_eye(
     assert found[name]["set"] == shapes
     assert found[name]["target"] == pytest.approx([0, 1.65, 0], abs=0.01)
     assert found[name]["height"] == pytest.approx(0.48, abs=0.05)
+
+
+def test_the_jaw_bone_turns_only_for_parts_without_shapes(
+    found: dict[str, dict[str, Any]],
+) -> None:
+    assert found["teeth"]["jaw"] == pytest.approx(0.3, abs=0.01)
+    assert found["chin"]["jaw"] == 0
 
 
 def test_turns_a_face_upright(found: dict[str, dict[str, Any]]) -> None:

@@ -16,7 +16,7 @@ from kouxing.services.driver.render.scene import camera, load_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
-from tests.glb_writer import Mesh, add_accessor, read_chunks, write_chunks, write_glb
+from tests.glb_writer import Mesh, add_skeleton, read_chunks, write_chunks, write_glb
 from tests.heads import neutral_faps
 from tests.meshes import meshes
 
@@ -106,34 +106,34 @@ def same_place(head: Head, original: Head) -> None:
 
 
 def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_path: Path) -> None:
-    """Test with avatar nodes Hips > Neck > Head, and a mesh skinned to Hips and Head."""
     path = write_glb(tmp_path / "my.glb", meshes(original, SHAPES))
-    document, binary = read_chunks(path)
-    count = len(document["nodes"])
-    document["nodes"] += [
-        {"name": "Hips", "children": [count + 1], "translation": [0, -1, 0]},
-        {"name": "Neck", "children": [count + 2], "translation": [0, 0.9, 0]},
+    bones = [
+        {"name": "Hips", "translation": [0, -1, 0]},
+        {"name": "Neck", "translation": [0, 0.9, 0]},
         {"name": "Head", "translation": [0, 0.1, 0]},
     ]
-    document["scenes"][0]["nodes"].append(count)
-    matrices = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
-    matrices[0, 3, 1] = 1.0  # column-major: the bind pose cancels the position of the hips
-    accessor = add_accessor(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
-    document["skins"] = [{"joints": [count, count + 2], "inverseBindMatrices": accessor}]
-    for node in document["nodes"][:count]:
-        attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
-        rows = document["accessors"][attributes["POSITION"]]["count"]
-        joints, weights = np.zeros((rows, 4), "u1"), np.zeros((rows, 4), "<f4")
-        joints[:, 0], weights[:, 0] = node["name"] != "garment", 1
-        attributes["JOINTS_0"] = add_accessor(document, binary, joints, "VEC4", 5121)
-        attributes["WEIGHTS_0"] = add_accessor(document, binary, weights, "VEC4", 5126)
-        node["skin"] = 0
-    write_chunks(path, document, binary)
+    bind = np.tile(np.eye(4, dtype="<f4"), (3, 1, 1))
+    bind[0, 3, 1] = 1.0  # column-major: the bind pose cancels the position of the hips
+    add_skeleton(path, bones, lambda name: 0 if name == "garment" else 2, bind)
     head = read_glb(path)
     same_place(head, original)
     moved = np.abs(head.deform(neutral_faps(head_yaw=40_000)) - head.vertices).max(axis=1)
     assert moved[head.part("garment").vertices].max() == 0
     assert moved[head.part("hair").vertices].max() > 0.02
+
+
+def test_a_jaw_bone_moves_teeth_without_shapes(original: Head, tmp_path: Path) -> None:
+    whole = meshes(original, SHAPES)
+    for mesh in whole:
+        if mesh.name.startswith("teeth"):
+            mesh.targets = {}
+    path = write_glb(tmp_path / "cc4.glb", whole)
+    bones = [{"name": f"CC_Base_{name}"} for name in ("Head", "JawRoot", "Teeth02")]
+    add_skeleton(path, bones, lambda name: 2 if name == "teeth_lower" else 0)
+    head = read_glb(path)
+    moved = head.deform(neutral_faps(open_jaw=400)) - head.vertices
+    assert moved[head.part("teeth_lower").vertices, 1].mean() < -0.003
+    assert np.abs(moved[head.part("teeth_upper").vertices]).max() == 0
 
 
 # --- broken files ---------------------------------------------------------------------------------

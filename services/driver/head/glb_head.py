@@ -30,7 +30,13 @@ from kouxing.services.driver.head.head import Head, assemble
 from kouxing.services.driver.head.morphs import units_per_weight
 from kouxing.services.driver.head.pieces import Fields, Primitive, pack, part_names
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import (
+    FAP_NUMBER,
+    FAP_UNITS_PER_FAPU,
+    FAPS,
+    NUM_FAPS,
+    RADIANS_PER_ANGLE_UNIT,
+)
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
 from kouxing.shared.user_file import check_content
@@ -49,6 +55,8 @@ _MIN_FAPS = 12
 _MAX_FACES_APART = 2.0  # distance of the parts of one face, in sizes of a part
 _STEEPER = 1.5  # how much farther the mouth is below the eyes along an axis that replaces y
 
+_JAW = FAP_NUMBER["open_jaw"] - 1
+_OPEN_JAW = float(ARKIT.basis[ARKIT.names.index("jawOpen"), _JAW])
 _FAP_BY_NAME = {fap.name: fap for fap in FAPS[2:]}
 _NOT_MOUTH = re.compile("eye|brow|cheek|nose|blink|look")
 _SETS = {"arkit": ARKIT, "oculus": OCULUS, "vrm": VRM}
@@ -105,6 +113,12 @@ def _recognize(pieces: list[Primitive]) -> Names:
             if (shape := shape_of.get(name)) in table:
                 piece.shapes[shape] = piece.shapes.get(shape, 0.0) + shift
     known = {name for piece in pieces for name in piece.shapes}
+    opening = {
+        name: share for name in known & table.keys() if (share := table[name][_JAW] / _OPEN_JAW) > 0
+    }
+    for piece in pieces:
+        if piece.jaw is not None and not opening.keys() & piece.shapes.keys():  # teeth and tongue
+            piece.shapes |= {name: share * piece.jaw for name, share in opening.items()}
     return {name: row for name, row in table.items() if name in known}
 
 

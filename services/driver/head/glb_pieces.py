@@ -22,6 +22,8 @@ MAX_PIECES = 2_000
 MAX_SHIFTS = 20_000_000  # displacements of all morph targets
 MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
+_JAW_RAD = 0.3  # rotation of a jaw bone at full weight of ARKit's jawOpen
+_JAW_BONES = ("jaw", "jawroot", "lowerjaw")
 _LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes at full weight of ARKit's shapes
 
 
@@ -96,7 +98,7 @@ def _turn_shares(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
 
 
 def find_bones(glb: Glb) -> dict[int, str]:
-    """Return the bones by their nodes: those of a VRM, otherwise nodes named "head" and "neck"."""
+    """Return the bones by their nodes: those of a VRM, otherwise head, neck and jaw by name."""
     extensions = glb.json.get("extensions", {})
     listed = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     named = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
@@ -108,7 +110,8 @@ def find_bones(glb: Glb) -> dict[int, str]:
         re.split(r"[.:|_ ]", str(node.get("name", "")).lower())[-1]
         for node in glb.json.get("nodes", [])
     ]
-    return {number: word for number, word in enumerate(words) if word in ("head", "neck")}
+    known = {"head": "head", "neck": "neck", **dict.fromkeys(_JAW_BONES, "jaw")}
+    return {number: known[word] for number, word in enumerate(words) if word in known}
 
 
 def _uses_eye_bones(glb: Glb) -> bool:
@@ -178,6 +181,7 @@ def _piece(
         raise BadGlbError("the attributes of a mesh have different lengths")
     shapes = _shapes(glb, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
+    jaw = None if weight is None else _jaw_shift(glb, node["skin"], attributes, places, vertices)
     if weight is not None and _uses_eye_bones(glb):
         shapes = _eye_look_shapes(glb, node["skin"], attributes, places, vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
@@ -193,6 +197,7 @@ def _piece(
         material=material,
         head_weight=weight,
         shapes=shapes,
+        jaw=jaw,
     )
 
 
@@ -281,6 +286,34 @@ def _skinned(
     share = np.array([turn_shares.get(joint, 0.0) for joint in joints])
     placed = np.einsum("vk,vkij->vij", weights, bones[which])
     return placed, (weights * share[which]).sum(axis=1) if turn_shares else None
+
+
+def _jaw_shift(
+    glb: Glb,
+    skin: object,
+    attributes: dict[str, Float64],
+    places: dict[int, Float64],
+    vertices: Float64,
+) -> Float64 | None:
+    """Return the displacements (V, 3) by a jaw bone, if it moves vertices.
+
+    A VRM's jaw bone is ignored, because programs often choose a wrong one.
+    """
+    jaw = next((number for number, bone in find_bones(glb).items() if bone == "jaw"), None)
+    if jaw not in places or glb.json.get("extensions", {}).keys() & {"VRM", "VRMC_vrm"}:
+        return None
+    below = {jaw}
+    for number in places:  # parents come first
+        if number in below:
+            below |= set(glb.item("nodes", number).get("children", []))
+    is_jaw = np.array([joint in below for joint in glb.item("skins", skin)["joints"]])
+    share = (
+        _normalized(attributes["WEIGHTS_0"]) * is_jaw[attributes["JOINTS_0"].astype(np.int64)]
+    ).sum(axis=1, keepdims=True)
+    if not share.any():
+        return None
+    shift: Float64 = share * _JAW_RAD * np.cross([1, 0, 0], vertices - places[jaw][:3, 3])
+    return shift
 
 
 def _normalized(weights: Float64) -> Float64:

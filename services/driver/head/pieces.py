@@ -32,6 +32,7 @@ class Primitive:
     material: dict[str, Any]
     head_weight: Float64 | None  # None without a skeleton
     shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by name
+    jaw: Float64 | None = None  # displacements by a jaw bone
 
 
 def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
