@@ -16,6 +16,8 @@ MEASURES = ("opening", "width", "jaw")
 LEVEL_STEP_S = 0.02
 
 _MAX_GAP_S = 0.1  # longer gaps between tracked frames are not interpolated
+_MAX_SLOW_GAP_S = 0.3  # the same at few images per second
+_JITTER = 1.3  # of the interval between images
 _SIDES = [[MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] for fap in LIP_FAPS]
 _JAW, _UPPER_LIP, _LOWER_LIP, _CORNER = (LIP_FAPS.index(fap) for fap in (3, 4, 5, 6))
 
@@ -37,9 +39,11 @@ def interpolate_track(frame_s: Array, values: Array, time_s: Array) -> Array:
     known = ~np.isnan(values)
     if known.sum() < 2:
         return np.full(time_s.shape, np.nan)
+    interval_s = float(np.median(np.diff(frame_s)))
+    max_gap_s = min(max(_MAX_GAP_S, _JITTER * interval_s), _MAX_SLOW_GAP_S)
     frame_s, values = frame_s[known], values[known]
     after = np.clip(np.searchsorted(frame_s, time_s), 1, len(frame_s) - 1)
-    is_gap = frame_s[after] - frame_s[after - 1] > _MAX_GAP_S
+    is_gap = frame_s[after] - frame_s[after - 1] > max_gap_s
     outside = (time_s < frame_s[0]) | (time_s > frame_s[-1])
     interpolated: Array = np.interp(time_s, frame_s, values)
     return np.where(is_gap | outside, np.nan, interpolated)

@@ -16,13 +16,13 @@ from PIL import Image
 
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
-from kouxing.services.mouth_profiles.landmark_file import landmark_file
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from tests import heads
 from tests.browser import Browser
 from tests.fake_control import FakeControl
 from tests.heads import neutral_faps
 from tests.system import DEMO, Gateway, wait_until
+from tests.unit.test_face_landmarks import landmark_file
 
 NUM_PICTURES = 8
 
@@ -91,7 +91,8 @@ def longer(recording: bytes) -> bytes:
     landmarks = np.tile(points.reshape(-1, 3), (len(time_s), 1, 1))
     lower = [LANDMARKS.index(point) for point in (14, 17, 152, 178, 181, 402, 405)]
     landmarks[:, lower, 1] += 8 * (loudness / loudness.max())[:, None]  # pixels
-    return landmark_file(time_s, landmarks, sound, rate_hz)
+    frames = landmarks.astype(np.float32)
+    return landmark_file(time_s, frames, sound, sample_rate_hz=rate_hz)
 
 
 @pytest.mark.timeout(400)  # of a busy machine

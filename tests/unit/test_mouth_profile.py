@@ -13,7 +13,7 @@ from kouxing.services.mouth_profiles.learning import (
     fit_profile,
     observe,
 )
-from kouxing.services.mouth_profiles.lip_tracks import lip_measures
+from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
@@ -105,6 +105,14 @@ def test_rejects_too_little_speech() -> None:
     )
     with pytest.raises(UserError, match="s of speech show the lips"):
         fit_profile(speech)
+
+
+@pytest.mark.parametrize(("interval_s", "hole_s"), [(0.04, 0.16), (0.2, 0.6)])
+def test_interpolates_slow_images_but_not_holes(interval_s: float, hole_s: float) -> None:
+    frame_s = np.arange(0, 10, interval_s)
+    frame_s = frame_s[(frame_s <= 5) | (frame_s >= 5 + hole_s)]
+    values = interpolate_track(frame_s, frame_s, np.array([2.5 * interval_s, 5 + hole_s / 2]))
+    np.testing.assert_allclose(values, [2.5 * interval_s, np.nan])
 
 
 def test_corrects_the_lag_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:

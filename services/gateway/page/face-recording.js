@@ -14,7 +14,7 @@ const MIN_LOUD = 0.1; // fraction of the chunks
 const MIN_FACES = 0.7; // fraction of the images that must show a face
 
 export class FaceRecording {
-  static minRateHz = 10; // of the images; lips move within a tenth of a second
+  static minRateHz = 4.5; // of the images
   #rateHz;
   #chunks = [];
   #numSamples = 0;

@@ -11,6 +11,8 @@ import { curvePath, extent, figures, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
+const GOOD_RATE_HZ = 10; // of the images; at lower rates the reading is longer
+const SLOW_SHARE = 1.5; // of the usual time
 const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the first image
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
 const CURVES = ["tracked", "before", "after"];
@@ -29,6 +31,7 @@ export class MouthLesson {
   #handlers;
   #abort = new AbortController(); // for the current step
   #finish = () => {}; // ends the reading
+  #isSlow = false; // the computer analyzes few images per second
   #recording = null; // landmark file that was not used yet
   #learned = null; // profile that the user has neither kept nor discarded
 
@@ -135,6 +138,7 @@ export class MouthLesson {
 
   #prepare() {
     this.#recording = null;
+    this.#isSlow = false;
     const language = element("lesson-text").value;
     element("lesson-reading").lang = language;
     element("lesson-reading").textContent = READING_TEXTS[language];
@@ -161,8 +165,9 @@ export class MouthLesson {
       const { from, to } = RATE_CHECK_MS;
       setTimeout(() => (numImages = 0), from); // the first images take longer
       setTimeout(() => {
-        const isSlow = numImages < (FaceRecording.minRateHz * (to - from)) / 1000;
-        if (isSlow) reject(new UserError(say("tooSlow")));
+        const rateHz = (1000 * numImages) / (to - from);
+        if (rateHz < FaceRecording.minRateHz) reject(new UserError(say("tooSlow")));
+        this.#isSlow = rateHz < GOOD_RATE_HZ;
       }, to);
     });
     let next = nextImage(video);
@@ -192,11 +197,12 @@ export class MouthLesson {
       return;
     }
     const readingMs = nowMs - startMs - CLOSED_LIPS_MS;
-    const leftS = Math.ceil((readingMs < 0 ? -readingMs : 1000 * this.readingS - readingMs) / 1000);
+    const wholeMs = 1000 * this.readingS * (this.#isSlow ? SLOW_SHARE : 1);
+    const leftS = Math.ceil((readingMs < 0 ? -readingMs : wholeMs - readingMs) / 1000);
     element("lesson-count").textContent = leftS;
-    element("lesson-time").value = Math.max(0, readingMs / (1000 * this.readingS));
+    element("lesson-time").value = Math.max(0, readingMs / wholeMs);
     element("lesson-reading").classList.toggle("due", readingMs >= 0);
-    element("lesson-finish").disabled = readingMs < 1000 * MIN_READING * this.readingS;
+    element("lesson-finish").disabled = readingMs < MIN_READING * wholeMs;
     const advice = recording.advice(nowMs) ?? (readingMs < 0 ? "lessonLipsClosed" : "lessonRead");
     element("lesson-advice").textContent = say(advice);
     if (leftS <= 0) this.#finish();
