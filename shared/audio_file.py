@@ -138,8 +138,8 @@ def _open_pipe(
         source = raw_audio(pipe, raw, name)
         source.notices.append(
             f"{name}: no sound format fits, so this is read as raw samples: 16-bit,"
-            f" {raw.sample_rate_hz} Hz, channels: {raw.num_channels}; the options --raw, --rate and"
-            " --channels set this"
+            f" {raw.sample_rate_hz} Hz, channels: {raw.num_channels}; for other samples use"
+            " kouxing speak with --raw, --rate and --channels"
         )
         return source
     if raw is not None:
