@@ -50,11 +50,7 @@ AudioFolder = Annotated[
 ]
 Split = Annotated[str, typer.Option(help="Split of the corpus.")]
 Acoustic = Annotated[
-    list[str] | None, typer.Option(help="Model: neural, blocks, gmm or a file; repeatable.")
-]
-LookAhead = Annotated[
-    list[float] | None,
-    typer.Option("--look-ahead-ms", help="Look-ahead, for models with a choice; repeatable."),
+    list[str] | None, typer.Option(help="Model: blocks, light, gmm or a file; repeatable.")
 ]
 Sounds = Annotated[
     list[Path] | None,
@@ -71,13 +67,11 @@ def recognizer(
     audio: AudioFolder = None,
     split: Split = "test",
     acoustic: Acoustic = None,
-    look_ahead: LookAhead = None,
     sounds: Sounds = None,
     condition: Annotated[
         list[str] | None,
         typer.Option(help='Disturbance, such as "babble 10 dB"; repeatable. Default: all.'),
     ] = None,
-    curve: Annotated[Path | None, typer.Option(help="Plot errors against delay (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -95,28 +89,22 @@ def recognizer(
     )
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
     from kouxing.evaluation.recognizer.references import align_corpus
-    from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
+    from kouxing.evaluation.recognizer.report import print_figures
 
-    check_output(curve, json_file, force=force)
+    check_output(json_file, force=force)
     check_conditions(condition or ())
-    models = list(_models(acoustic, look_ahead))
+    models = list(_models(acoustic))
     music = music_from(_read_sounds(sounds))
     errors = RowErrors()
-    references = align_corpus(models[0][2], manifest, split, errors, audio)
+    references = align_corpus(models[0][1], manifest, split, errors, audio)
     disturbances = disturbances_for(references, music, condition or ())
     results = {
-        title: {
-            "acoustic": name,
-            "split": split,
-            **evaluate_recognizer(model, references, disturbances, rule),
-        }
-        for title, name, model, rule in models
+        name: {"split": split, **evaluate_recognizer(model, references, disturbances, rule)}
+        for name, model, rule in models
     }
     print_figures(results, split, Console())
     errors.report_to(print_message)
     write_json(json_file, results)
-    if curve is not None:
-        draw_delay_curve(list(results.values()), curve)
 
 
 @app.command()
@@ -145,7 +133,7 @@ def voice(
     from kouxing.evaluation.recognizer.voice import evaluate_voice, materials_of, print_voice
 
     check_output(json_file, force=force)
-    models = {title: model for title, _, model, _ in _models(acoustic, None)}
+    models = {name: model for name, model, _ in _models(acoustic)}
     recorded = _read_sounds(sounds)
     music = music_from(recorded)
     errors = RowErrors()
@@ -164,18 +152,14 @@ def _read_sounds(folders: list[Path] | None) -> list[Sound]:
 
 
 def _models(
-    names: list[str] | None, look_aheads_ms: list[float] | None
-) -> Iterator[tuple[str, str, AcousticModel, OutputRuleConfig]]:
-    """Yield title, name, model and default output rule of each model and look-ahead."""
-    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
+    names: list[str] | None,
+) -> Iterator[tuple[str, AcousticModel, OutputRuleConfig]]:
+    """Yield name, model and default output rule of each model."""
+    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_model
     from kouxing.services.recognizer.config import RecognizerConfig
 
     for name in names or [DEFAULT_MODEL]:
-        defaults = RecognizerConfig(acoustic=name)
-        for look_ahead_ms in look_aheads_ms or [defaults.look_ahead_ms]:
-            model = load_live_model(name, look_ahead_ms=look_ahead_ms)
-            title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_aheads_ms else name
-            yield title, name, model, defaults.output_rule
+        yield name, load_model(name), RecognizerConfig(acoustic=name).output_rule
 
 
 @app.command()
@@ -255,12 +239,12 @@ def schemes(
     By default, the shipped samples are used, with the recognizers blocks and gmm.
     """
     from kouxing.evaluation.lips import sentences
-    from kouxing.evaluation.lips.four_schemes import load_recognizers, print_missing, recognize_all
+    from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
     from kouxing.evaluation.lips.scheme_report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos
     from kouxing.services.lip_models import lip_models
-    from kouxing.services.recognizer.acoustic.load import load_live_model
+    from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.shared.errors import UserError
 
     check_output(json_file, force=force)
@@ -270,7 +254,7 @@ def schemes(
         raise UserError("--audio and --split apply to a corpus; add --manifest")
     if (anchor or sound_at_once) and not videos:
         raise UserError("--anchor and --sound-at-once apply to videos; add --videos FOLDER")
-    model = load_live_model()
+    model = load_model()
     if manifest:
         chosen = sentences.corpus_sentences(model, manifest, split or "test", audio)
     elif clips:
@@ -279,7 +263,6 @@ def schemes(
         chosen = sentences.sample_sentences(model, SENTENCE.parent)
     recognizers = load_recognizers(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
     names = lips or list(lip_models())
-    print_missing(names, recognizers)
     recognized = recognize_all(model, recognizers, chosen)
     outcome = score_schemes(recognized, recognizers, names)
     print_outcome(outcome, Console())

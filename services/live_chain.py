@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -63,7 +63,7 @@ class LiveChain:
 
     Examples
     --------
-    >>> chain = LiveChain(load_live_model(), load_lip_model())
+    >>> chain = LiveChain(load_model(), load_lip_model())
     >>> frames = chain.accept_waveform(samples) + chain.input_finished()
     """
 
@@ -85,7 +85,7 @@ class LiveChain:
         self._stream = self._recognizer.create_stream(
             sample_rate_hz=sample_rate_hz,
             num_channels=num_channels,
-            lip_predictor=lip_predictor or lip_predictor_for(model),
+            lip_predictor=lip_predictor or load_lip_predictor(),
             face_delay_s=synthesizer.delay_ms / 1e3,
         )
         self._face = FaceAnimator(

@@ -18,17 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.offline import decode_offline
 from kouxing.services.recognizer.speech_scorer import (
     ScoreEvent,
-    SpeechEnd,
-    SpeechStart,
     WithProgress,
-    frame_time_s,
     score_recording,
 )
+from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
@@ -85,7 +84,7 @@ def analyze_recording(
     samples
         16 kHz mono, shape (n,).
     lip_predictor
-        The network that predicts learnt lips, if it fits the acoustic model.
+        The network that predicts learnt lips, if any.
     aligned
         The phones of the known text; None: phones are recognized.
     with_progress

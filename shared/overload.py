@@ -1,7 +1,8 @@
-"""The overload policy: on a busy machine, a live session skips old audio to stay live.
+"""The overload policy: what a live session gives up on a busy machine to stay live.
 
-A session is *behind* if late audio is queued. A session that stays too far behind skips the queued
-audio in one cut and continues with the newest audio. An unpaced session skips nothing. It takes
+A session is *behind* if late audio is queued. If it is slightly behind, it uses the light acoustic
+model until it has been in time for a while. A session that stays too far behind skips the queued
+audio in one cut and continues with the newest audio. An unpaced session gives up nothing. It takes
 longer instead.
 
 The *lateness* of audio is the time since the audio was due. Audio is due when a sender in real time
@@ -11,6 +12,8 @@ although it was just received. Audio that a client sends ahead of the clock is n
 
 import math
 
+LIGHT_FROM = 0.75  # fraction of the limit above which a session uses the light model
+LIGHT_FOR_S = 2.0  # time for which it continues to use it
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
 REPORT_INTERVAL_S = 1.0  # between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
@@ -34,6 +37,7 @@ class Overload:
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: on arrival
         self._late_since_s = math.inf  # when the session exceeded its limit
+        self._light_until_s = -math.inf  # when it has been in time for a while
         self._reported_s, self._report_due_s = 0.0, -math.inf  # part of skipped_s; next report
 
     def add(self, duration_s: float, now_s: float, *, has_waiting: bool) -> None:
@@ -69,6 +73,8 @@ class Overload:
             return False
         late_s = self._late_s(waiting_s, now_s)
         behind_s = min(waiting_s, late_s)
+        if behind_s > LIGHT_FROM * self._max_behind_s:
+            self._light_until_s = now_s + LIGHT_FOR_S
         if behind_s <= self._max_behind_s:
             self._late_since_s = math.inf
         else:  # after a stop of this process, the session has been late for some time
@@ -79,6 +85,10 @@ class Overload:
         self._late_since_s = math.inf
         self.skipped_s += waiting_s
         return True
+
+    def needs_light_model(self, now_s: float) -> bool:
+        """Return whether the session is or was recently behind."""
+        return now_s < self._light_until_s
 
     def take_report_s(self, now_s: float) -> float:
         """Return the duration of the audio skipped since the last report, at most once a second."""

@@ -169,9 +169,12 @@ class Service(MessageLoop):
             SessionStarted(session=start.session, request=start.request, media_time=media_time)
         )
 
-    def publish_event(self, name: EventName, session: str, detail: str) -> None:
+    def publish_event(
+        self, name: EventName, session: str, detail: str = "", media_time: int = 0
+    ) -> None:
         """Let control publish an event about a session."""
-        self.send_to_control(Event(session=session, name=name, detail=detail[:2000]))
+        event = Event(session=session, name=name, detail=detail[:2000], media_time=media_time)
+        self.send_to_control(event)
 
     def report_skipped(self, session: str, skipped_s: float) -> None:
         """Count and publish the duration of a live session's skipped audio, unless it is 0."""

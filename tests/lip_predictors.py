@@ -1,12 +1,11 @@
-"""A lip predictor with random weights for the shipped network."""
+"""A lip predictor with random weights for the shipped ear."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS, LipPredictor
 
-WIDTH = 512  # of the shipped network
-NUM_FEATURES, NUM_COMPONENTS, UNITS, HISTORY = 160 + 2 * WIDTH, 6, 5, 3
+NUM_FEATURES, NUM_COMPONENTS, UNITS, NUM_LIPS = 160 + 307, 6, 5, 51  # log-mel, ear's features
 DELAYS_S = (-0.005, 0.055, 0.155)
 
 
@@ -27,7 +26,7 @@ def made_up_model() -> LipPredictor:
         input_bias=draw(3 * UNITS),
         state_weights=draw(UNITS, 3 * UNITS),
         state_bias=draw(3 * UNITS),
-        history_weights=draw(HISTORY, NUM_COMPONENTS, *outputs),
+        lip_weights=draw(NUM_LIPS, *outputs),
         output_weights=draw(2 * UNITS, *outputs),
         output_bias=draw(*outputs),
     )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.session import SessionFacts
 
@@ -26,13 +26,13 @@ START = StartSession(
     endpoints={},
 )
 
+RULE = OutputRuleConfig()
+
 
 class LiveStream:
     """A stream with a separate recognizer; ``options`` are those of ``create_stream``."""
 
-    def __init__(
-        self, model: AcousticModel, rule: OutputRuleConfig = MODEL_RULES["neural"], **options: Any
-    ) -> None:
+    def __init__(self, model: AcousticModel, rule: OutputRuleConfig = RULE, **options: Any) -> None:
         self._recognizer = Recognizer(model, rule)
         self.stream = self._recognizer.create_stream(**options)
 
@@ -64,7 +64,7 @@ def recognize_live(
     model: AcousticModel,
     samples: NDArray[np.float32],
     chunk: int | None = None,
-    rule: OutputRuleConfig = MODEL_RULES["neural"],
+    rule: OutputRuleConfig = RULE,
     **options: Any,
 ) -> list[StreamOutput]:
     """Return all results of a recording."""
@@ -76,7 +76,7 @@ def recognize_together(
     model: AcousticModel, recordings: list[NDArray[np.float32]], **options: Any
 ) -> list[list[StreamOutput]]:
     """Return all results of recordings that are decoded together."""
-    recognizer = Recognizer(model, MODEL_RULES["neural"])
+    recognizer = Recognizer(model)
     streams = [recognizer.create_stream(**options) for _ in recordings]
     for stream, samples in zip(streams, recordings, strict=True):
         stream.accept_waveform(samples)

@@ -34,7 +34,7 @@ NOTHING_SKIPPED = {  # on a busy machine
 }
 PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
-CHEAP = {"KOUXING_RECOGNIZER_ACOUSTIC": "neural"}  # half the work of the default
+CHEAP = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
 MAX_KEPT = 200
 

@@ -9,7 +9,7 @@ import typer
 
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.terminal import CONSOLE, Force, check_output, print_message
+from kouxing.shared.terminal import Force, check_output, print_message
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
@@ -132,36 +132,6 @@ def gmm(
 
 
 @app.command()
-def neural(
-    corpus: Corpora,
-    output: Model,
-    aligner: Annotated[Path, typer.Option(help="Model that aligns the recordings.")],
-    whisper: Whisper,
-    untranscribed: Untranscribed = None,
-    phone_lm: PhoneLm = None,
-    seed: Seed = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 800,
-    any_license: AnyLicense = False,
-    force: Force = False,
-) -> None:
-    """Train the neural recognizer, and write its model card."""
-    with _neural_training(output, force=force):
-        from kouxing.training.neural.recipe import train_neural
-
-    train_neural(
-        corpus,
-        output,
-        aligner=aligner,
-        whisper=whisper,
-        untranscribed=untranscribed or [],
-        phone_lm=phone_lm,
-        seed=seed,
-        num_steps=steps,
-        shipping=not any_license,
-    )
-
-
-@app.command()
 def blocks(
     corpus: Corpora,
     output: Model,
@@ -205,15 +175,12 @@ def ear(
     output: Model,
     whisper: Whisper,
     sounds: Sounds,
+    clips: Clips,
     untranscribed: Untranscribed = None,
-    clips: Annotated[
-        Path | None,
-        typer.Option(help="Folder of clips with tracked lips; only their audio is used."),
-    ] = None,
     seed: Seed = 0,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of batches, each with 140 s of audio.")
-    ] = 20_000,
+    ] = 7000,
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
@@ -232,26 +199,6 @@ def ear(
         shipping=not any_license,
     )
     train_ear(sources, output, whisper=whisper, seed=seed, num_steps=steps)
-
-
-@app.command()
-def ear_report(
-    model: Annotated[Path, typer.Argument(help="Model file, or training checkpoint (.pt).")],
-    corpus: Corpora,
-    whisper: Whisper,
-    sounds: Sounds,
-    clips: Clips,
-) -> None:
-    """Measure the voice classes and the lip features of a small ear on held-out audio.
-
-    ``kouxing evaluate voice`` measures the voice activity of the recognizer.
-    """
-    with _neural_training():
-        from kouxing.training.ear.recipe import Sources
-        from kouxing.training.ear.report import report_ear
-
-    sources = Sources(corpora=corpus, clips=clips, sounds=sounds)
-    report_ear(model, sources, whisper=whisper, console=CONSOLE)
 
 
 @app.command()
@@ -274,16 +221,6 @@ def lips(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
     ] = Path("services/recognizer/models/lips.npz"),
-    speech: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder of speech in any language, of which the teacher labels up to an hour; "
-            "repeatable."
-        ),
-    ] = None,
-    whisper: Annotated[
-        Path | None, typer.Option(help="Folder of Whisper base for faster-whisper, the teacher.")
-    ] = None,
     seed: Seed = 0,
     any_license: AnyLicense = False,
     force: Force = False,
@@ -292,9 +229,7 @@ def lips(
     with _neural_training(output, force=force):
         from kouxing.training.lips.recipe import train_lips
 
-    train_lips(
-        clips, output, speech=speech or [], whisper=whisper, seed=seed, any_license=any_license
-    )
+    train_lips(clips, output, seed=seed, any_license=any_license)
 
 
 @app.command()

@@ -12,14 +12,14 @@ from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.scoring import ErrorCounts, count_errors
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.vtln import without_pitch
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.shared.errors import UserError
 from kouxing.training.training_set import Example, Report, load_examples
 
-M = TypeVar("M", GmmModel, NeuralModel)
+M = TypeVar("M", GmmModel, BlockModel)
 
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
 _PHONE_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)

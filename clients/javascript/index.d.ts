@@ -10,6 +10,7 @@ export interface SessionMessage {
   chosen: string;
   epoch: number;
   lips: string;
+  acoustic: string;
   sample: boolean;
 }
 
@@ -46,6 +47,8 @@ export interface ViewerHandlers {
   error?(message: { code: string; text: string }): void;
   status?(message: { missing: string[] }): void;
   lips?(message: { lips: string }): void;
+  /** The acoustic model of the session changed: "full" or "light". */
+  acoustic?(message: { acoustic: string }): void;
 }
 
 /** Follows one session, or always the newest. Reconnects by itself until it is closed. */

@@ -2,7 +2,9 @@
 
 import { ViewerSocket } from "./page/viewer-socket.js";
 
-const EVENTS = ["session", "phone", "syllable", "speech", "end", "error", "status", "lips"];
+const EVENTS = [
+  "session", "phone", "syllable", "speech", "end", "error", "status", "lips", "acoustic",
+];
 
 /**
  * Return the URL of one of the gateway's WebSockets.

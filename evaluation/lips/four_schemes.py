@@ -28,16 +28,14 @@ from kouxing.evaluation.lips.live_faces import animate_live, drop_first_hypothes
 from kouxing.evaluation.lips.sentences import Sentence
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
-from kouxing.shared.terminal import print_message
 
 SCHEMES = (1, 2, 3, 4)
 ALIGNED, RECOGNIZED, LIVE, NEXT_PHONE = SCHEMES
@@ -64,13 +62,8 @@ class TestedRecognizer:
 
     name: str
     model: AcousticModel
-    lips: LipFrameModel | None
     config: RecognizerConfig
     has_paper_rule: bool  # phones are emitted as in the paper and never corrected
-
-    def can_drive(self, lips: str) -> bool:
-        """Whether the recognizer has the input of a lip model; learnt lips need lip frames."""
-        return lips != "learnt" or self.lips is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,26 +93,13 @@ def load_recognizers(
     """
     recognizers = []
     for name in names:
-        model = load_live_model(name)
+        model = load_model(name)
         config = RecognizerConfig(acoustic=name)
         if has_paper_rule:
             config = RecognizerConfig(acoustic=name, num_stable_frames=3, min_confidence=0.0)
         title = Path(name).stem + ("-paper" if has_paper_rule else "")
-        recognizers.append(
-            TestedRecognizer(title, model, lip_predictor_for(model), config, has_paper_rule)
-        )
+        recognizers.append(TestedRecognizer(title, model, config, has_paper_rule))
     return recognizers
-
-
-def print_missing(lips: Sequence[str], recognizers: Sequence[TestedRecognizer]) -> None:
-    """Print why some recognizers have no schemes with a lip model."""
-    for name in lips:
-        for tested in recognizers:
-            if not tested.can_drive(name):
-                print_message(
-                    f"no schemes 2 to 4 with {name} lips and {tested.name}: {name} lips need a"
-                    " neural recognizer, such as --acoustic blocks"
-                )
 
 
 def all_conditions(recognizers: Sequence[TestedRecognizer], lips: Sequence[str]) -> list[Condition]:
@@ -128,8 +108,7 @@ def all_conditions(recognizers: Sequence[TestedRecognizer], lips: Sequence[str])
     for name in lips:
         conditions.append(Condition(ALIGNED, name, ""))
         for recognizer in recognizers:
-            if recognizer.can_drive(name):
-                conditions += [Condition(n, name, recognizer.name) for n in SCHEMES[1:]]
+            conditions += [Condition(n, name, recognizer.name) for n in SCHEMES[1:]]
     return conditions
 
 
@@ -137,15 +116,15 @@ def recognize_all(
     model: AcousticModel, recognizers: Sequence[TestedRecognizer], sentences: Sequence[Sentence]
 ) -> list[RecognizedSentence]:
     """Run all recognizers on all sentences. ``model`` is the one of the aligned phones."""
-    lips = lip_predictor_for(model)
+    lips = load_lip_predictor()
     recognized = []
     for sentence in track(sentences, description="recognizing", transient=True):
         samples, phones = sentence.clip.samples, sentence.aligned
         aligned = None if phones is None else analyze_recording(model, samples, lips, phones)
         outputs = {
             tested.name: RecognizerOutput(
-                analyze_recording(tested.model, samples, tested.lips),
-                live_events(tested.model, samples, tested.lips, _DELAYS_S, tested.config),
+                analyze_recording(tested.model, samples, lips),
+                live_events(tested.model, samples, lips, _DELAYS_S, tested.config),
                 tested.has_paper_rule,
             )
             for tested in recognizers

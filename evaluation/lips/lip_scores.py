@@ -29,7 +29,7 @@ from kouxing.evaluation.recognizer.disturbances import (
 )
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -94,7 +94,7 @@ def score_lips(
     conditions: Sequence[str],
 ) -> Results:
     """Score faces (see ``load_faces``) on the held-out clips of a folder."""
-    model = load_live_model()
+    model = load_model()
     faces = load_faces(names, delays_ms, model.inventory)
     clips = clips_to_score(folder, [Path(name) for name in names if name.endswith(".json")])
     known = known_speakers(folder)

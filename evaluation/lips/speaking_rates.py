@@ -36,10 +36,10 @@ from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, live_events, live_
 from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
@@ -92,7 +92,7 @@ def score_rates(folder: Path) -> list[RateScore]:
     if not clips:
         raise UserError(f"{folder} has no held-out clips with sound in sync; use another folder")
     real = scale_openings([clip.speaker for clip in clips], [clip.faps for clip in clips])
-    model = load_live_model()
+    model = load_model()
     return [_score_rate(model, clips, real, rate) for rate in RATES]
 
 
@@ -183,7 +183,7 @@ def _methods(
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
         yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
     delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}
-    events = live_events(model, samples, lip_predictor_for(model), sorted(set(delays_s.values())))
+    events = live_events(model, samples, load_lip_predictor(), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)
         frames = live_frames(lips, events[delay_s], delay_s)

@@ -199,10 +199,10 @@ def _score(model: AcousticModel, samples: Samples) -> list[tuple[float, list[Sco
     for start in range(0, len(samples), CHUNK_SAMPLES):
         chunk = samples[start : start + CHUNK_SAMPLES]
         scorer.accept_waveform(chunk)
-        score_streams(model, [scorer])
+        score_streams([scorer])
         scored.append(((start + len(chunk)) / SAMPLE_RATE_HZ, scorer.get_events()))
     scorer.input_finished()
-    score_streams(model, [scorer])
+    score_streams([scorer])
     return [*scored, (len(samples) / SAMPLE_RATE_HZ, scorer.get_events())]
 
 

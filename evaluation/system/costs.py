@@ -18,17 +18,17 @@ from kouxing.evaluation.tables import format_number
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.writer import VideoWriter
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level import VISEMES
 from kouxing.shared.terminal import print_table
 
-MODELS = ("neural", "blocks")
+MODELS = ("blocks", "light")
 NUM_SESSIONS = (1, 16)
 NUM_IMAGES = 60
 # name, detail, size, anti-aliasing samples per pixel, whether the images are encoded (H.264)
@@ -43,11 +43,11 @@ def measure_sessions(path: Path) -> dict[str, float]:
     samples = to_16_khz(*read_audio(path))
     costs = {}
     for name in MODELS:
-        model = load_live_model(name)
+        model = load_model(name)
         recognizer = Recognizer(model, RecognizerConfig(acoustic=name).output_rule)
         recognizer.warm_up()
         for num in NUM_SESSIONS:
-            for lips, note in ((None, ""), (lip_predictor_for(model), " with lips")):
+            for lips, note in ((None, ""), (load_lip_predictor(), " with lips")):
                 costs[f"{name}, {num}{note}"] = _cpu_s(recognizer, lips, samples, num)
     return costs
 

@@ -18,9 +18,9 @@ from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables
-from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -148,8 +148,8 @@ def animate(
 @lru_cache(maxsize=1)
 def _load_models(mouth: Path | None) -> tuple[AcousticModel, LipPredictor | None]:
     """Load the models once for all files of a command."""
-    model = load_live_model()
-    return model, _load_lip_predictor(model, mouth)
+    model = load_model()
+    return model, _load_lip_predictor(mouth)
 
 
 def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) -> list[film.Frame]:
@@ -160,10 +160,10 @@ def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) 
     return frames + chain.input_finished()
 
 
-def _load_lip_predictor(model: AcousticModel, mouth: Path | None) -> LipPredictor | None:
+def _load_lip_predictor(mouth: Path | None) -> LipPredictor:
     """Return the network that predicts learnt lips, adapted to a mouth profile, if any."""
-    predictor = lip_predictor_for(model)
-    if mouth is None or predictor is None:
+    predictor = load_lip_predictor()
+    if mouth is None:
         return predictor
     profile = read_mouth_profile(mouth)
     try:

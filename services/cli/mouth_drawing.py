@@ -20,10 +20,10 @@ from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import DrawnLips, Timing
 from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
 from kouxing.services.recording_chain import (
@@ -179,7 +179,7 @@ def _time_phones(
         if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
             print_mismatch(source, f"the speech is {ratio:.1f} times the text's usual duration")
         return phones
-    model = load_live_model()
+    model = load_model()
     if transcript is None:
         return recognize_recording(model, samples, with_progress)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
@@ -196,8 +196,8 @@ def _widths(
     """Return times, and the distance of the corners at each, relative to the mouth at rest."""
     if lips is DrawnLips.FERGUSON:
         return np.zeros(1), np.ones(1)
-    model = load_live_model()
-    predictor = lip_predictor_for(model) if lips is DrawnLips.LEARNT else None
+    model = load_model()
+    predictor = load_lip_predictor() if lips is DrawnLips.LEARNT else None
     recording = analyze_recording(model, samples, predictor, timed, with_progress)
     frames = animate_recording(
         recording, load_lip_model(name=lips), SynthesizerConfig(lips=lips, expressiveness=1.0)

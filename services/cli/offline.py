@@ -33,9 +33,7 @@ from kouxing.shared.terminal import (
 )
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
-Acoustic = Annotated[
-    str, typer.Option(help="Acoustic model: neural, blocks, gmm, or a model file.")
-]
+Acoustic = Annotated[str, typer.Option(help="Acoustic model: blocks, light, gmm, or a model file.")]
 
 
 class PhoneFormat(StrEnum):
@@ -211,7 +209,7 @@ def phones(
 ) -> None:
     """Recognize the phones of audio files, with their times."""
     from kouxing.services.cli.inputs import read_mono_16k
-    from kouxing.services.recognizer.acoustic.load import load_model, model_path
+    from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.services.recording_chain import recognize_recording
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.phone_files import format_phones
@@ -225,7 +223,7 @@ def phones(
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
     for source, target in pairs:
         check_output(target, inputs=[source], force=force)
-    model = load_model(model_path(acoustic))
+    model = load_model(acoustic)
 
     def recognize_file(source: Path, target: Path | None) -> None:
         samples = read_mono_16k(source, track)
@@ -254,14 +252,14 @@ def align(
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.cli.spoken_text import read_text, report_mismatch
-    from kouxing.services.recognizer.acoustic.load import load_model, model_path
+    from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
     check_output(output, inputs=[audio, Path(text)], force=force)
-    model = load_model(model_path(acoustic))
+    model = load_model(acoustic)
     transcript = read_text(text, model.inventory)
     samples = read_mono_16k(audio, track)
     with open_progress() as progress:

@@ -47,7 +47,13 @@ STOPPED = "stopped"  # reason for a service that shut down
 CHECK_S = 0.5  # interval of checking waiting sessions and the list of keys
 MAX_PAUSE_S = 0.1  # delay of a tick; any longer delay was caused by control itself
 # events that a service may publish
-SERVICE_EVENTS = (EventName.AUDIO_SKIPPED, EventName.ERROR, EventName.RECORDED)
+SERVICE_EVENTS = (
+    EventName.AUDIO_SKIPPED,
+    EventName.ERROR,
+    EventName.LAUGHTER_START,
+    EventName.LAUGHTER_STOP,
+    EventName.RECORDED,
+)
 
 
 class ControlService(Service):
@@ -329,7 +335,12 @@ class ControlService(Service):
 
     def _on_service_event(self, event: Event, instance: str) -> None:
         if event.name in SERVICE_EVENTS:
-            self._lifecycle.publish(EventName(event.name), event.session, detail=event.detail)
+            self._lifecycle.publish(
+                EventName(event.name),
+                event.session,
+                detail=event.detail,
+                media_time=event.media_time,
+            )
         else:
             self.warn("event", f"{instance} may not publish {event.name!r}", event.session)
 

@@ -50,7 +50,7 @@ from kouxing.shared.wire.events import phone_of
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import StatusReport, StatusRequest
-from kouxing.shared.wire.speech import Phone, Speech
+from kouxing.shared.wire.speech import Acoustic, Phone, Speech
 
 STATUS_INTERVAL_S = 1.0  # between status requests
 STATUS_TIMEOUT_S = 3.0  # between status requests without an answer, or without viewers
@@ -302,6 +302,7 @@ class GatewayService(Service):
                 Phone: self._on_phone,
                 Sound: self._on_sound,
                 Speech: self._on_speech,
+                Acoustic: self._on_acoustic,
             },
             live=start.paced,
             on_complete=lambda: self.session_started(session.start),
@@ -363,6 +364,9 @@ class GatewayService(Service):
     def _on_speech(self, speech: Speech) -> None:
         message = wire.text("speech", active=speech.active, media_time=speech.media_time)
         self._viewers.forward(speech.session, MessageKind.TEXT, message)
+
+    def _on_acoustic(self, acoustic: Acoustic) -> None:
+        self._viewers.set_acoustic(acoustic.session, acoustic.model)
 
     def _on_end(self, end: EndOfFaps) -> None:
         self._audio_sessions.on_last_frame(end.session)

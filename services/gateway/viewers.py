@@ -21,6 +21,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.speech import AcousticModel
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
@@ -33,6 +34,7 @@ _SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 class _ShownSession:
     epoch: int
     lip_model: str  # its name; empty: unknown
+    acoustic: str = AcousticModel.FULL
 
 
 @dataclass(slots=True, eq=False)
@@ -89,6 +91,13 @@ class Viewers:
         if session in self._sessions:
             self._sessions[session].lip_model = lip_model
             self.forward(session, MessageKind.TEXT, wire.text("lips", lips=lip_model))
+
+    def set_acoustic(self, session: str, model: str) -> None:
+        """Announce the acoustic model that finds a session's phones, if it has changed."""
+        shown = self._sessions.get(session)
+        if shown is not None and shown.acoustic != model:
+            shown.acoustic = model
+            self.forward(session, MessageKind.TEXT, wire.text("acoustic", acoustic=model))
 
     def remove_session(self, session: str) -> None:
         """Announce to a session's viewers that it has ended."""
@@ -226,8 +235,8 @@ class Viewers:
                 viewer.chosen = session
             else:
                 raise UserError(
-                    "expected 'follow' with a session's name, 'play', 'lips', 'express' "
-                    "or 'expressiveness'"
+                    "expected 'follow' with a session's name, 'play', 'lips', 'acoustic', "
+                    "'express' or 'expressiveness'"
                 )
         except UserError as error:
             self._put(viewer, MessageKind.TEXT, wire.error_text(str(error)))
@@ -250,6 +259,7 @@ class Viewers:
                 chosen=viewer.chosen,
                 epoch=session.epoch if session else 0,
                 lips=session.lip_model if session else "",
+                acoustic=session.acoustic if session else "",
                 sample=session is not None and name == viewer.chosen == self._sample,
             )
             self._put(viewer, MessageKind.TEXT, message)

@@ -21,6 +21,7 @@ from kouxing.shared.face.expressions import (
 from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.speech import AcousticModel
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
@@ -135,6 +136,10 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
             raise UserError("express must be an object that maps names to strengths")
         check_expressions(expressions, hold_s)
         settings.update(expressions=expressions, hold_s=hold_s)
+    if (acoustic := fields.get("acoustic")) is not None:
+        if acoustic not in [*AcousticModel]:
+            raise UserError("acoustic must be full or light")
+        settings["acoustic"] = acoustic
     if (amount := fields.get("expressiveness")) is not None:
         settings["expressiveness"] = check_expressiveness(amount)
     return FaceSettings(**settings) if settings else None

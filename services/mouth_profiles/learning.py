@@ -37,10 +37,8 @@ from kouxing.services.mouth_profiles.lip_tracks import (
     lip_measures,
 )
 from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
-from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_frames import delay_for
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor, lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
 
@@ -106,9 +104,9 @@ class ProfileGain:
     curves: Array  # (3, 3, n): measure; tracked, before, after
 
 
-def observe(model: NeuralModel, lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
+def observe(lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
     """Run the lip model over a recording; the result is empty if there is no speech."""
-    (positions,) = record_positions(model, [filmed.samples])
+    positions = record_positions(filmed.samples)
     stream = lip_predictor.create_stream(lip_predictor.delays_s)
     predicted = np.zeros(
         (len(positions.known_s), len(lip_predictor.delays_s), _NUM_FAPS), np.float32
@@ -270,13 +268,8 @@ class LearnedProfile:
 
 def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     """Learn a mouth profile; UserError if there is too little speech with lips in view."""
-    model = load_model()
-    lip_predictor = lip_predictor_for(model)
-    if lip_predictor is None or not isinstance(model, NeuralModel):
-        raise UserError("the shipped lip model and acoustic model do not match; reinstall kouxing")
-    observations = Observations.join(
-        [observe(model, lip_predictor, filmed) for filmed in recordings]
-    )
+    lip_predictor = load_lip_predictor()
+    observations = Observations.join([observe(lip_predictor, filmed) for filmed in recordings])
     return LearnedProfile(
         content=fit_profile(observations).to_bytes(lip_predictor.digest),
         speech_s=len(observations) * POSITION_S,

@@ -1,20 +1,17 @@
 """Record what the recognizer passes to the lip model for whole recordings.
 
-Voice activity detection runs as in the live recognizer. The network therefore restarts at each
-stretch of speech.
+Voice activity detection runs as in the live recognizer.
 """
-
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_predictor import features_at
-from kouxing.services.recognizer.speech_scorer import SpeechScorer, score_streams
+from kouxing.services.recognizer.speech_segmenter import SpeechSegmenter
 from kouxing.shared.phones.events import LipPositions
 
 Floats = NDArray[np.float32]
@@ -31,11 +28,11 @@ class LipInputs:
         self.features: list[NDArray[np.float16]] = []  # of each position, (features,)
 
     def process_position(
-        self, known_s: float, frames: Floats, values: Floats
+        self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Store the network's values at a position."""
+        """Store the ear's features at a position."""
         self.known_s.append(known_s)
-        self.features.append(features_at(frames, values).astype(np.float16))
+        self.features.append(features_at(frames, features).astype(np.float16))
         return []
 
     def reset(self) -> None:
@@ -43,15 +40,10 @@ class LipInputs:
         self.starts.append(len(self.known_s))
 
 
-def record_positions(model: NeuralModel, recordings: Sequence[Floats]) -> list[LipInputs]:
-    """Run the network over recordings, each 16 kHz mono, (n,).
-
-    Processing them together takes half the time. It does not change the values.
-    """
-    positions = [LipInputs() for _ in recordings]
-    scorers = [SpeechScorer(model, recorder) for recorder in positions]
-    for scorer, samples in zip(scorers, recordings, strict=True):
-        scorer.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ))
-        scorer.input_finished()
-    score_streams(model, scorers)
+def record_positions(samples: Floats) -> LipInputs:
+    """Run the small ear over a recording, 16 kHz mono, (n,)."""
+    positions = LipInputs()
+    segmenter = SpeechSegmenter(WhisperMel(), positions)
+    for _ in segmenter.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ)):
+        pass  # the positions are what counts
     return positions

@@ -17,7 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats, Topology
-from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, frames_in
+from kouxing.services.recognizer.front_end.features import (
+    HOP_S,
+    SAMPLE_RATE_HZ,
+    frame_time_s,
+    frames_in,
+)
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
@@ -25,7 +30,7 @@ from kouxing.services.recognizer.search.forced_path import (
     utterance_graph,
     viterbi_path,
 )
-from kouxing.services.recognizer.speech_scorer import WithProgress, frame_time_s
+from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable

@@ -23,10 +23,7 @@ class RecognizerConfig(ServiceConfig):
     """Endpoint to which clients send the audio of sessions that are not paced. Live audio takes
     precedence."""
     acoustic: str = "blocks"
-    """Acoustic model: blocks (fewest errors), neural (half the processor time), gmm, or a file."""
-    look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0
-    """Future audio that the neural model waits for, in ms: 10, 30, 60, 100 or 200. The neural model
-    also runs alongside blocks."""
+    """Acoustic model: blocks (fewest errors), light (for weak machines), gmm, or a file."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
         default_factory=DependentDefault(
             "acoustic",
@@ -45,7 +42,7 @@ class RecognizerConfig(ServiceConfig):
     """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011."""
     max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
     """Seconds that a live session may be behind. If it exceeds this limit for 0.4 s, it skips
-    audio."""
+    audio. From three quarters of the limit, it uses the light acoustic model."""
 
     @property
     def output_rule(self) -> OutputRuleConfig:

@@ -1,7 +1,7 @@
 """The interface of a model that predicts lip frames from the audio.
 
-It gets what the acoustic network computes at every position, 50 times a second during speech, and
-predicts lip frames. A model offers several delays, of which the recognizer chooses one.
+It gets what the small ear computes at every position, 50 times a second during speech, and predicts
+lip frames. A model offers several delays, of which the recognizer chooses one.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class LipFrameStream(Protocol):
     """The lip frames of one session, one segment of speech after the other."""
 
     def process_position(
-        self, known_s: float, frames: NDArray[np.float32], values: NDArray[np.float32]
+        self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
     ) -> list[LipPositions]:
-        """Return the lip frames that follow from what the network computes at a position.
+        """Return the lip frames that follow from what the ear computes at a position.
 
         Parameters
         ----------
@@ -33,8 +33,8 @@ class LipFrameStream(Protocol):
             Media time of the last sample that the position has seen, seconds.
         frames
             Its two newest log-mel frames, shape (2, 80).
-        values
-            Attention values of its layers, shape (layers, heads, size).
+        features
+            The ear's features, shape (features,).
         """
 
     def reset(self) -> None:

@@ -1,28 +1,25 @@
-"""The lip predictor: mouth shapes from the inner values of the acoustic network.
+"""The lip predictor: mouth shapes from the features of the small ear.
 
-Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
-recurrent unit); Hoerl and Kennard 1970, "Ridge regression". The network's layers predict lips
-better than its phones do, as measured in ``models/lips.md``.
+Source: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
+recurrent unit).
 
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
 ======== ============================================================ ==================
-f        a position: its two log-mel frames, and the values of the    (160 + 2 width,)
-         network's last two layers
+f        a position: its two log-mel frames, and the ear's features    (160 + ear's,)
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
 h        state of the gated recurrent unit, driven by u               (units,)
-X        x of the last positions, the newest last; zeros before the   (history, components)
-         segment's first
+l        the ear's own lips, the last of its features                 (lips,)
 y        for each delay the FAPs, and log odds of closure and of      (delays, 17)
          lip to teeth
 ======== ============================================================ ==================
 
-    y = A X + B [h, u] + c
+    y = A l + B [h, u] + c
 
-A is a ridge regression, which generalizes to unseen speakers. B [h, u] follows the training
-speakers more closely. The two are fitted separately and averaged, so A and B contain half of each.
-The odds of a closure are doubled, because a missed closure is more visible than a false one.
+The ear's lips come from many voices, so they follow unseen speakers better, and have the larger
+share of the FAPs. B [h, u] follows the filmed speakers more closely. Closures come only from
+B [h, u]. Their odds are doubled, because a missed closure is more visible than a false one.
 
 There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen
 the audio up to T gives, for every delay d, the mouth at T - d. Every position is one step, so
@@ -34,7 +31,6 @@ Cost: about 4 ms of one core per second of speech.
 from __future__ import annotations
 
 import hashlib
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -42,11 +38,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.mouth_profile import MouthProfile, parse_mouth_profile
 from kouxing.shared.errors import UserError
@@ -54,17 +49,15 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
 
 LIPS_PATH = Path(__file__).parent / "models" / "lips.npz"
-FORMAT = "lips 2"
+FORMAT = "lips 4"
 # FAPs that a camera tracks. The left and the right FAP of a pair have the same value.
 LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 OTHER_SIDE = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
 CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outputs, after the FAPs
 NUM_OUTPUTS = len(LIP_FAPS) + 2
-NUM_LAYERS = 2  # of the network, the last ones
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # of features, components, units
-_MAX_HISTORY = 64
 _COLUMNS = [MOUTH_FAPS.index(fap) for fap in LIP_FAPS]
 _PAIRS = [(MOUTH_FAPS.index(fap), MOUTH_FAPS.index(other)) for fap, other in OTHER_SIDE.items()]
 
@@ -82,7 +75,7 @@ class LipPredictor:
     input_bias: Floats  # (3 units,)
     state_weights: Floats  # (units, 3 units)
     state_bias: Floats  # (3 units,)
-    history_weights: Floats  # (history, components, delays, 17): A, oldest first
+    lip_weights: Floats  # (lips, delays, 17): A
     output_weights: Floats  # (2 units, delays, 17): B
     output_bias: Floats  # (delays, 17): c
 
@@ -96,17 +89,17 @@ class LipPredictor:
         return {}
 
     def weights_of(self, delays: Sequence[int]) -> tuple[Floats, Floats]:
-        """Return A and B for some delays, (history components, delays 17), (2 units, delays 17).
+        """Return A and B for some delays, (lips, delays 17), (2 units, delays 17).
 
         Streams with the same delays share them.
         """
         key = tuple(delays)
         if key not in self._of_delays:
-            history, output = (
+            lips, output = (
                 weights[..., list(delays), :].reshape(-1, len(delays) * NUM_OUTPUTS)
-                for weights in (self.history_weights, self.output_weights)
+                for weights in (self.lip_weights, self.output_weights)
             )
-            self._of_delays[key] = history, output
+            self._of_delays[key] = lips, output
         return self._of_delays[key]
 
     def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
@@ -140,15 +133,14 @@ class LipPredictor:
     def adapt(self, profile: MouthProfile) -> LipPredictor:
         """Adapt the model to one speaker."""
         faps = slice(len(LIP_FAPS))
-        history, output, bias = (
-            weights.copy()
-            for weights in (self.history_weights, self.output_weights, self.output_bias)
+        lips, output, bias = (
+            weights.copy() for weights in (self.lip_weights, self.output_weights, self.output_bias)
         )
-        for weights in (history, output, bias):
+        for weights in (lips, output, bias):
             weights[..., faps] *= profile.scale
         output[..., faps] += profile.residual
         bias[..., faps] += profile.offset
-        return replace(self, history_weights=history, output_weights=output, output_bias=bias)
+        return replace(self, lip_weights=lips, output_weights=output, output_bias=bias)
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle), weights in 16 bits."""
@@ -164,24 +156,21 @@ class LipPredictorStream:
     def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
         self._model = model
         self._delays_s = [model.delays_s[delay] for delay in delays]
-        self._history_weights, self._output_weights = model.weights_of(delays)
+        self._lip_weights, self._output_weights = model.weights_of(delays)
         self._output_bias = model.output_bias[list(delays)]
         self.reset()
 
     def reset(self) -> None:
         """Start a new segment of speech."""
-        history, components = self._model.history_weights.shape[:2]
-        nothing = np.zeros(components, np.float32)
-        self._history = deque([nothing] * history, maxlen=history)
         self._state = np.zeros(len(self._model.state_weights), np.float32)
         # [h, u] at the last position
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
     def process_position(
-        self, known_s: float, frames: Floats, values: Floats
+        self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
         """Return the lip frames that follow from a position; see ``LipFrameStream``."""
-        outputs = self.step(features_at(frames, values))
+        outputs = self.step(features_at(frames, features))
         return [
             LipPositions(
                 time_s=known_s - delay_s,
@@ -198,7 +187,6 @@ class LipPredictorStream:
         model = self._model
         centered = features - model.feature_mean
         component = (centered @ model.projection).astype(np.float32, copy=False)
-        self._history.append(component)
         entered = np.maximum(component @ model.entry_weights + model.entry_bias, 0)
         from_input = entered @ model.input_weights + model.input_bias
         from_state = self._state @ model.state_weights + model.state_bias
@@ -207,16 +195,16 @@ class LipPredictorStream:
         reset, update = gates[:size], gates[size:]
         new = np.tanh(from_input[2 * size :] + reset * from_state[2 * size :])
         self._state = (1 - update) * new + update * self._state
-        linear = np.concatenate(self._history) @ self._history_weights
+        from_lips = features[-len(model.lip_weights) :] @ self._lip_weights
         self.inner = np.concatenate([self._state, entered])
         recurrent = self.inner @ self._output_weights
-        outputs: Floats = (linear + recurrent).reshape(self._output_bias.shape)
+        outputs: Floats = (from_lips + recurrent).reshape(self._output_bias.shape)
         return outputs + self._output_bias
 
 
-def features_at(frames: Floats, values: Floats) -> Floats:
-    """Return a position's features, (160 + 2 width,), from its frames and values."""
-    return np.concatenate([frames, values[-NUM_LAYERS:]], axis=None)
+def features_at(frames: Floats, features: Floats) -> Floats:
+    """Join a position's frames, (2, 80), with the ear's features."""
+    return np.concatenate([frames, features], axis=None)
 
 
 def mouth_faps(lips: Floats) -> Floats:
@@ -242,20 +230,13 @@ def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
         form = str(archive.array("format", ()))
         if form != FORMAT:
             raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
-        return lip_predictor_from(archive)
+        predictor = lip_predictor_from(archive)
+        num_features = FRAMES_PER_POSITION * NUM_MELS + load_ear().num_features
+        if len(predictor.feature_mean) != num_features:
+            raise ValueError("it was trained for another ear")
+        return predictor
     except ValueError as error:
         raise UserError(f"lip predictor {path}: {error}; train it again") from error
-
-
-def lip_predictor_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | None:
-    """Read the predictor for an acoustic model; None if it was trained for another one."""
-    network = model.early if isinstance(model, TwoNetworks) else model
-    if not isinstance(network, NeuralModel):
-        return None
-    lip_predictor, sizes = load_lip_predictor(path), network.session.sizes
-    width = sizes.num_heads * sizes.head_size
-    fits = len(lip_predictor.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + NUM_LAYERS * width
-    return lip_predictor if fits else None
 
 
 def lip_predictor_from(archive: Archive) -> LipPredictor:
@@ -269,9 +250,9 @@ def lip_predictor_from(archive: Archive) -> LipPredictor:
     if num_features <= FRAMES_PER_POSITION * NUM_MELS:
         raise ValueError(f"it takes {num_features} features per position")
     _, units = _sizes(archive, "entry_weights", 2)
-    history = _sizes(archive, "history_weights", 4)[0]
-    if history > _MAX_HISTORY:
-        raise ValueError(f"it looks back {history} positions")
+    num_lips = _sizes(archive, "lip_weights", 3)[0]
+    if num_lips > num_features:
+        raise ValueError(f"it takes {num_lips} lips of {num_features} features")
     outputs = (len(delays), NUM_OUTPUTS)
     return LipPredictor(
         delays=delays,
@@ -283,7 +264,7 @@ def lip_predictor_from(archive: Archive) -> LipPredictor:
         input_bias=archive.floats("input_bias", 3 * units),
         state_weights=archive.floats("state_weights", units, 3 * units),
         state_bias=archive.floats("state_bias", 3 * units),
-        history_weights=archive.floats("history_weights", history, num_components, *outputs),
+        lip_weights=archive.floats("lip_weights", num_lips, *outputs),
         output_weights=archive.floats("output_weights", 2 * units, *outputs),
         output_bias=archive.floats("output_bias", *outputs),
     )

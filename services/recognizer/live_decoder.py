@@ -4,10 +4,9 @@ Source: Li et al. 2011, sections 1 and 2.2.
 
 The shortest delay from a phone's onset to its first hypothesis is
 25 ms window + L * 10 ms + (N - 1) * 10 ms. L is the acoustic model's look-ahead in frames, and N is
-``num_stable_frames``. With L = 1 and N = 1, it is 35 ms. A neural model scores two frames at a
-time, so half of the frames come 10 ms sooner. When speech starts, the VAD adds up to 32 ms. For
-input above 16 kHz, the resampler adds 2 ms. The paper has N = 3 and differences that look 40 ms
-ahead, so its delay is 85 ms. It states 45 ms, without the differences.
+``num_stable_frames``. The block network runs every 40 ms, so L is 1 to 4. When speech starts, the
+VAD adds up to 60 ms. For input above 16 kHz, the resampler adds 2 ms. The paper has N = 3 and
+differences that look 40 ms ahead, so its delay is 85 ms. It states 45 ms, without the differences.
 """
 
 from __future__ import annotations
@@ -25,16 +24,14 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Topology,
     empty_scores,
 )
-from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.front_end.features import HOP_S, frame_time_s
 from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import (
     FrameScores,
     ScoreEvent,
-    SpeechEnd,
-    SpeechStart,
-    frame_time_s,
 )
+from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
 
 FINALIZE_AFTER_S = 0.2  # after a phone's end; waiting longer corrects nothing more

@@ -10,16 +10,15 @@ from collections.abc import Iterable
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.speech_scorer import (
     FrameScores,
     ScoreEvent,
-    SpeechEnd,
-    SpeechStart,
     WithProgress,
-    frame_time_s,
     score_recording,
 )
+from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.phones.events import Phone
 
 

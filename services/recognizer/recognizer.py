@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
+from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder
@@ -28,7 +28,7 @@ class Recognizer:
 
     Examples
     --------
-    >>> recognizer = Recognizer(load_live_model())
+    >>> recognizer = Recognizer(load_model())
     >>> stream = recognizer.create_stream(sample_rate_hz=48_000)
     >>> for chunk in microphone:
     ...     stream.accept_waveform(chunk)
@@ -56,7 +56,7 @@ class Recognizer:
         sample_rate_hz, num_channels
             Of the audio: 8000 to 48000 Hz; channels are averaged.
         lip_predictor
-            Predicts lip frames; the acoustic model must have positions. None: no lip frames.
+            Predicts lip frames. Without it, there are no lip frames.
         face_delay_s
             Delay of the face behind the audio. The lip frames get the longest delay that is in
             time for the face.
@@ -82,7 +82,7 @@ class Recognizer:
 
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:
         """Decode all audio that the streams have accepted; the model scores it in batches."""
-        score_streams(self.model, [scorer for stream in streams for scorer in stream.scorers])
+        score_streams([scorer for stream in streams for scorer in stream.scorers])
         for stream in streams:
             stream.decode()
 
@@ -98,4 +98,4 @@ class Recognizer:
         decoder.advance(scores)
         decoder.drop_records()
         decoder.final_path()
-        VoiceActivityDetector().detect(np.zeros(BLOCK_SAMPLES, np.float32))
+        load_ear()

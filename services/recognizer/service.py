@@ -15,11 +15,11 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
@@ -29,7 +29,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
-from kouxing.shared.phones.events import SpeechChange, Waveform
+from kouxing.shared.phones.events import Progress, SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
@@ -78,19 +78,12 @@ class RecognizerService(Service):
             "unpaced_audio": config.reachable(self._unpaced_audio.endpoint),
         }
         with ThreadPoolExecutor(max_workers=1) as executor:  # a restart must be quick
-            loading = executor.submit(
-                load_live_model, config.acoustic, look_ahead_ms=config.look_ahead_ms
-            )
+            loading = executor.submit(load_model, config.acoustic)
             load_numba()
             model = loading.result()
         self._recognizer = Recognizer(model, config.output_rule)
         self.facts = SessionFacts(language=model.inventory.language)
-        self._lip_predictor = lip_predictor or lip_predictor_for(model)
-        if self._lip_predictor is None:
-            LOG.warning(
-                "this acoustic model has no lip predictor, so the lip model learnt uses dynamic "
-                "visemes; set synthesizer.lips = dynamic-visemes to use their delay too"
-            )
+        self._lip_predictor = lip_predictor or load_lip_predictor()
         self._recognizer.warm_up()
         for socket in (self._audio, self._unpaced_audio):
             self.register(socket, {AudioChunk: partial(self._on_audio, socket)})
@@ -238,11 +231,12 @@ class RecognizerService(Service):
         }
 
     def gauges(self) -> dict[str, float]:
-        """Return the duration of queued audio and the number of unacknowledged messages."""
+        """Return figures about queued audio, unacknowledged messages and the light model."""
         backlogs = [session.link.backlog for session in self._sessions.values()]
         return {
             "queued_audio_seconds": self._live_audio_s + self._unpaced.duration_s,
             "unacknowledged_messages": max(backlogs, default=0),
+            "light_sessions": sum(session.stream.is_light for session in self._sessions.values()),
         }
 
     # --- audio -----------------------------------------------------------------------------------
@@ -421,6 +415,8 @@ class RecognizerService(Service):
         """
         now_s = time.monotonic()
         results = session.new_results(self._recognizer)
+        if (acoustic := session.acoustic_message(results)) is not None:
+            session.replay.send(acoustic, now_s)
         for result in results:
             published = session.published_message(result)
             if published is not None:
@@ -430,6 +426,10 @@ class RecognizerService(Service):
         for result in results:
             if not isinstance(result, Waveform):
                 session.link.send(message_of(result), now_s)
+            if isinstance(result, Progress) and result.is_laughter != session.is_laughing:
+                session.is_laughing = result.is_laughter
+                name = EventName.LAUGHTER_START if result.is_laughter else EventName.LAUGHTER_STOP
+                self.publish_event(name, session.name, media_time=to_samples(result.time_s))
 
     def _on_joined(self, session: str) -> None:
         joined = self._sessions.get(session)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import secrets
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 from kouxing.services.recognizer.audio_order import AudioOrder
 from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
@@ -27,13 +29,15 @@ from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
-from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
+from kouxing.shared.wire.speech import Acknowledge, Acoustic, AcousticModel, AudioState, Progress
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
 ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
 STALLED_AFTER_S = 0.2  # without audio of a live client
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
+M = TypeVar("M", bound=Message)
+
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
 
 
@@ -95,6 +99,8 @@ class RecognizerSession:
         self.without_audio_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
+        self.is_laughing = False  # the person who speaks
+        self._published_acoustic = AcousticModel.FULL
         self.sequence_out = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
@@ -160,6 +166,8 @@ class RecognizerSession:
     def accept_waveform(self, max_s: float, now_s: float) -> None:
         """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old."""
         has_skipped = self.audio.skip_old(now_s)
+        is_light = self.face.settings.acoustic == AcousticModel.LIGHT
+        self.stream.set_light(is_light or self.audio.overload.needs_light_model(now_s))
         for media_time, samples in self.audio.take(max_s):
             if has_skipped:
                 self.stream.skip_to(media_time)
@@ -213,6 +221,18 @@ class RecognizerSession:
             message = message_of(result)
         else:
             return None
+        return self._numbered(message)
+
+    def acoustic_message(self, results: Sequence[StreamOutput]) -> Acoustic | None:
+        """Return the message about the acoustic model in use, if it is due with some results."""
+        model = AcousticModel.LIGHT if self.stream.is_light else AcousticModel.FULL
+        starts = any(isinstance(result, SpeechChange) and result.active for result in results)
+        if model == self._published_acoustic and not starts:
+            return None
+        self._published_acoustic = model
+        return self._numbered(Acoustic(model=model, media_time=self.stream.media_time))
+
+    def _numbered(self, message: M) -> M:
         self.sequence_out += 1
         return replace(
             message, session=self.name, epoch=self.start.epoch, sequence=self.sequence_out

@@ -1,10 +1,8 @@
 """Audio to state scores of speech: what live and offline recognition share.
 
-    samples -> VAD, front end -> [speech only] acoustic model -> events
+    samples -> speech segmenter -> [speech only] acoustic model -> events
 
-Time is media time, counted from the first sample of the scorer. Feature frame ``t`` covers the
-10 ms around the middle of its window. Any chunking of the same audio gives the same result, because
-every step processes whole frames and whole VAD blocks, in order.
+Any chunking of the same audio gives the same result.
 """
 
 from __future__ import annotations
@@ -16,12 +14,23 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats, Work
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticModel,
+    AcousticStream,
+    Floats,
+    Work,
+)
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
+from kouxing.services.recognizer.speech_segmenter import (
+    SpeechEnd,
+    SpeechFrames,
+    SpeechSegmenter,
+    SpeechStart,
+)
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,
@@ -29,27 +38,6 @@ from kouxing.shared.phones.events import (
     Progress,
     Waveform,
 )
-
-PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
-_FIRST_NEWEST_FRAME = 2  # the newest frame that the network's first position sees
-# Speech starts at an odd frame. So every position ends POSITION_LAG_S before a multiple of 20 ms.
-_FIRST_FRAME_PARITY = 1
-_BLOCK_FRAMES = 10  # of the longest blocks of a network; they start with the speech
-_PRE_ROLL_FRAMES = round((PRE_ROLL_S + BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
-
-
-@dataclass(frozen=True, slots=True)
-class SpeechStart:
-    """Speech starts. Its first scored frame is ``frame``."""
-
-    frame: int
-
-
-@dataclass(frozen=True, slots=True)
-class SpeechEnd:
-    """Speech has ended before ``frame``."""
-
-    frame: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,30 +61,13 @@ ScoreEvent: TypeAlias = (
 )
 
 
-def frame_time_s(frame: int) -> float:
-    """Time of the boundary before a feature frame: halfway between two windows' middles."""
-    return frame * HOP_S + (WINDOW_S - HOP_S) / 2
-
-
-def frame_at(time_s: float) -> int:
-    """Return the feature frame whose preceding boundary is nearest to a time."""
-    return round((time_s - (WINDOW_S - HOP_S) / 2) / HOP_S)
-
-
 class SpeechScorer:
     """Scores the speech of one session.
 
     ``accept_waveform`` queues the audio, ``score_streams`` scores it together with other sessions'
     audio, and ``get_events`` returns the results in order.
 
-    Parameters
-    ----------
-    model, lip_stream
-        The acoustic model must have positions if there are lip frames.
-    start_frame
-        Frame at which speech started, if another recognizer processed its start; negative before
-        the audio. The first speech then starts where the network's blocks align with those of the
-        other recognizer.
+    The parameters besides the model are those of :class:`SpeechSegmenter`.
     """
 
     def __init__(
@@ -105,35 +76,43 @@ class SpeechScorer:
         lip_stream: LipFrameStream | None = None,
         start_frame: int | None = None,
     ) -> None:
-        self._stream = model.create_stream(keep_positions=lip_stream is not None)
-        self._lip_stream = lip_stream
-        self._detector = VoiceActivityDetector()
-        self._start_frame = start_frame
-        self._front_end = model.create_front_end()
-        self._block = np.empty(0, np.float32)  # of the VAD, incomplete
-        self._recent: deque[Floats] = deque(maxlen=_PRE_ROLL_FRAMES + _BLOCK_FRAMES - 1)
-        self._num_frames = 0
-        self._speaking = False
+        self._own: AcousticStream = model.create_stream()
+        self._stream = self._own  # the one in use
+        light = model.light if isinstance(model, BlockModel) else None
+        self._light = light.create_stream() if light else None
+        front_end = WhisperMel() if self._own.uses_ear else model.create_front_end()
+        self._segmenter = SpeechSegmenter(front_end, lip_stream, start_frame)
+        self._needs_light = False  # whether the light model scores the next speech
         # Frames to score, and events in order. The first item is to be scored; SpeechEnd is too.
-        self._queue: deque[Floats | ScoreEvent] = deque()
+        self._queue: deque[SpeechFrames | ScoreEvent] = deque()
         self._events: list[ScoreEvent] = []  # not yet returned
-        self._next_newest = 0  # frame at which the network's next position ends
+        self._num_unscored = 0  # frames of the current speech without settled scores
+
+    @property
+    def is_light(self) -> bool:
+        """Whether the light model scores the speech."""
+        return self._stream.uses_ear
+
+    def set_light(self, is_light: bool) -> None:
+        """Use the light model, or the session's own model from the next start of speech on."""
+        self._needs_light = is_light
+        if not is_light or self._light is None or self.is_light or self._queue:
+            return
+        provisional = self._stream.provisional
+        if len(provisional):
+            self._events.append(FrameScores(provisional, provisional[:0]))
+        self._own.reset()
+        self._light.start(self._num_unscored - len(provisional))
+        self._stream = self._light
 
     def accept_waveform(self, samples: Floats) -> None:
         """Queue samples, 16 kHz mono, shape (n,)."""
-        while len(samples):  # cut at the ends of the VAD's blocks
-            piece = samples[: BLOCK_SAMPLES - len(self._block)]
-            samples = samples[len(piece) :]
-            self._block = np.concatenate([self._block, piece])
-            self._queue_frames(self._front_end.accept_waveform(piece))
-            if len(self._block) == BLOCK_SAMPLES:
-                self._detect_speech()
-                self._block = self._block[:0]
+        self._queue.extend(self._segmenter.accept_waveform(samples))
+        self._release_events()
 
     def input_finished(self) -> None:
         """End the audio."""
-        if self._speaking:
-            self._end_speech()
+        self._queue.extend(self._segmenter.input_finished())
 
     def add_event(self, event: ScoreEvent) -> None:
         """Queue an event, to be returned after the results of the audio so far."""
@@ -145,90 +124,57 @@ class SpeechScorer:
         """Whether there is audio to score."""
         return bool(self._queue)
 
+    @property
+    def is_laughter(self) -> bool:
+        """Whether someone laughs at the end of the queued audio."""
+        return self._segmenter.is_laughter
+
+    @property
+    def model(self) -> AcousticModel:
+        """The model that scores the next audio."""
+        return self._stream.model
+
     def get_events(self) -> list[ScoreEvent]:
         """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
-    def _queue_frames(self, frames: Floats) -> None:
-        """Queue the front end's frames, shape (n, k), if they are speech.
-
-        Each piece ends with a position, so that any chunking gives the same provisional scores.
-        """
-        if not self._speaking:
-            self._num_frames += len(frames)
-            self._recent.extend(frames)
-            return
-        while len(frames):
-            piece = frames[: FRAMES_PER_POSITION - self._num_frames % FRAMES_PER_POSITION]
-            frames = frames[len(piece) :]
-            self._num_frames += len(piece)
-            self._queue.append(piece)
-
-    def _detect_speech(self) -> None:
-        """Start or end speech, depending on the complete VAD block."""
-        is_speech = self._detector.detect(self._block).is_speech
-        first = self._first_frame()
-        if is_speech and not self._speaking and self._num_frames - first >= FRAMES_PER_POSITION:
-            self._speaking = True
-            self._start_frame = None
-            self.add_event(SpeechStart(first))
-            self._queue.append(np.array(self._recent)[first - self._num_frames :])
-            self._recent.clear()
-        elif self._speaking and not is_speech:
-            self._end_speech()
-
-    def _first_frame(self) -> int:
-        """Return the frame at which speech starts if it is detected now."""
-        oldest = self._num_frames - len(self._recent)
-        first = max(oldest, self._num_frames - _PRE_ROLL_FRAMES)
-        first += (_FIRST_FRAME_PARITY - first) % FRAMES_PER_POSITION
-        if self._start_frame is not None:
-            first -= (first - self._start_frame) % _BLOCK_FRAMES
-            first += _BLOCK_FRAMES * (first < oldest)
-        return first
-
-    def _end_speech(self) -> None:
-        self._speaking = False
-        self._queue.append(SpeechEnd(self._num_frames))
-
     def _release_events(self) -> None:
         """Make the events available that no queued audio precedes."""
-        while self._queue and not isinstance(event := self._queue[0], np.ndarray | SpeechEnd):
+        while self._queue and not isinstance(event := self._queue[0], SpeechFrames | SpeechEnd):
             self._queue.popleft()
-            if isinstance(event, SpeechStart):
-                self._next_newest = event.frame + _FIRST_NEWEST_FRAME
-                if self._lip_stream is not None:
-                    self._lip_stream.reset()
             self._events.append(event)
+            if isinstance(event, SpeechStart):
+                self._stream = (self._needs_light and self._light) or self._own
+                self._num_unscored = 0
 
     def next_work(self) -> Work:
         """Return the audio to score next."""
-        item = self._queue[0]
-        self._last_provisional = self._stream.provisional
-        return self._stream, item if isinstance(item, np.ndarray) else None
+        item, stream = self._queue[0], self._stream
+        self._last_provisional = stream.provisional
+        if not isinstance(item, SpeechFrames):
+            return stream, None
+        self._num_unscored += len(item.features)
+        return stream, item.phones if stream.uses_ear else item.features
 
     def add_scores(self, settled: Floats) -> None:
         """Add the settled scores of ``next_work``, (m, states)."""
         item, provisional = self._queue.popleft(), self._stream.provisional
+        self._num_unscored -= len(settled)
         if len(settled) or provisional is not self._last_provisional:
             self._events.append(FrameScores(settled, provisional))
-        if isinstance(item, SpeechEnd):  # positions at the end see repeated frames, not audio
+        if isinstance(item, SpeechEnd):
             self._events.append(item)
-        elif self._lip_stream is not None:
-            for position in self._stream.positions:
-                known_s = self._next_newest * HOP_S + WINDOW_S
-                self._events += self._lip_stream.process_position(known_s, *position)
-                self._next_newest += FRAMES_PER_POSITION
-        self._stream.positions.clear()
         self._release_events()
 
 
-def score_streams(model: AcousticModel, scorers: Sequence[SpeechScorer]) -> None:
-    """Score the queued audio of several sessions, in batches."""
+def score_streams(scorers: Sequence[SpeechScorer]) -> None:
+    """Score the queued audio of several sessions, in one batch for each model."""
     while ready := [scorer for scorer in scorers if scorer.is_ready]:
-        scores = model.score([scorer.next_work() for scorer in ready])
-        for scorer, settled in zip(ready, scores, strict=True):
+        model = ready[0].model
+        batch = [scorer for scorer in ready if scorer.model is model]
+        scores = model.score([scorer.next_work() for scorer in batch])
+        for scorer, settled in zip(batch, scores, strict=True):
             scorer.add_scores(settled)
 
 
@@ -261,7 +207,7 @@ def score_recording(
 
     def score(more: Floats) -> list[ScoreEvent]:
         scorer.accept_waveform(more)
-        score_streams(model, [scorer])
+        score_streams([scorer])
         return scorer.get_events()
 
     for start in with_progress(range(0, len(samples), sample_rate_hz)):

@@ -13,13 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.pcm import SLICE, progress_at, slices
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.lip_frames import LipFrameModel, delay_for
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import SpeechScorer, frame_at
+from kouxing.services.recognizer.speech_scorer import SpeechScorer
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones.events import (
     AudioSkipped,
@@ -55,6 +56,7 @@ class SpeechStream:
         speech_time: int,
     ) -> None:
         self.num_gaps = 0  # so far
+        self._needs_light_model = False
         self._model = model
         self._rule = rule
         self._rate_hz = sample_rate_hz
@@ -68,6 +70,19 @@ class SpeechStream:
         self._is_speaking = False
         self._results: list[StreamOutput] = []  # not yet returned
         self._segments = [self._new_segment(0)]  # those with results to come; the last takes audio
+
+    @property
+    def is_light(self) -> bool:
+        """Whether the light model finds the phones."""
+        return self._segments[-1].scorer.is_light
+
+    def set_light(self, is_light: bool) -> None:
+        """Use the light model, or the session's own model from the next start of speech on.
+
+        All audio so far must be decoded.
+        """
+        self._needs_light_model = is_light
+        self._segments[-1].scorer.set_light(is_light)
 
     @property
     def media_time(self) -> int:
@@ -163,10 +178,12 @@ class SpeechStream:
         if self._speech_time and self._first_chunk is not None:
             start_frame = frame_at(to_seconds(self._speech_time - media_time))
             self._speech_time = 0
+        scorer = SpeechScorer(self._model, lip_stream, start_frame)
+        scorer.set_light(self._needs_light_model)
         return _Segment(
             media_time,
             Resampler(self._rate_hz, self._num_channels),
-            SpeechScorer(self._model, lip_stream, start_frame),
+            scorer,
             LiveDecoder(self._model.topology, self._rule),
         )
 
@@ -209,7 +226,8 @@ class _Segment:
             self.scorer.accept_waveform(piece)
             if self._num_samples % SLICE == 0:
                 newest = np.concatenate(self._slice)
-                self.scorer.add_event(progress_at(self.media_time, newest, self._pitch))
+                progress = progress_at(self.media_time, newest, self._pitch)
+                self.scorer.add_event(replace(progress, is_laughter=self.scorer.is_laughter))
                 self._slice.clear()
 
     def decode(self) -> list[StreamOutput]:

@@ -32,6 +32,7 @@ from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expression_motion import JAW, mix
+from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import (
     AudioSkipped,
@@ -54,6 +55,7 @@ _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
 _REHEARSAL_S = 1.6
 _MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # of mouth FAPs, of other FAPs
 _BIND_S = 0.04  # after this part of a transition, lips close fully for speech
+_LAUGHTER_HOLD_S = 0.2  # after the last report of laughter
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
 _ROUNDING = 0.01  # tolerance of media times, in frames
 
@@ -93,6 +95,7 @@ class FaceAnimator:
         self._delay_s = delay_s
         self._expressiveness = Expressiveness(expressiveness)
         self._expression = SpeechExpression()
+        self._laughter = SpeechExpression()
         self._idle_motion = SpeechIdleMotion(idle_motion_seed) if idle_motion_seed else None
         self._num_frames = 0  # including frames at rest
         self._first_shown = 0  # earlier frames are rehearsals
@@ -243,6 +246,10 @@ class FaceAnimator:
             self._changes.append(event)
         elif isinstance(event, Progress):
             self._levels.append((event.time_s, event.level_db))
+            if event.is_laughter:
+                self._laughter.show({ExpressionName.JOY: 1.0}, _LAUGHTER_HOLD_S)
+                if self._laughter not in self._modifiers:
+                    self._modifiers.append(self._laughter)
             if event.pitch_hz > 0.0:
                 self._pitches.append((event.time_s, event.pitch_hz))
 

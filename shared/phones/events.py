@@ -65,6 +65,7 @@ class Progress:
     level_db: float  # RMS of the newest 20 ms, full scale = 0
     zero_crossing_rate: float = 0.0  # sign changes per sample in the newest 20 ms, 0 to 1
     pitch_hz: float = 0.0  # in the newest 20 ms; 0: unvoiced
+    is_laughter: bool = False  # laughter is not speech
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,6 +37,8 @@ class EventName(StrEnum):
 
     AUDIO_SKIPPED = "audio-skipped"
     ERROR = "error"
+    LAUGHTER_START = "laughter-start"
+    LAUGHTER_STOP = "laughter-stop"
     RECORDED = "recorded"
     SERVICE_LOST = "service-lost"
     SERVICE_READY = "service-ready"

@@ -74,6 +74,7 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 level_db=event.level_db,
                 zero_crossing_rate=event.zero_crossing_rate,
                 pitch_hz=event.pitch_hz or None,
+                is_laughter=event.is_laughter,
             )
         case events.AudioSkipped():
             return Progress(media_time=to_samples(event.time_s), state=AudioState.SKIPPED)
@@ -119,4 +120,5 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
                 level_db=message.level_db,
                 zero_crossing_rate=message.zero_crossing_rate,
                 pitch_hz=message.pitch_hz or 0.0,
+                is_laughter=message.is_laughter,
             )

@@ -27,6 +27,7 @@ class FaceSettings:
     """How a session's face moves. A setting without a value does not change."""
 
     lip_model: Name | None = None
+    acoustic: Name | None = None  # an acoustic model: light, or full
     expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (
         None  # scales the mouth's motion; 1: as the lip model moves it
     )
@@ -40,6 +41,7 @@ class FaceSettings:
         expressed = self if change.expressions is None else change
         return FaceSettings(
             lip_model=change.lip_model or self.lip_model,
+            acoustic=change.acoustic or self.acoustic,
             expressiveness=change.expressiveness or self.expressiveness,
             expressions=expressed.expressions,
             hold_s=expressed.hold_s,

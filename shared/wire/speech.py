@@ -32,6 +32,13 @@ class AudioState(StrEnum):
     ENDED = "ended"  # no more results follow
 
 
+class AcousticModel(StrEnum):
+    """The acoustic models of a session."""
+
+    FULL = "full"  # the recognizer's
+    LIGHT = "light"  # fewer right phones, in less time
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Speech(Message):
     """Voice activity started (active) or ended at media_time."""
@@ -39,6 +46,15 @@ class Speech(Message):
     published_at: ClassVar[str | None] = "phones"
 
     active: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acoustic(Message):
+    """The acoustic model that finds the phones from now on. Repeated when speech starts."""
+
+    published_at: ClassVar[str | None] = "phones"
+
+    model: Name = AcousticModel.FULL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +99,7 @@ class Progress(Message):
     level_db: Annotated[float, Meta(ge=-200, le=20)] = -200.0  # RMS of the newest 20 ms, dBFS
     zero_crossing_rate: Probability = 0.0  # sign changes per sample in the newest 20 ms
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
+    is_laughter: bool = False  # someone laughs, which is not speech
     # Of the lost synthesizer: the new one continues after it. In the first message of an epoch
     newest_frame: NewestFrame | None = None
 

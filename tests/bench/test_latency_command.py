@@ -27,9 +27,8 @@ def test_prints_and_writes_the_same_figures(
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
     assert latency["sound_to_frame_ms"]["p50"] > latency["delay_ms"]
     assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
-    kinds = [f"{number}{lips}" for number in (1,) for lips in ("", " with lips")]
     assert list(latency["sessions"]) == [
-        f"{name}, {kind}" for name in ("neural", "blocks") for kind in kinds
+        f"{name}, 1{lips}" for name in ("blocks", "light") for lips in ("", " with lips")
     ]
     assert all(cost > 0 for cost in latency["sessions"].values())
     rendering = latency["rendering"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.live_faces import live_events, live_frames
 from kouxing.services.live_chain import LiveChain
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import to_samples
@@ -146,7 +146,7 @@ def test_services_send_the_frames_of_the_chain(
     samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:48000], rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
     sent = stream(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
-    chain = LiveChain(load_live_model(), load_lip_model(), sample_rate_hz=rate_hz)
+    chain = LiveChain(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
     assert sent.times == [to_samples(time_s) for time_s, _ in frames]
@@ -189,10 +189,10 @@ def lips_of(sent: Stream) -> list[speech.LipPositions]:
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     samples = samples_of_file(VOWELS_FILE)
-    chain = LiveChain(load_live_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
+    chain = LiveChain(load_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
     frames = chain.accept_waveform(samples) + chain.input_finished()
     delay_s = SynthesizerConfig().delay_ms / 1e3
-    events = live_events(load_live_model(), samples, None, [delay_s])
+    events = live_events(load_model(), samples, None, [delay_s])
     scored = live_frames(LIPS, events[delay_s], delay_s)
     np.testing.assert_array_equal(scored[:, MOUTH], np.array([faps[MOUTH] for _, faps in frames]))
     assert scored[:, MOUTH].any()

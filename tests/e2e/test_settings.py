@@ -16,7 +16,7 @@ from kouxing.evaluation.system.live import Seen, speak
 from kouxing.services.control.load import MIN_SESSIONS, RETRY_AFTER_S
 from kouxing.services.kinds import KINDS
 from kouxing.services.live_chain import LiveChain
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.config import variable
@@ -44,7 +44,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
-    chain = LiveChain(load_live_model(), load_lip_model(name=lips), synthesizer=FACE)
+    chain = LiveChain(load_model(), load_lip_model(name=lips), synthesizer=FACE)
     frames = chain.accept_waveform(SAMPLES) + chain.input_finished()
     return np.array([faps for _, faps in frames])
 

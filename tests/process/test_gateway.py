@@ -21,6 +21,7 @@ from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionStarted
 from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.session import CloseSession, FlushSession
+from kouxing.shared.wire.speech import Acoustic
 from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (
     FACE,
@@ -129,6 +130,11 @@ async def test_viewers_receive_their_session(control: FakeControl, gateway: Gate
         assert binary[2][16:] == b"\x01\x00\xff\x7f"
         symbols = {text["type"]: text.get("symbol") for text in texts}
         assert symbols == {"speech": None, "phone": "iao", "syllable": "yao"}
+        control.publish(control.phones, Acoustic(session="one", epoch=EPOCH, model="light"))
+        await receive_json(newest, "acoustic", acoustic="light")
+        await newest.send_json({"acoustic": "full"})
+        await until(lambda: control.of(SetFace))
+        assert control.of(SetFace)[-1].face.acoustic == "full"
 
         await other.send_json({"follow": "one"})
         await receive_json(other, "session", session="one")

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kouxing.services.lip_models import lip_model_info
-from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
@@ -32,10 +32,8 @@ JAW, EYELID, HEAD_PITCH, LOWER_LIP = 3, 19, 48, 5  # FAPs
 def events() -> tuple[SoundEvent, ...]:
     """Return a live recognizer's output for a sentence with many closures."""
     samples, _ = read_audio(DEMO / "bilabials-female.wav")
-    model = load_live_model()
-    outputs = recognize_live(
-        model, samples, lip_predictor=lip_predictor_for(model), face_delay_s=0.06
-    )
+    model = load_model()
+    outputs = recognize_live(model, samples, lip_predictor=load_lip_predictor(), face_delay_s=0.06)
     return tuple(event for event in outputs if not isinstance(event, Waveform))
 
 

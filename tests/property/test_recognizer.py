@@ -1,27 +1,19 @@
 """Chunks and other sessions do not affect results; invariants of search and output rule."""
 
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kouxing.corpora.scoring import count_errors
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
-from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import (
-    FrameScores,
-    SpeechEnd,
-    SpeechStart,
-    score_recording,
-)
+from kouxing.services.recognizer.speech_scorer import FrameScores, SpeechEnd, SpeechStart
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Waveform
 from tests.live_streams import LiveStream
@@ -37,8 +29,8 @@ def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
 
 
 @cache
-def the_model(name: str = "neural") -> AcousticModel:
-    return load_model(model_path(name))
+def the_model(name: str = "blocks") -> AcousticModel:
+    return load_model(name)
 
 
 def last_phone_after(decoder: Decoder, row: np.ndarray) -> LastPhone:
@@ -92,7 +84,7 @@ def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
 
 
 @settings(max_examples=30)
-@given(cuts=CUTS, name=st.sampled_from(["gmm", "neural"]))
+@given(cuts=CUTS, name=st.sampled_from(["gmm", "blocks"]))
 def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
     model = the_model(name)
     front_end = model.create_front_end()
@@ -141,25 +133,33 @@ def test_a_search_continues_from_the_state_of_another(
         assert decoder.final_path() == one.final_path()
 
 
+def scores_of(topology: Topology, phones: list[str], frames_per_state: int) -> np.ndarray:
+    """Make scores that only fit some phones."""
+    states = [
+        state
+        for phone in (topology.inventory.index[symbol] for symbol in phones)
+        for state in range(topology.first_state[phone], topology.first_state[phone + 1])
+    ]
+    rows = np.full((len(states), topology.num_states), -20.0, np.float32)
+    rows[np.arange(len(states)), states] = 0.0
+    return rows.repeat(frames_per_state, axis=0)
+
+
 def test_withdraws_surplus_phones() -> None:
-    model = the_model()
-    events = score_recording(model, HELLO, 16_000)
-    rows = np.concatenate([event.settled for event in events if isinstance(event, FrameScores)])
-    decoder = LiveDecoder(model.topology, OutputRuleConfig(1, 0.0))
+    topology = the_model().topology
+    rows = scores_of(topology, ["h", "ao", "m", "a"], 10)
+    other = scores_of(topology, ["b", "a", "d", "e", "g", "u"], 1)
+    decoder = LiveDecoder(topology, OutputRuleConfig(1, 0.0))
     outputs = decoder.decode([SpeechStart(0)])
-    for start in range(0, len(rows), 10):  # provisional scores of other sounds
-        other = np.roll(rows, 50, axis=0)[start : start + 20]
+    for start in range(0, len(rows), 10):
         outputs += decoder.decode([FrameScores(rows[start : start + 10], other)])
-    outputs += decoder.decode([SpeechEnd(len(rows))])
+    outputs += decoder.decode([FrameScores(rows[:0], other[:0]), SpeechEnd(len(rows))])
     phones = [output for output in outputs if isinstance(output, Phone)]
     finals = [phone for phone in phones if phone.final]
     assert [phone.index for phone in finals] == list(range(len(finals)))
     assert {phone.index for phone in phones} == {phone.index for phone in finals}
     withdrawn = [phone for phone in finals if phone.is_withdrawn]
     assert len(withdrawn) > 1
-    assert {phone.symbol for phone in withdrawn} == {model.inventory.silence}
-    left = [phone for phone in finals if not phone.is_withdrawn]
-    for one, two in pairwise(left):
-        assert one.onset_s + one.duration_s <= two.onset_s + 1e-9
-    expected = [phone.symbol for phone in recognize(model, HELLO, 16_000)]
-    assert count_errors(expected[1:], [phone.symbol for phone in left]).rate < 0.2
+    assert {phone.symbol for phone in withdrawn} == {topology.inventory.silence}
+    spoken = [phone.symbol for phone in finals if phone.is_spoken]
+    assert spoken == ["h", "ao", "m", "a"]

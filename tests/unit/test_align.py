@@ -9,7 +9,7 @@ import pytest
 import typer
 
 from kouxing.services.cli.offline import align
-from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import (
     align_syllables,
     align_text,
@@ -89,7 +89,7 @@ def test_rejects_a_text_that_does_not_fit(
     ],
 )  # fmt: skip
 def test_the_fit_shows_whether_the_text_was_spoken(text: str, *, fits: bool) -> None:
-    model = load_model(model_path("blocks"))
+    model = load_model("blocks")
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     syllables = model.inventory.pronounce(text)
     assert align_syllables(model, samples, rate_hz, syllables).fits is fits

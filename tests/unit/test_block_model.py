@@ -9,24 +9,23 @@ import torch
 
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.load import MODELS, load_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.ear import EAR_PATH
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import onnx_of
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, layout
-from kouxing.training.neural.network import Shape
+from kouxing.training.networks.network import Shape
 from tests.system import DEMO
 
 pytestmark = [pytest.mark.usefixtures("one_thread")]
 
-VAD = MODELS / "silero_vad.onnx"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 FRAMES = np.resize(WhisperMel().accept_waveform(HELLO), (330, 80))  # more than a past
 FRAMES[40, 7] = FRAMES[:40].max() - 3.0  # below the floor
-SMALL = partial(Shape, look_aheads=(), width=32, heads=2, layers=4, inner=48)
+SMALL = partial(Shape, width=32, heads=2, layers=4, inner=48)
 BLOCK, RIGHT = 5, 10
 LENGTH = BLOCK + RIGHT
 SCALE = np.float32(0.5)
@@ -48,7 +47,7 @@ def networks(num_states: int = 180) -> tuple[BlockEncoder, BlockReadout]:
 @cache
 def blocks() -> BlockModel:
     shipped = load_model()
-    assert isinstance(shipped, NeuralModel)
+    assert isinstance(shipped, BlockModel)
     return BlockModel(
         topology=shipped.topology,
         network=onnx_of(*networks(shipped.topology.num_states), BLOCK),
@@ -141,7 +140,7 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     arrays = read_archive(path).arrays
     changes: list[tuple[dict[str, np.ndarray], str]] = [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
-        ({"network": np.frombuffer(VAD.read_bytes(), np.uint8)}, "has the inputs"),
+        ({"network": read_archive(EAR_PATH).array("network", None)}, "has the inputs"),
         ({"network": onnx_of(*networks(), BLOCK, past=6000)}, "has the sizes"),  # much memory
         ({"network": onnx_of(*networks(178), BLOCK)}, r"its network scores \(1, 30, 178\)"),
         ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),

@@ -12,12 +12,12 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.blocks import batches, recipe
 from kouxing.training.blocks.batches import Material, block_batch
 from kouxing.training.blocks.recipe import train_blocks
-from kouxing.training.neural import optimizer, teacher
-from kouxing.training.neural.batches import Recording, Targets
-from kouxing.training.neural.network import ReadoutShape
+from kouxing.training.networks import optimizer, teacher
+from kouxing.training.networks.batches import Recording, Targets
+from kouxing.training.networks.network import ReadoutShape
 from tests.unit.test_block_model import HELLO, SMALL
 from tests.unit.test_ear_training import write_sounds
-from tests.unit.test_neural_training import write_corpus
+from tests.unit.test_whisper_weights import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,7 +41,7 @@ def test_trains_resumes_and_writes_model_and_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: str
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("kouxing.training.neural.initial_network.Shape", SMALL)
+    monkeypatch.setattr("kouxing.training.networks.whisper.Shape", SMALL)
     corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
     output = tmp_path / "blocks.npz"
     lines: list[str] = []

@@ -6,11 +6,13 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
+from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion, State
-from kouxing.shared.phones.events import AudioSkipped, EndOfSound, SpeechChange
+from kouxing.shared.phones.events import AudioSkipped, EndOfSound, Progress, SpeechChange
 from tests.lips import DELAY_S, LIPS, advance, make_face, phone
 
 JAW = 2
+MOUTH_CORNERS = [11, 12]  # FAP 12 and 13: upwards
 FRAME_S = 0.02
 
 
@@ -61,6 +63,20 @@ def test_skips_to_newer_audio_without_a_jump() -> None:
     assert faps[0, JAW] > 100.0
     assert faps[-1, JAW] < 1.0
     assert np.abs(np.diff(faps[:, JAW])).max() < faps[0, JAW] / 3
+
+
+def test_smiles_while_someone_laughs() -> None:
+    face = make_face()
+    faps = []
+    for number in range(250):
+        time_s = number * FRAME_S
+        progress = Progress(time_s=time_s, level_db=-20.0, is_laughter=0.5 <= time_s < 1.0)
+        faps += values(face.process(progress)).reshape(-1, NUM_FAPS).tolist()
+    corners = np.array(faps)[:, MOUTH_CORNERS].mean(axis=1)
+    shown = round((0.5 - DELAY_S) / FRAME_S)  # the first frame of the laughter
+    assert not corners[: shown - 1].any()
+    assert corners[shown : shown + 25].max() > 100.0
+    assert abs(corners[-1]) < 1.0
 
 
 def test_end_of_sound_completes_the_frames_and_leads_to_rest() -> None:

@@ -64,6 +64,7 @@ def test_parses_face_settings() -> None:
     assert settings == FaceSettings(expressions={"joy": 1}, hold_s=7, expressiveness=2)
     assert wire.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
     assert wire.parse_face_settings({"lips": "learnt"}) == FaceSettings(lip_model="learnt")
+    assert wire.parse_face_settings({"acoustic": "light"}) == FaceSettings(acoustic="light")
 
 
 @pytest.mark.parametrize(
@@ -74,6 +75,7 @@ def test_parses_face_settings() -> None:
         ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
         ({"express": "joy"}, "names to strengths"),
         ({"expressiveness": 3}, "expressiveness is 3"),
+        ({"acoustic": "heavy"}, "acoustic must be full or light"),
     ],
 )
 def test_rejects_bad_face_settings(fields: dict[str, object], error: str) -> None:

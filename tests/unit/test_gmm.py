@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel, mixture_scores
-from kouxing.services.recognizer.acoustic.load import NEURAL_PATH, load_model
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, NUM_STATIC
 from kouxing.shared.errors import UserError
@@ -54,7 +54,7 @@ def test_rejects_broken_files(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no acoustic model at"):
         load_model(path)
     np.savez(pickled, format=np.array([{"a": 1}], dtype=object))
-    whole = NEURAL_PATH.read_bytes()
+    whole = model_path("gmm").read_bytes()
     for content in (b"not a model", whole[: len(whole) // 2], pickled.read_bytes()):
         path.write_bytes(content)
         with pytest.raises(UserError, match="is not an acoustic model"):

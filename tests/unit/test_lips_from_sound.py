@@ -6,21 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import write_archive
 from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     FORMAT,
     LipPredictor,
     features_at,
-    lip_predictor_for,
     load_lip_predictor,
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
 from tests.e2e.following import samples_of_file
-from tests.lip_predictors import HISTORY, NUM_FEATURES, UNITS, made_up_model
+from tests.lip_predictors import NUM_FEATURES, NUM_LIPS, UNITS, made_up_model
 from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE
 
@@ -47,7 +46,7 @@ def test_a_step_matches_the_formulas() -> None:
         reset, update = (1 / (1 + np.exp(-from_input[k] - from_state[k])) for k in (0, 1))
         state = (1 - update) * np.tanh(from_input[2] + reset * from_state[2]) + update * state
     expected = (
-        np.einsum("hc,hcdo->do", np.stack(components[-HISTORY:]), MODEL.history_weights)
+        np.einsum("l,ldo->do", rows[-1, -NUM_LIPS:], MODEL.lip_weights)
         + np.einsum("u,udo->do", np.concatenate([state, entered]), MODEL.output_weights)
         + MODEL.output_bias
     )
@@ -55,26 +54,26 @@ def test_a_step_matches_the_formulas() -> None:
 
 
 def test_each_delay_has_separate_outputs_and_times() -> None:
-    frames, values = np.ones((2, 80), np.float32), np.ones((4, 8, 64), np.float32)
-    both = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, values)
-    alone = MODEL.create_stream([0.155]).process_position(1.0, frames, values)
+    frames, heard = np.ones((2, 80), np.float32), np.ones(NUM_FEATURES - 160, np.float32)
+    both = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, heard)
+    alone = MODEL.create_stream([0.155]).process_position(1.0, frames, heard)
     assert [(lip.time_s, lip.delay_s) for lip in both] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
-    outputs = MODEL.create_stream([0.155]).step(features_at(frames, values))
+    outputs = MODEL.create_stream([0.155]).step(features_at(frames, heard))
     assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
     with pytest.raises(UserError, match="no delay of 70 ms; choose -5, 55, 155"):
         MODEL.create_stream([0.07])
 
 
-def test_uses_the_predictor_only_with_its_network(tmp_path: Path) -> None:
+def test_rejects_a_predictor_for_another_ear(tmp_path: Path) -> None:
     path = tmp_path / "lips.npz"
     MODEL.save(path)
-    assert lip_predictor_for(load_model(), path) is not None
-    assert lip_predictor_for(load_model(model_path("gmm")), path) is None
+    assert load_lip_predictor(path).delays_s == MODEL.delays_s
     wider = np.pad(MODEL.projection, ((0, 2), (0, 0)))
     mean = np.pad(MODEL.feature_mean, (0, 2))
     write_archive(path, {**arrays_of(MODEL), "projection": wider, "feature_mean": mean})
-    assert lip_predictor_for(load_model(), path) is None
+    with pytest.raises(UserError, match="trained for another ear"):
+        load_lip_predictor(path)
 
 
 def test_the_shipped_predictor_opens_rounds_and_closes_the_lips() -> None:

@@ -14,8 +14,6 @@ from kouxing.services.mouth_profiles.learning import (
     observe,
 )
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
-from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.services.recognizer.mouth_profile import (
     MouthProfile,
@@ -120,14 +118,12 @@ def test_corrects_the_lag_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = samples_of_file(VOWELS_FILE)[:80_000]
     frame_s = np.arange(250) / 50
     still = FilmedSpeech(samples=samples, frame_s=frame_s, lip_track=np.zeros((250, NUM_FAPS)))
-    model = load_model()
-    assert isinstance(model, NeuralModel)
-    plain = observe(model, MODEL, still)
+    plain = observe(MODEL, still)
     time_s = plain.known_s - MODEL.delays_s[-1]
     lips = np.stack(
         [np.interp(frame_s - 0.08, time_s, track) for track in plain.predicted[:, -1].T], axis=1
     )
-    late = observe(model, MODEL, FilmedSpeech(samples=samples, frame_s=frame_s, lip_track=lips))
+    late = observe(MODEL, FilmedSpeech(samples=samples, frame_s=frame_s, lip_track=lips))
     assert opening_error(late) < 0.1 * opening_error(plain)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.live_audio import LiveAudio
-from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S, Overload
+from kouxing.shared.overload import CATCH_UP_S, LIGHT_FOR_S, MAX_LATE_FOR_S, Overload
 
 MAX_BEHIND_S = 0.2
 CHUNK_S = 0.02
@@ -146,3 +146,14 @@ def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
     assert audio.skip_old(2.0)
     assert [at for at, _ in audio.take(1.0)] == [1600 * 19]
     assert not audio
+
+
+def test_a_session_that_is_slightly_behind_uses_the_light_model() -> None:
+    session = Session()
+    session.run(2.0, speed=3.0)
+    assert not session.overload.needs_light_model(session.now_s)
+    session.run(1.0, speed=0.8)
+    assert session.overload.needs_light_model(session.now_s)
+    assert session.overload.skipped_s == 0.0
+    session.run(LIGHT_FOR_S + 1.0, speed=3.0)
+    assert not session.overload.needs_light_model(session.now_s)

@@ -11,7 +11,7 @@ from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.evaluation.recognizer.disturbances import check_conditions, disturbances_for
 from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
 from kouxing.evaluation.recognizer.references import RATE_NAMES, align_corpus
-from kouxing.evaluation.recognizer.report import draw_delay_curve, print_figures
+from kouxing.evaluation.recognizer.report import print_figures
 from kouxing.evaluation.recognizer.synthetic_sounds import varying_noise as noise
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
@@ -64,9 +64,6 @@ def test_evaluates_a_corpus_with_bad_rows(tmp_path: Path) -> None:
     assert clean["final"]["phone_errors"]["reference"] == 6
     assert clean["final"]["labials"]["recall"] is None  # no p, b, m, f in it
     assert clean == results["speech"]["5.5 to 7/s"]
-    named = [{"acoustic": name, **results} for name in ("one", "one", "two")]
-    draw_delay_curve(named, tmp_path / "curve.png")
-    assert (tmp_path / "curve.png").stat().st_size > 10_000
     reasons: list[str] = []
     errors.report_to(reasons.append)
     for reason in (

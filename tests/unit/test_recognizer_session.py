@@ -22,8 +22,9 @@ from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
-from kouxing.shared.wire.speech import Progress
+from kouxing.shared.wire.speech import AcousticModel, Progress
 from tests.e2e.following import samples_of_file
 from tests.live_streams import START
 from tests.system import VOWELS_FILE
@@ -92,6 +93,23 @@ class PacedClient:
             return False
         self.end_s += gap_s + duration_s
         return True
+
+
+def test_reports_the_acoustic_model_in_use() -> None:
+    session = make_session(sample_rate_hz=16_000)
+    samples = samples_of_file(VOWELS_FILE)[7_000:]
+    models = []
+    for number, start in enumerate(range(0, 32_000, 1600)):
+        light = AcousticModel.LIGHT if number >= 8 else AcousticModel.FULL
+        session.face.change(FaceSettings(acoustic=light), 0.0)
+        session.audio.append((start, samples[start : start + 1600]), start / 16_000)
+        session.accept_waveform(1.0, start / 16_000)
+        RECOGNIZER.decode_streams([session.stream])
+        message = session.acoustic_message(session.new_results(RECOGNIZER))
+        models.append(message.model if message else None)
+    reported = [(number, model) for number, model in enumerate(models) if model]
+    assert [model for _, model in reported][:2] == ["full", "light"]
+    assert reported[1][0] == 8
 
 
 def test_limits_how_far_a_paced_client_is_ahead_of_the_clock() -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.shared.audio_file import read_audio
@@ -28,7 +28,7 @@ class Sessions:
 
     def __init__(self, model: AcousticModel) -> None:
         self._recognizer = Recognizer(model)
-        self._lips = lip_predictor_for(model)
+        self._lips = load_lip_predictor()
         sound = to_16_khz(*read_audio(DEMO / "bilabials-female.wav"))
         self._sounds = [np.roll(sound, number * 24_000) for number in range(NUM_SESSIONS)]
         self._rng = np.random.default_rng(0)
@@ -62,7 +62,7 @@ def used_mb() -> float:
 
 
 def test_a_speaking_session_needs_less_than_4_mb() -> None:
-    model = load_live_model("blocks")
+    model = load_model("blocks")
     sessions = Sessions(model)
     sessions.start()
     sessions.speak_a_round()

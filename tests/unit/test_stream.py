@@ -89,6 +89,27 @@ def test_skips_to_newer_audio() -> None:
     assert stream.stream.num_gaps == 0
 
 
+@pytest.mark.parametrize("cuts", [[9600, 14_400], [320, 10_240], [0, 50_000]])
+def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
+    expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
+    stream = LiveStream(MODEL, **FACE)
+    outputs = []
+    for number, part in enumerate(np.split(SAMPLES, cuts)):
+        stream.stream.set_light(number == 1)
+        outputs += stream.feed(part, chunk=320)
+    outputs += stream.finish()
+    for kind in (LipPositions, SpeechChange, Progress):
+        one, two = (messages_of(of_kind(kind, results)) for results in (expected, outputs))
+        assert one == two
+    phones = [phone for phone in of_kind(Phone, outputs) if phone.final]
+    assert [phone.index for phone in phones] == list(range(len(phones)))
+    end_s = 0.0
+    for phone in phones:
+        if not phone.is_withdrawn:
+            assert end_s == 0.0 or phone.onset_s == pytest.approx(end_s, abs=1e-4)
+            end_s = phone.onset_s + phone.duration_s
+
+
 def test_jitter_is_not_a_gap() -> None:
     stream = LiveStream(MODEL)
     outputs = stream.feed(SAMPLES[:8000], 0) + stream.feed(SAMPLES[8000:], 8000 + MAX_JITTER)

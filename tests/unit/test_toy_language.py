@@ -12,7 +12,7 @@ import pytest
 
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
-from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text, spoken
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -43,7 +43,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PhoneInventory]:
 @pytest.fixture(scope="module")
 def path(toy: PhoneInventory, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the file of a model of the toy language."""
-    mandarin = load_model(model_path("gmm"))
+    mandarin = load_model("gmm")
     assert isinstance(mandarin, GmmModel)
     hmms = mandarin.topology
     phones = [mandarin.inventory.index[phone.replace("y", "v")] for phone in toy.phones]

@@ -1,4 +1,4 @@
-"""The neural model's front end, compared with its definition."""
+"""Whisper's front end, compared with its definition."""
 
 import numpy as np
 import pytest

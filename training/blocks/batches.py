@@ -1,7 +1,7 @@
 """Batches for the block network: clean speech for the teacher, disturbed speech for the network.
 
-The disturbances are those of :mod:`kouxing.training.neural.augmentation`, and background music and
-voices, clipping and lossy coding.
+The disturbances are those of :mod:`kouxing.training.networks.augmentation`, and background music
+and voices, clipping and lossy coding.
 
 An excerpt is cut from the concatenated recordings, and its speed is drawn. The teacher sees it
 clean, and slightly longer than the network does. A tempo is drawn for the frames of both. Every
@@ -23,14 +23,14 @@ from scipy.ndimage import uniform_filter1d
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from kouxing.training.neural.augmentation import (
+from kouxing.training.networks.augmentation import (
     Samples,
     change_speed,
     disturb,
     scale_level,
     source_frames,
 )
-from kouxing.training.neural.batches import Recording, Targets, sampling_probs
+from kouxing.training.networks.batches import Recording, Targets, sampling_probs
 
 BATCH_S = 32
 BATCHES_PER_STEP = 8

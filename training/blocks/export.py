@@ -21,7 +21,7 @@ new             keys and values of the block, in the order of the  (sessions, 2 
                 inputs, 16-bit floats                              B, size)
 =============== ================================================== =============================
 
-Products use 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`). Norms, attention and the
+Products use 8-bit integers (:mod:`kouxing.training.networks.onnx_graph`). Norms, attention and the
 recurrent layer use floats. onnxruntime may sum a product with a single row in another order. The
 recurrent layer has one row for each session, so the first session's row is repeated.
 """
@@ -36,9 +36,9 @@ from onnx import TensorProto, helper
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
-from kouxing.training.neural.network import MAX_DEVIATIONS
-from kouxing.training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
-from kouxing.training.neural.teacher import KEPT_LAYERS
+from kouxing.training.networks.network import MAX_DEVIATIONS
+from kouxing.training.networks.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
+from kouxing.training.networks.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")
 

@@ -51,8 +51,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
-from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Readout, ReadoutShape, Shape
-from kouxing.training.neural.teacher import KEPT_LAYERS
+from kouxing.training.networks.network import PADDING_FRAMES, Encoder, Readout, ReadoutShape, Shape
+from kouxing.training.networks.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms
 PAST = 125  # positions before a block that it attends to, 2.5 s

@@ -1,7 +1,7 @@
 """From corpora to the block model: labels, tuned encoder with its readout, model card.
 
 A trained acoustic model aligns the recordings with their texts, and a teacher labels all recordings
-(:mod:`kouxing.training.neural.labels`). Some recordings get a sung copy. Then encoder and readout
+(:mod:`kouxing.training.networks.labels`). Some recordings get a sung copy. Then encoder and readout
 are tuned in blocks. The HMMs are estimated from the alignment; the phone language model is that of
 the acoustic model.
 
@@ -39,9 +39,9 @@ from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
 from kouxing.training.ear.singing import sing
 from kouxing.training.model_card import write_card
-from kouxing.training.neural.batches import Recording, Targets
-from kouxing.training.neural.initial_network import init_encoder, load_whisper
-from kouxing.training.neural.labels import STATES_PER_PHONE, Mix, label, statistics_of
+from kouxing.training.networks.batches import Recording, Targets
+from kouxing.training.networks.labels import STATES_PER_PHONE, Mix, label, statistics_of
+from kouxing.training.networks.whisper import init_encoder, load_whisper
 from kouxing.training.training_set import (
     FRAMES_PER_MINUTE,
     Example,

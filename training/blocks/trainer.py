@@ -38,9 +38,9 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.training.blocks.batches import BATCHES_PER_STEP, BlockBatch, Material, block_batch
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
 from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.neural.network import MAX_DEVIATIONS
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
-from kouxing.training.neural.teacher import WholeEncoder
+from kouxing.training.networks.network import MAX_DEVIATIONS
+from kouxing.training.networks.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
+from kouxing.training.networks.teacher import WholeEncoder
 from kouxing.training.training_set import Report
 
 _RATE, _READOUT_RATE = 1.5e-4, 1.5e-3  # of the last layer, of the readout

@@ -2,7 +2,7 @@
 
 An excerpt joins recordings, with pauses between some of them. Its random speed also shifts pitch
 and formants. Music, voices or noise are added in the background, then the augmentations of
-:mod:`kouxing.training.neural.augmentation` are applied. Some excerpts contain only a background.
+:mod:`kouxing.training.networks.augmentation` are applied. Some excerpts contain only a background.
 Every batch has its own random generator, so resumed training gives the same network.
 """
 
@@ -12,19 +12,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.ear import LIP_DELAYS_S, Voice
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.training.ear.lip_teacher import POSITION_S
 from kouxing.training.ear.network import NUM_INPUTS
-from kouxing.training.ear.targets import PITCH, VOICE, Piece, Samples, Voice
+from kouxing.training.ear.targets import PITCH, VOICE, Columns, Piece, Samples
 from kouxing.training.ear.teachers import POSITION_SAMPLES
-from kouxing.training.neural.augmentation import Sound, change_speed, disturb, scale_level
+from kouxing.training.networks.augmentation import Sound, change_speed, disturb, scale_level
 
 Floats = NDArray[np.float32]
+Halves = NDArray[np.float16]
+Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
 
 NUM_POSITIONS = 250  # of an excerpt, 5 s
 NUM_EXCERPTS = 28
@@ -34,9 +36,11 @@ _MAX_PIECE = 400  # positions of one recording in an excerpt
 _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
 _LEVEL_DB = 5.0  # deviation of the levels of recordings in an excerpt
 _MIDDLE = 0.875  # of a position's frames, positions after its first sample
+_KNOWN = 2.25  # end of the audio that the network has received, likewise
 _CLEAN_PROB, _ONLY_BACKGROUND_PROB, _BACKGROUND_PROB = 0.15, 0.08, 0.65
 _VOICES_PROB, _MAX_VOICES = 0.35, 6  # of a background with other speakers
 _MIN_SNR_DB, _MAX_SNR_DB = 0.0, 25.0
+_MIN_PITCH, _MAX_PITCH = 0.75, 1.33  # of music and noise
 _TINY = 1e-9
 
 
@@ -46,19 +50,20 @@ class Material:
 
     pieces: Sequence[Piece]
     backgrounds: Sequence[Samples]  # music and noise
+    columns: Columns
 
     def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
         """Draw a piece; ``probs`` are the cumulative probabilities."""
         return self.pieces[int(np.searchsorted(probs, rng.random() * probs[-1]))]
 
 
-def batch_of(material: Material, seed: int, number: int) -> tuple[Tensor, Tensor]:
-    """Draw a batch by its number: inputs, (batch, positions, 160), and targets."""
+def batch_of(material: Material, seed: int, number: int) -> Batch:
+    """Draw a batch by its number."""
     rng = np.random.default_rng([seed, number])
     probs = np.cumsum([piece.weight for piece in material.pieces])
     excerpts = [_excerpt(material, probs, rng) for _ in range(NUM_EXCERPTS)]
-    inputs, targets = (np.stack(arrays) for arrays in zip(*excerpts, strict=True))
-    return torch.from_numpy(inputs), torch.from_numpy(targets)
+    inputs, targets = (np.stack(arrays, dtype=np.float16) for arrays in zip(*excerpts, strict=True))
+    return inputs, targets
 
 
 def inputs_of(samples: Floats) -> Floats:
@@ -83,9 +88,21 @@ def _excerpt(
         sound = disturb(sound, rng)
     inputs = inputs_of(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
     at = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
-    chosen = targets[np.clip(np.rint(at).astype(np.int64), 0, len(targets) - 1)]
+    chosen = _rows(targets, at)
     chosen[:, PITCH] += np.float32(np.log2(speed))
-    return inputs, chosen
+    lips = material.columns.lips
+    delayed = [
+        _rows(targets[:, lips], speed * (np.arange(NUM_POSITIONS) + known) - 1)
+        for known in (_KNOWN - delay_s / POSITION_S for delay_s in LIP_DELAYS_S)
+    ]
+    return inputs, np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
+
+
+def _rows(targets: Floats, at: NDArray[np.floating]) -> Floats:
+    """Return the rows that are nearest to positions; NaN before the first one."""
+    rows: Floats = targets[np.clip(np.rint(at).astype(np.int64), 0, len(targets) - 1)]
+    rows[at < -1] = np.nan
+    return rows
 
 
 def _speech(
@@ -123,8 +140,16 @@ def _add_background(
         numbers = rng.integers(len(material.pieces), size=int(rng.integers(1, _MAX_VOICES + 1)))
         others = [material.pieces[number].samples for number in numbers]
     else:
-        others = [material.backgrounds[int(rng.integers(len(material.backgrounds)))]]
+        background = material.backgrounds[int(rng.integers(len(material.backgrounds)))]
+        others = [_change_pitch(background, rng)]
     return mix(sound, others, snr_db, rng)
+
+
+def _change_pitch(samples: Samples, rng: np.random.Generator) -> Samples:
+    """Play a sound faster or slower."""
+    at = np.arange(0, len(samples) - 1, rng.uniform(_MIN_PITCH, _MAX_PITCH))
+    changed: Samples = np.interp(at, np.arange(len(samples)), samples).astype(np.int16)
+    return changed
 
 
 def mix(sound: Sound, others: Sequence[Samples], snr_db: float, rng: np.random.Generator) -> Sound:

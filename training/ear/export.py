@@ -7,71 +7,38 @@ symbol      meaning                                                          sha
 =========== ================================================================ =====================
 frames      the two newest log-mel frames, the older one first               (sessions, 160)
 state       states of both recurrent layers                                  (sessions, 2 width)
-features    components of the causal network and of Whisper's encoder, and   (sessions, 307)
-            lips: the inputs of a lip model
+features    early and late components of Whisper's encoder, and lips: the    (sessions, 307)
+            inputs of a lip model
 phones      log posteriors                                                   (sessions, phones)
 voice       probabilities of no voice, speech, sung or held voice, laughter  (sessions, 4)
 scalars     probability of voicing; pitch, log2 of Hz; level; effort         (sessions, 4)
 new_state   states after the step                                            (sessions, 2 width)
 =========== ================================================================ =====================
 
-Products use 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`).
+Products use 8-bit integers (:mod:`kouxing.training.networks.onnx_graph`).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from pickle import UnpicklingError
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
-from kouxing.shared.errors import UserError
+from kouxing.services.recognizer.acoustic.model_file import write_archive
+from kouxing.services.recognizer.ear import FORMAT, Voice
 from kouxing.training.ear.network import (
     MEAN_PITCH,
     NUM_FEATURES,
     NUM_INPUTS,
-    NUM_OTHER_OUTPUTS,
     Ear,
 )
-from kouxing.training.ear.targets import Voice
-from kouxing.training.neural.onnx_graph import Floats, Graph, arrays_of, floats
-
-FORMAT = "ear 1"
-_AVERAGED = "module."  # prefix of the averaged weights in a checkpoint
+from kouxing.training.networks.onnx_graph import Floats, Graph, arrays_of, floats
 
 
 def save_ear(path: Path, ear: Ear) -> None:
     """Write the model as an npz file (arrays only, no pickle)."""
     write_archive(path, {"format": np.array(FORMAT), "network": onnx_of(ear)})
-
-
-def load_ear(path: Path) -> NDArray[np.uint8]:
-    """Read the network of a model file, or of a training checkpoint (.pt).
-
-    Raises UserError if the file cannot be read.
-    """
-    try:
-        if path.suffix != ".pt":
-            return read_archive(path).array("network", None)
-        averaged = torch.load(path, weights_only=True)["averaged"]
-        state = {
-            name.removeprefix(_AVERAGED): array
-            for name, array in averaged.items()
-            if name.startswith(_AVERAGED)
-        }
-        num_phones = len(state["output.bias"]) - NUM_OTHER_OUTPUTS
-        ear = Ear(num_phones, width=len(state["entry.bias"]))
-        ear.load_state_dict(state)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except (KeyError, RuntimeError, UnpicklingError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a small ear; give a file from 'kouxing train ear'"
-        ) from error
-    return onnx_of(ear)
 
 
 def onnx_of(ear: Ear) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""The small ear in PyTorch: a recurrent network of two million weights, one step every 20 ms.
+"""The small ear in PyTorch: a recurrent network of 2.7 million weights, one step every 20 ms.
 
     a = relu(U x)
     h1 = GRU(a),  h2 = GRU(h1)
@@ -8,14 +8,14 @@
 symbol   meaning                                                            shape
 ======== ================================================================== ==================
 x        two log-mel frames, 2 p + 1 and 2 p + 2, of position p             (160,)
-y        components of the causal network and lips at position p; at        (outputs,)
-         position p - 2: components of Whisper's encoder, phones and voice
+y        early components of Whisper's encoder at position p; lips at three (outputs,)
+         delays; at position p - 2: late components, phones and voice
          classes (logits), voicing (logit), pitch, level, effort
 ======== ================================================================== ==================
 
 A step uses audio up to 65 ms after the middle of position p - 2.
 
-    loss = E(causal) + E(encoder) + 3 E(lips) + H(phones) / 3 + H(voice) + H(voicing) / 3
+    loss = E(early) + E(late) + 3 E(lips) + H(phones) / 2 + H(voice) + H(voicing) / 3
            + |pitch| + E(level) / 5 + E(effort) / 5
 
 E is a mean squared error and H a cross-entropy. Pitch errors are in octaves. Unknown targets are
@@ -30,38 +30,41 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, log_softmax
 
+from kouxing.services.recognizer.ear import LIP_DELAYS_S, Voice
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.training.ear.targets import (
     EFFORT,
     LEVEL,
     NUM_COMPONENTS,
-    NUM_LIPS,
     PITCH,
     VOICE,
     Columns,
-    Voice,
 )
 
 NUM_INPUTS = 2 * NUM_MELS
-LOOK_AHEAD = 2  # positions; the first output has no look-ahead
-WIDTH = 384
+LOOK_AHEAD = 2  # positions, of all outputs but the early components and the lips
+WIDTH = 448
+NUM_LIPS = len(LIP_DELAYS_S) * NUM_OUTPUTS
 NUM_FEATURES = 2 * NUM_COMPONENTS + NUM_LIPS  # the first outputs
 NUM_OTHER_OUTPUTS = NUM_FEATURES + len(Voice) + 4  # all but the phones
 
 _LIPS_WEIGHT = 3.0
-_PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 3, 1 / 3, 1 / 5
+_PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 2, 1 / 3, 1 / 5
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
     """The parts of an output row."""
 
-    causal: Tensor  # (..., 128)
-    encoder: Tensor  # (..., 128)
+    early: Tensor  # (..., 128)
+    late: Tensor  # (..., 128)
     lips: Tensor  # (..., 51)
     phones: Tensor  # (..., phones) logits
     voice: Tensor  # (..., 4) logits
@@ -100,6 +103,16 @@ class Ear(nn.Module):
         scalars = (scalar.squeeze(-1) for scalar in (voicing, pitch, level, effort))
         return Outputs(*ranges, *scalars)
 
+    @torch.no_grad()
+    def rescale_lips(self, mean: NDArray[np.float32], deviation: NDArray[np.float32]) -> None:
+        """Express the lips in the units of the lip teacher, whose mean and deviation are given."""
+        scale, offset = (
+            torch.from_numpy(values).repeat(len(LIP_DELAYS_S)) for values in (deviation, mean)
+        )
+        rows = slice(2 * NUM_COMPONENTS, NUM_FEATURES)
+        self.output.weight[rows] *= scale[:, None]
+        self.output.bias[rows] = scale * self.output.bias[rows] + offset
+
     def loss(self, inputs: Tensor, targets: Tensor) -> Tensor:
         """Compute the loss of a batch; targets have the shape (batch, positions, columns)."""
         rows = self(inputs).float()
@@ -117,8 +130,8 @@ class Ear(nn.Module):
             late.voicing, is_voiced.float(), reduction="none"
         )
         losses = (
-            _squared_error(now.causal, targets[..., self.columns.causal]),
-            _squared_error(late.encoder, before[..., self.columns.encoder]),
+            _squared_error(now.early, targets[..., self.columns.encoder]),
+            _squared_error(late.late, before[..., self.columns.encoder]),
             _LIPS_WEIGHT * _squared_error(now.lips, targets[..., self.columns.lips]),
             _PHONES_WEIGHT * _mean(entropy, has_phones),
             cross_entropy(late.voice.flatten(0, 1), voice.flatten().long()),

@@ -1,13 +1,15 @@
 """Trains the small ear from corpora: targets, training, export, model card.
 
+    clips, block network, Whisper's encoder -> lip teacher
+    recordings, teachers -> targets -> small ear
+
 If training is interrupted, the same command resumes it. Next to the output, the folder ``.targets``
-contains the targets, and ``.checkpoint.pt`` the training state. Targets of further recordings are
-computed during training, so the first checkpoint exists after half an hour.
+contains the lip teacher and the targets, and ``.checkpoint.pt`` the training state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,27 +19,27 @@ import torch
 from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
-from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
+from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out, may_ship
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.ear import Voice
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.device import mixed_precision
-from kouxing.training.ear.batches import BATCH_S, Material, batch_of
+from kouxing.training.device import DEVICE, mixed_precision
+from kouxing.training.ear.batches import BATCH_S, Batch, Material, batch_of
 from kouxing.training.ear.export import save_ear
+from kouxing.training.ear.lip_teacher import LipTeacher, hear, train_lip_teacher
 from kouxing.training.ear.network import Ear
-from kouxing.training.ear.targets import Piece, Recording, Samples, TargetStore, Voice
+from kouxing.training.ear.targets import Columns, Recording, Samples, TargetStore
 from kouxing.training.ear.teachers import Teachers
 from kouxing.training.model_card import write_card
-from kouxing.training.neural.optimizer import Optimizer, warm_up_factor
+from kouxing.training.networks.optimizer import Optimizer, warm_up_and_decay_factor
 from kouxing.training.training_set import Report, read_utterances, weights_of
 
-_FIRST_CHUNKS, _STEPS_PER_CHUNK = 64, 24  # chunks at the start; steps until the next one
-_RATE, _WARM_UP_STEPS = 1e-3, 200
-_VALIDATE_EVERY, _NUM_VALIDATED = 250, 3  # steps; batches
+_RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 200, 0.5
 _BACKGROUNDS = ("music", "noise", "babble")
 _OTHER_VOICES = {"laughter": Voice.LAUGHTER, "breath": Voice.NONE}  # by the kind of a sound
 _OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
@@ -49,18 +51,18 @@ class Sources:
 
     corpora: Sequence[Path]
     untranscribed: Sequence[Path] = ()
-    clips: Path | None = None  # with tracked lips; only their audio is used
     sounds: Sequence[Path] = ()
+    clips: Path  # with tracked lips
     shipping: bool = True  # use only data whose license allows distributing the model
 
 
 def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
     """Load the teachers and their phone inventory."""
     torch.set_num_threads(1)  # reproducible sums on every machine
-    causal, blocks = (load_model(model_path(name)) for name in ("neural", "blocks"))
-    if not (isinstance(causal, NeuralModel) and isinstance(blocks, BlockModel)):
-        raise UserError("the small ear needs the shipped acoustic models; reinstall kouxing")
-    return Teachers(causal, blocks, whisper), blocks.inventory
+    blocks = load_model(model_path("blocks"))
+    if not isinstance(blocks, BlockModel):
+        raise UserError("the small ear needs the shipped acoustic model; reinstall kouxing")
+    return Teachers(blocks, whisper), blocks.inventory
 
 
 def train_ear(
@@ -69,7 +71,7 @@ def train_ear(
     *,
     whisper: Path,
     seed: int = 0,
-    num_steps: int = 20_000,
+    num_steps: int = 7000,
     report: Report = print,
 ) -> None:
     """Train the small ear, and write it with its model card.
@@ -78,7 +80,13 @@ def train_ear(
     """
     teachers, inventory = load_teachers(whisper)
     errors = RowErrors()
-    utterances = utterances_of(sources, errors, inventory, "train")
+    utterances = [
+        utterance
+        for corpus in sources.corpora
+        for utterance in read_utterances(
+            corpus, errors, inventory, split="train", shipping=sources.shipping
+        )
+    ]
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
     sounds = [
@@ -98,15 +106,18 @@ def train_ear(
         if sound.kind in _OTHER_VOICES
     ]
     recordings = [*_speech_of(sources, utterances), *others]
-    store = TargetStore(output.with_suffix(".targets"), recordings, teachers, errors, seed)
-    held_out = [
-        piece
-        for one in utterances_of(sources, errors, inventory, "dev")
-        for piece in store.pieces_of(_recording(one.path, 1.0))
-    ]
+    folder = output.with_suffix(".targets")
+    folder.mkdir(parents=True, exist_ok=True)
+    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", sources, teachers, seed)
+    store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
     trained = _train_network(
-        len(inventory), store, held_out, backgrounds, num_steps, seed, output, report
+        Material(store.pieces(), backgrounds, Columns(len(inventory))),
+        num_steps,
+        seed,
+        output,
+        report,
     )
+    trained.rescale_lips(store.lips_mean, store.lips_deviation)
     save_ear(output, trained)
     write_card(
         output,
@@ -120,29 +131,14 @@ def train_ear(
     errors.report_to(report)
 
 
-def utterances_of(
-    sources: Sources, errors: RowErrors, inventory: PhoneInventory, split: str
-) -> list[Utterance]:
-    """List the recordings of one split of all corpora."""
-    return [
-        utterance
-        for corpus in sources.corpora
-        for utterance in read_utterances(
-            corpus, errors, inventory, split=split, shipping=sources.shipping
-        )
-    ]
-
-
 def _speech_of(sources: Sources, utterances: Sequence[Utterance]) -> list[Recording]:
     """List all speech. Sources are weighted by the square root of their size; the sum is 1."""
     weights = zip(utterances, weights_of(utterances), strict=True)
     of_sources = [[(one.path, weight * one.seconds) for one, weight in weights]]
     for folder in sources.untranscribed:
         of_sources.append([(path, 1.0) for path in audio_files(folder) if not is_held_out(path)])
-    if sources.clips:
-        clips = read_clips(sources.clips, any_license=not sources.shipping, language=None)
-        paths = [sources.clips / f"{clip.name}.flac" for clip in clips if may_train(clip, sources)]
-        of_sources.append([(path, 1.0) for path in paths])
+    paths = [sources.clips / f"{clip.name}.flac" for clip in _clips_of(sources)]
+    of_sources.append([(path, 1.0) for path in paths])
     shares = np.sqrt([sum(path.stat().st_size for path, _ in source) for source in of_sources])
     recordings = []
     for source, share in zip(of_sources, shares / shares.sum(), strict=True):
@@ -152,50 +148,74 @@ def _speech_of(sources: Sources, utterances: Sequence[Utterance]) -> list[Record
 
 
 def _recording(path: Path, weight: float) -> Recording:
-    return Recording(path.name, lambda: as_integers(read_audio(path)), weight)
+    return Recording(path.name, partial(_read, path), weight)
 
 
-def may_train(clip: LipClip, sources: Sources) -> bool:
-    """Return whether a clip may be used for training."""
-    return clip.part != "held" and (may_ship(clip.license) or not sources.shipping)
+def _read(path: Path) -> Samples:
+    return as_integers(read_audio(path))
+
+
+def _load_lip_teacher(path: Path, sources: Sources, teachers: Teachers, seed: int) -> LipTeacher:
+    """Load the lip teacher, or train it on the clips.
+
+    Raises UserError if there are no clips to train on.
+    """
+    if not path.exists():
+        clips = [clip for clip in _clips_of(sources) if clip.is_in_sync]
+        if not clips:
+            raise UserError(
+                f"no clip in {sources.clips} may be used; give clips with a free license"
+            )
+        heard = list(process_in_order(partial(hear, teachers), [clip.samples for clip in clips]))
+        model = load_model(model_path("blocks"))
+        phones = {
+            clip.name: label_clip(model, clip)
+            for clip in clips
+            if clip.language == model.inventory.code
+        }
+        unfinished = path.with_suffix(".part")
+        train_lip_teacher(clips, heard, phones, seed).save(unfinished)
+        unfinished.replace(path)
+    return LipTeacher.load(path)
+
+
+def _clips_of(sources: Sources) -> list[LipClip]:
+    """Read the clips that may be used for training."""
+    clips = read_clips(sources.clips, any_license=not sources.shipping, language=None)
+    return [
+        clip
+        for clip in clips
+        if clip.part != "held" and (may_ship(clip.license) or not sources.shipping)
+    ]
 
 
 def _train_network(
-    num_phones: int,
-    store: TargetStore,
-    held_out: Sequence[Piece],
-    backgrounds: Sequence[Samples],
-    num_steps: int,
-    seed: int,
-    output: Path,
-    report: Report,
+    material: Material, num_steps: int, seed: int, output: Path, report: Report
 ) -> Ear:
     torch.manual_seed(seed)
-    ear = Ear(num_phones)
+    ear = Ear(material.columns.num_phones).to(DEVICE)
     optimizer = Optimizer(
         ear,
         [{"params": list(ear.parameters()), "lr": _RATE}],
         weight_decay=0.01,
         max_norm=1.0,
-        mean_exponent=3,
+        mean_exponent=8,
     )
-
-    def loss_of(pieces: Sequence[Piece], number: int) -> Tensor:
-        with mixed_precision():
-            return ear.loss(*batch_of(Material(pieces, backgrounds), seed, number))
+    batches: Iterator[Batch] | None = None
 
     def loss(step: int) -> Tensor:
-        if step % _VALIDATE_EVERY == 0 and held_out:
-            with torch.no_grad():
-                losses = [float(loss_of(held_out, number)) for number in range(_NUM_VALIDATED)]
-            report(f"step {step}: held-out loss {np.mean(losses):.3f}")
-        return loss_of(store.pieces(_FIRST_CHUNKS + step // _STEPS_PER_CHUNK), step)
+        nonlocal batches
+        if batches is None:
+            numbers = range(step, num_steps)
+            batches = process_in_order(partial(batch_of, material, seed), numbers)
+        with mixed_precision():
+            return ear.loss(*(torch.from_numpy(part).to(DEVICE).float() for part in next(batches)))
 
     return optimizer.train(
         loss,
-        lambda step: warm_up_factor(step, _WARM_UP_STEPS),
+        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
         num_steps=num_steps,
         seed=seed,
         report=report,
         checkpoint=output.with_suffix(".checkpoint.pt"),
-    )
+    ).cpu()

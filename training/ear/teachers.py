@@ -1,18 +1,15 @@
 """The teachers of the small ear: trained networks that compute its targets from clean recordings.
 
-The causal network and the block network come from the shipped models. Their 8-bit ONNX weights are
-converted to floats, so that PyTorch can run whole recordings. This is several times faster than the
-live networks. The third teacher is Whisper's unchanged encoder, the fourth the lip predictor.
+The block network comes from the shipped model. Its 8-bit ONNX weights are converted to floats, so
+that PyTorch can run whole recordings. The second teacher is Whisper's unchanged encoder. The lip
+teacher (:mod:`kouxing.training.ear.lip_teacher`) uses the outputs of both.
 
 ======== ==================================================================== =================
 symbol   meaning                                                              shape
 ======== ==================================================================== =================
-p        position: the feature frames 2 p and 2 p + 1
-causal   attention values of the causal network's last two layers. Position   (positions, 2 w)
-         p has seen the frames up to 2 p + 2
-encoder  positions of Whisper's encoder after layers 4 and 6, which have      (positions, 2 w)
+p        position: the feature frames 2 p and 2 p + 1                         (positions,)
+encoder  positions of Whisper's encoder after layers 2, 4 and 6, which have   (positions, 3 w)
          seen the whole recording
-lips     outputs of the lip predictor, for each of `LIP_DELAYS_S`             (positions, 51)
 phones   posteriors of the phones, of the block network                       (positions, phones)
 pitch    log2 of the pitch in Hz; NaN without voice                           (positions,)
 level    log10 of the power, relative to the recording's loudest parts        (positions,)
@@ -41,23 +38,18 @@ from torch.nn.functional import pad
 
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.network import MAX_POSITIONS
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lip_predictor import NUM_LAYERS, load_lip_predictor
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
-from kouxing.training.device import mixed_precision
-from kouxing.training.neural.initial_network import load_whisper
-from kouxing.training.neural.network import Layer, Network, ReadoutShape, Shape
-from kouxing.training.neural.teacher import NUM_LAYERS as NUM_WHISPER_LAYERS
-from kouxing.training.neural.teacher import WholeEncoder
+from kouxing.training.device import DEVICE, mixed_precision
+from kouxing.training.networks.network import ReadoutShape, Shape
+from kouxing.training.networks.teacher import NUM_LAYERS, WholeEncoder
+from kouxing.training.networks.whisper import load_whisper
 
 Floats = NDArray[np.float32]
 
 POSITION_SAMPLES = 320
-LIP_DELAYS_S = (0.015, 0.055, 0.155)
-_ENCODER_LAYERS = (3, 5)  # of Whisper's encoder, the first is 0
+_ENCODER_LAYERS = (1, 3, 5)  # of Whisper's encoder, the first is 0
 _BLOCK_POSITIONS = 50  # of the block network; longer blocks than live cost less
 _LOW_BANDS, _HIGH_BANDS = slice(1, 27), slice(27, 69)  # below 1 kHz, and 1 to 5 kHz
 _LOUD_PERCENTILE = 95
@@ -68,9 +60,7 @@ _TINY_POWER = 1e-7
 class TeacherOutputs:
     """The outputs of the teachers for a recording; arrays have the shapes above."""
 
-    causal: Floats
     encoder: Floats
-    lips: Floats
     phones: Floats
     pitch: Floats
     level: Floats
@@ -80,90 +70,48 @@ class TeacherOutputs:
 class Teachers:
     """The teachers, ready to run."""
 
-    def __init__(self, causal: NeuralModel, blocks: BlockModel, whisper: Path) -> None:
-        sizes = causal.session.sizes
-        shape = Shape(
-            num_states=0,
-            look_aheads=(),
-            width=sizes.width,
-            heads=sizes.num_heads,
-            layers=sizes.num_layers,
-            inner=_inner_of(causal.network),
-        )
-        self._causal = Network(shape)
-        load_exported(self._causal, causal.network)
-        self._values: list[Tensor] = []
-        for layer in list(self._causal.layers)[-NUM_LAYERS:]:
-            assert isinstance(layer, Layer)  # noqa: S101 - PyTorch's lists have no types
-            layer.query_key_value.register_forward_hook(self._keep_values)
+    def __init__(self, blocks: BlockModel, whisper: Path) -> None:
         self._blocks = BlockEncoder(_block_shape(blocks))
         load_exported(self._blocks, blocks.network)
         self._readout = _readout_of(blocks)
-        self._encoder = WholeEncoder(
-            Shape(num_states=0, look_aheads=(), layers=NUM_WHISPER_LAYERS), _ENCODER_LAYERS
-        )
+        self._encoder = WholeEncoder(Shape(num_states=0, layers=NUM_LAYERS), _ENCODER_LAYERS)
         load_whisper(self._encoder, whisper)
-        for network in (self._causal, self._blocks, self._readout, self._encoder):
+        self._networks = (self._blocks, self._readout, self._encoder)
+        for network in self._networks:
             network.eval()
-        self._lips = load_lip_predictor()
         self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
         self._first_state = blocks.topology.first_state
-        networks = causal.network.tobytes() + blocks.network.tobytes()
-        self.digest = hashlib.sha256(networks + self._lips.digest).hexdigest()
+        self.digest = hashlib.sha256(blocks.network.tobytes()).hexdigest()
 
     @torch.no_grad()
     def compute_targets(self, samples: NDArray[np.int16]) -> TeacherOutputs:
         """Compute the targets of samples, (n,) at 16 kHz, up to 20 s."""
+        for network in self._networks:
+            network.to(DEVICE)
         bands = WhisperMel().accept_waveform(as_floats(samples))
         num_positions = (len(bands) - 1) // 2
         frames = torch.from_numpy(bands[: 2 * num_positions + 1])[None]
         power = 10 ** (4 * bands[: 2 * num_positions].reshape(num_positions, 2, -1) - 4)
         level = np.log10(power.mean(axis=(1, 2)) + _TINY_POWER)
         low, high = (power[..., part].mean(axis=(1, 2)) for part in (_LOW_BANDS, _HIGH_BANDS))
-        causal = self.causal_values(frames)
         return TeacherOutputs(
-            causal=causal,
             encoder=self._encoder.features(samples)[:num_positions].astype(np.float32),
-            lips=self.lips_of(bands[1 : 2 * num_positions + 1], causal),
             phones=self._phones(frames),
             pitch=pitch_of(samples, num_positions),
             level=(level - np.percentile(level, _LOUD_PERCENTILE)).astype(np.float32),
             effort=np.log10((high + _TINY_POWER) / (low + _TINY_POWER)).astype(np.float32),
         )
 
-    @torch.no_grad()
-    def causal_values(self, frames: Tensor) -> Floats:
-        """Run the causal network: (1, frames, 80) to (positions, 2 width).
-
-        After 30 s it restarts with an empty past, like the live network.
-        """
-        parts = []
-        for start in range(0, frames.shape[1] - 2, 2 * MAX_POSITIONS):
-            self._values.clear()
-            with mixed_precision():
-                self._causal(frames[:, start : start + 2 * MAX_POSITIONS + 1])
-            parts.append(torch.cat(self._values, dim=-1)[0].float())
-        return torch.cat(parts).numpy()
-
-    def lips_of(self, frames: Floats, causal: Floats) -> Floats:
-        """Predict lips from log-mel frames, (2 positions, 80), and the causal network's values."""
-        stream = self._lips.create_stream(LIP_DELAYS_S)
-        features = np.concatenate([frames.reshape(len(causal), -1), causal], axis=1)
-        return np.stack([stream.step(row).ravel() for row in features])
-
-    def _keep_values(self, _layer: nn.Module, _inputs: object, outputs: Tensor) -> None:
-        self._values.append(outputs[..., 2 * outputs.shape[-1] // 3 :])
-
     def _phones(self, frames: Tensor) -> Floats:
         """Compute the phones' posteriors: (1, frames, 80) to (positions, phones)."""
         num_positions = (frames.shape[1] - 1) // 2
         missing = -num_positions % _BLOCK_POSITIONS  # few sizes: layouts are cached
         padded = pad(frames, (0, 0, 0, 2 * missing), mode="replicate")
-        laid = layout(num_positions + missing, _BLOCK_POSITIONS)
+        laid = layout(num_positions + missing, _BLOCK_POSITIONS, device=DEVICE)
         with mixed_precision():
-            features = self._blocks(padded, laid)
+            features = self._blocks(padded.to(DEVICE), laid)
         states = self._readout.read(features.float(), laid)[0, :num_positions].exp().mean(dim=1)
-        return np.add.reduceat(states.numpy(), self._first_state[:-1], axis=1)
+        return np.add.reduceat(states.cpu().numpy(), self._first_state[:-1], axis=1)
 
 
 def pitch_of(samples: NDArray[np.int16], num_positions: int) -> Floats:
@@ -187,7 +135,7 @@ def load_exported(
     prefix: str = "",
     others: Mapping[str, NDArray[Any]] | None = None,
 ) -> None:
-    """Load the weights of an exported network (:mod:`kouxing.training.neural.onnx_graph`).
+    """Load the weights of an exported network (:mod:`kouxing.training.networks.onnx_graph`).
 
     ``others`` are weights that the file stores in another form, by their module names.
     """
@@ -215,7 +163,6 @@ def _block_shape(model: BlockModel) -> Shape:
     sizes = model.session.sizes
     return Shape(
         num_states=int(model.topology.first_state[-1]),
-        look_aheads=(),
         width=sizes.width,
         heads=sizes.heads,
         layers=sizes.layers,

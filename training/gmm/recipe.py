@@ -23,7 +23,7 @@ from kouxing.training.gmm.estimation import (
     topology_of,
 )
 from kouxing.training.model_card import write_card
-from kouxing.training.neural.augmentation import augment_samples, scale_level
+from kouxing.training.networks.augmentation import augment_samples, scale_level
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.training_set import Example, Report, load_examples

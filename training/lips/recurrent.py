@@ -27,7 +27,6 @@ _INPUT_NOISE = 0.1  # standard deviation; that of a component is 1
 _PIECE = 200  # positions
 _MIN_PIECE = 10
 _BATCH = 32  # pieces
-_LABELED_SHARE = 3  # labeled pieces in an epoch for each piece of the examples
 _RATE, _WEIGHT_DECAY = 2e-3, 1e-2
 _PROBABILITY_WEIGHT = 0.3  # of closure and lip to teeth in the loss
 _UNITS_WEIGHT = 0.01  # of a speaker's squared scale (log) and offset
@@ -87,7 +86,6 @@ class Example:
 
 def train_network(
     examples: Sequence[Example],
-    labeled: Sequence[Example] = (),
     *,
     num_epochs: int,
     seed: int,
@@ -95,39 +93,34 @@ def train_network(
 ) -> tuple[LipNetwork, list[float]]:
     """Train; return the network and the mean loss of each epoch.
 
-    Every epoch uses all ``examples``, and another share of the ``labeled`` ones, three times as
-    long. ``both_ways`` makes the recurrent layer bidirectional.
+    ``both_ways`` makes the recurrent layer bidirectional.
     """
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
-    pieces, further = _cut(examples), _cut(labeled)
-    share = min(len(further), _LABELED_SHARE * len(pieces))
-    further = [further[number] for number in rng.permutation(len(further))]
+    pieces = _cut(examples)
     first = pieces[0]
     network = LipNetwork(
         first.components.shape[1],
         first.targets.shape[1],
-        1 + max(example.speaker for example in [*examples, *labeled]),
+        1 + max(example.speaker for example in examples),
         both_ways=both_ways,
     )
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_WEIGHT_DECAY)
-    num_batches = math.ceil((len(pieces) + share) / _BATCH)
+    num_batches = math.ceil(len(pieces) / _BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, _RATE, total_steps=num_batches * num_epochs
     )
     losses = []
     network.train()
-    for epoch in range(num_epochs):
+    for _ in range(num_epochs):
         total = 0.0
-        turn = range(epoch * share, (epoch + 1) * share)
-        epoch_pieces = pieces + [further[number % len(further)] for number in turn]
         # Pieces of similar length share a batch.
-        lengths = [len(piece.components) // 40 + rng.random() for piece in epoch_pieces]
+        lengths = [len(piece.components) // 40 + rng.random() for piece in pieces]
         batches = np.array_split(np.argsort(lengths), num_batches)
         for number in rng.permutation(num_batches):
             optimizer.zero_grad()
-            loss = network.loss(*_batch([epoch_pieces[k] for k in batches[number]]))
+            loss = network.loss(*_batch([pieces[k] for k in batches[number]]))
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT)
             optimizer.step()

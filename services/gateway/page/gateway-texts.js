@@ -62,7 +62,6 @@ const CHINESE = {
   "it has less than a second of audio": "声音不到一秒",
   "only {speech} s of speech show the lips; film {least} s or more, preferably a minute":
     "只有 {speech} 秒语音能看到嘴唇，请录 {least} 秒以上，最好一分钟",
-  "the shipped lip model and acoustic model do not match; reinstall kouxing": "口型模型与声学模型不匹配，请重新安装 kouxing",
 
   // Other programs
   "VRM shapes": "VRM 形状",

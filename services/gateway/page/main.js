@@ -94,6 +94,10 @@ function handleMessage(message) {
       gateway.lips = message.lips;
       showLipModel();
     },
+    acoustic() {
+      gateway.acoustic = message.acoustic;
+      statusBar.show();
+    },
     status() {
       gateway.missing = message.missing;
       statusBar.show();
@@ -137,6 +141,11 @@ function chosenLipModel() {
 
 function showLipModel() {
   if (isOwnSession() && gateway.lips !== null) settings.showLipModel(gateway.lips);
+}
+
+function chooseAcousticModel(acoustic) {
+  socket.send({ acoustic });
+  element("full-model").hidden = acoustic === "full";
 }
 
 function sendExpressiveness() {
@@ -196,6 +205,7 @@ window.kouxing = {
       soundMinusPictureMs: player.soundMinusImageMs,
       microphone: speech.state === "on",
       lips: gateway.lips,
+      acoustic: gateway.acoustic,
       caption: caption.text,
       mouthProfile: mouthProfiles.current?.profile ?? "",
       drawing: stage.drawing,
@@ -211,6 +221,8 @@ element("sample").onclick = () => {
   speech.unblockSound();
 };
 element("learn").onclick = () => lesson.open();
+element("light-model").onclick = () => chooseAcousticModel("light");
+element("full-model").onclick = () => chooseAcousticModel("full");
 document.body.dataset.view = query.get("view") ?? "";
 if (query.has("background")) document.documentElement.style.background = query.get("background");
 showMouthProfile();

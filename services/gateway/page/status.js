@@ -17,6 +17,7 @@ export class GatewayState {
   epoch = 0; // of the session; it increases with each restart
   isSample = false; // whether the session is the sample sentence that this page asked for
   lips = null; // lip model of the session; null: unknown
+  acoustic = ""; // acoustic model of the session: full or light
   missing = []; // services that are not running
 
   /** Whether the gateway refused the first connection, although it served this page. */
@@ -35,12 +36,13 @@ export class GatewayState {
   }
 
   /** Take a "session" message; return { isRestart, isOther }: whether the epoch or session changed. */
-  setSession({ session, epoch, sample, lips }) {
+  setSession({ session, epoch, sample, lips, acoustic }) {
     const isOther = session !== this.session;
     const isRestart = !isOther && session !== null && epoch > this.epoch;
     this.session = session;
     this.epoch = epoch;
     this.isSample = sample;
+    this.acoustic = acoustic;
     if (session !== null) this.lips = lips || null; // a session that has ended is still visible
     return { isOther, isRestart };
   }
@@ -172,6 +174,9 @@ export class StatusBar {
     element("status").title = session === null ? "" : say("sessionName", { name: session });
     setText(element("state"), say(isBehind && isThisComputer() ? "behindBusy" : state));
     element("behind").hidden = !isBehind;
+    const isLight = gateway.acoustic === "light";
+    for (const name of ["light", "acoustic"]) element(name).hidden = !isLight;
+    element("light-model").hidden = isLight;
 
     const { playout, voiceToImageMs } = player;
     const isAudible = isLive && sound.state === "on";

@@ -48,6 +48,7 @@ export const TEXTS = {
     zh: "请关闭其他程序，以及显示本页的其他窗口。",
   },
   fewerPictures: { en: "Draw fewer pictures", zh: "减少画面" },
+  useLightModel: { en: "Use the light model", zh: "使用轻量模型" },
   gatewayStopped: {
     en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
     zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
@@ -119,6 +120,8 @@ export const TEXTS = {
     zh: "没有显卡，画面已简化：{size} 像素",
   },
   allPictures: { en: "Draw all pictures again", zh: "恢复全部画面" },
+  lightModel: { en: "light model", zh: "轻量模型" },
+  useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
   expression: { en: "Expression", zh: "表情" },

@@ -1,11 +1,11 @@
-"""The interface of acoustic models, Gaussian and neural."""
+"""The interface of acoustic models, Gaussian mixtures and networks."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,13 +57,6 @@ class FrontEnd(Protocol):
         """Take samples, shape (n,), 16 kHz, in [-1, 1]; return the new frames, (m, k)."""
 
 
-class NetworkPosition(NamedTuple):
-    """What a network computes at one position, for a lip predictor."""
-
-    frames: Floats  # (2, 80) its two newest log-mel frames
-    values: Floats  # (layers, heads, size) attention values
-
-
 class AcousticStream(ABC):
     """State scores of one speaker's speech, segment by segment.
 
@@ -71,13 +64,12 @@ class AcousticStream(ABC):
     provisional scores of the next frames, computed from less audio than the settled ones will be.
     """
 
+    uses_ear = False  # whether its frames are the ear's phones instead of the front end's
     look_ahead_frames: int  # the settled scores of a frame come at most this many frames after it
-    positions: list[NetworkPosition]  # new ones, if the stream keeps them; the caller clears it
     provisional: Floats  # (k, states) of the frames after the settled ones; a change is a new array
 
     def __init__(self, model: AcousticModel) -> None:
-        self._model = model
-        self.positions = []
+        self.model = model
         self.provisional = empty_scores(model.topology.num_states)
 
     def score(self, frames: Floats | None) -> Floats:
@@ -85,7 +77,7 @@ class AcousticStream(ABC):
 
         Returns the newly settled scores, (m, states).
         """
-        return self._model.score([(self, frames)])[0]
+        return self.model.score([(self, frames)])[0]
 
     @abstractmethod
     def reset(self) -> None:
@@ -117,8 +109,8 @@ class AcousticModel(ABC):
         """Create the front end of one session."""
 
     @abstractmethod
-    def create_stream(self, *, keep_positions: bool = False) -> AcousticStream:
-        """Create the stream of one speaker. Only a causal network has positions to keep."""
+    def create_stream(self) -> AcousticStream:
+        """Create the stream of one speaker."""
 
     @abstractmethod
     def score(self, work: Sequence[Work]) -> list[Floats]:

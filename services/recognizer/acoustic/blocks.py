@@ -55,6 +55,7 @@ from kouxing.services.recognizer.acoustic.caches import (
     Float16,
     cache_names,
 )
+from kouxing.services.recognizer.acoustic.light import LightModel, light_model
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
@@ -92,8 +93,13 @@ class BlockModel(NetworkModel):
         """Keys and values of all sessions."""
         return CacheMemory(self.session.sizes.cache, _MAX_BATCH)
 
-    def create_stream(self, *, keep_positions: bool = False) -> BlockStream:
-        """Create the stream of one speaker; it keeps no positions."""
+    @cached_property
+    def light(self) -> LightModel | None:
+        """The model that replaces this one on a busy machine; None: the ear has other phones."""
+        return light_model(self.topology, self.log_prior)
+
+    def create_stream(self) -> BlockStream:
+        """Create the stream of one speaker."""
         return BlockStream(self)
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
@@ -199,7 +205,7 @@ class BlockRunner:
 class BlockStream(AcousticStream):
     """Scores of one speaker's speech, segment by segment."""
 
-    _model: BlockModel
+    model: BlockModel
 
     def __init__(self, model: BlockModel) -> None:
         super().__init__(model)

@@ -110,7 +110,7 @@ class GmmModel(AcousticModel):
         """Create the front end of one session."""
         return PitchedLogMel()
 
-    def create_stream(self, *, keep_positions: bool = False) -> GmmStream:
+    def create_stream(self) -> GmmStream:
         """Create the stream of one speaker; it has no positions."""
         return GmmStream(self)
 
@@ -137,7 +137,7 @@ class GmmModel(AcousticModel):
 class GmmStream(AcousticStream):
     """Scores of one speaker's speech, segment by segment."""
 
-    _model: GmmModel
+    model: GmmModel
 
     def __init__(self, model: GmmModel) -> None:
         super().__init__(model)
@@ -153,21 +153,21 @@ class GmmStream(AcousticStream):
         """
         if frames is None:
             features = self._differences.finish()
-            self._differences = Differences(self._model.half_width)
+            self._differences = Differences(self.model.half_width)
         else:
             log_mel = self._vtln.warp(frames[:, :-2], frames[:, -2], frames[:, -1])
             features = self._differences.append(cepstra(log_mel))
         normalized = self._mean.normalize(features)
-        scores = np.empty((len(features), self._model.topology.num_states), dtype=np.float32)
-        num_mixtures = self._model.mixtures.weights.shape[1]
+        scores = np.empty((len(features), self.model.topology.num_states), dtype=np.float32)
+        num_mixtures = self.model.mixtures.weights.shape[1]
         for row in range(len(features)):  # row by row: a product's rounding depends on its height
-            frame = normalized[row : row + 1] @ self._model.rotation
-            scores[row] = mixture_scores(frame, self._model.matrix, num_mixtures)[0]
-        return scores * np.float32(self._model.acoustic_scale)
+            frame = normalized[row : row + 1] @ self.model.rotation
+            scores[row] = mixture_scores(frame, self.model.matrix, num_mixtures)[0]
+        return scores * np.float32(self.model.acoustic_scale)
 
     def reset(self) -> None:
         """Forget the segment and the speaker."""
-        self._differences = Differences(self._model.half_width)
+        self._differences = Differences(self.model.half_width)
         self._vtln.reset()
         self._mean.reset()
 

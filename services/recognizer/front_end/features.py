@@ -97,6 +97,16 @@ def _cepstral_matrix() -> NDArray[np.float32]:
 _CEPSTRAL = _cepstral_matrix()
 
 
+def frame_time_s(frame: int) -> float:
+    """Time of the boundary before a feature frame: halfway between two windows' middles."""
+    return frame * HOP_S + (WINDOW_S - HOP_S) / 2
+
+
+def frame_at(time_s: float) -> int:
+    """Return the feature frame whose preceding boundary is nearest to a time."""
+    return round((time_s - (WINDOW_S - HOP_S) / 2) / HOP_S)
+
+
 def frames_in(num_samples: int) -> int:
     """Return the number of whole feature frames in a number of samples."""
     return max(0, (num_samples - WINDOW_SAMPLES) // HOP_SAMPLES + 1)

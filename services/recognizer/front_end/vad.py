@@ -1,100 +1,69 @@
-"""Voice activity detection (VAD): finds speech in the audio.
+"""Voice activity detection (VAD): starts and ends of speech, and of laughter.
 
-A network (Silero VAD 6.2, MIT) computes a speech probability every 32 ms. Three states turn it into
-starts and ends of speech:
+The small ear computes the probabilities of the kinds of voice every 20 ms. A detector follows one
+of them. It starts as soon as there is enough evidence (a cumulative sum, Page 1954):
 
-    quiet --probable--> speaking --improbable--> stopping --for STOP_BLOCKS--> quiet
-                            ^                       |
-                            +-------probable--------+
+======== ============================================================= ====
+symbol   meaning                                                       unit
+======== ============================================================= ====
+p        probability of the kind of voice                              1
+d        probability that counts as no evidence                        1
+e        evidence                                                      1
+======== ============================================================= ====
 
-Onset delay: a block of 32 ms is judged when it is complete. If the first block of speech is
-probable at once, speech is detected up to 32 ms after it starts. Waiting for a second block
-rejected no more noise in tests, neither clicks nor knocks. A pre-roll restores the audio before
-the detection (see :mod:`kouxing.services.recognizer.speech_scorer`).
+    e(n) = max(0, e(n - 1) + p(n) - d)
 
-======== ================================================================ =============
-symbol   meaning                                                          shape
-======== ================================================================ =============
-x        a block, preceded by 64 samples of context                       (1, 576)
-h        state of its long short-term memory, hidden and cell             (2, 1, 128)
-======== ================================================================ =============
-
-Deviation: the context is the mirrored start of the block, as the network mirrors the end of the
-block. Silero's code takes the last samples of the previous block instead.
-
-Cost: about 4 ms of one core per second of audio.
+It ends when the voice has been improbable for half a second. A pre-roll restores the audio before
+the detection of speech (see :mod:`kouxing.services.recognizer.speech_segmenter`).
 """
 
-from __future__ import annotations
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats
+from kouxing.services.recognizer.ear import Voice
 
-from enum import Enum
-from functools import cache
-from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
-from kouxing.services.recognizer.onnx_session import open_network
-
-BLOCK_SAMPLES = 512  # at 16 kHz: 32 ms, fixed by the network
-_PROBABLE = 0.2  # enough to start: the lips must not miss the first syllable
-_IMPROBABLE = 0.35  # one weak syllable does not end the speech, only many such blocks do
-_STOP_BLOCKS = 16  # half a second: longer than a closure or a breath between phrases
-
-_NETWORK = Path(__file__).parents[1] / "models" / "silero_vad.onnx"
-_CONTEXT_SAMPLES = 64
-_STATE_SHAPE = (2, 1, 128)
-
-
-class VoiceState(Enum):
-    """The three states."""
-
-    QUIET = "quiet"
-    SPEAKING = "speaking"
-    STOPPING = "stopping"
-
-    @property
-    def is_speech(self) -> bool:
-        """Whether the audio is recognized."""
-        return self is not VoiceState.QUIET
+_IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such positions do
+_STOP_POSITIONS = 25  # half a second: longer than a closure or a breath between phrases
 
 
 class VoiceActivityDetector:
-    """Follows one stream block by block."""
+    """Follows one stream, position by position."""
 
     def __init__(self) -> None:
-        self.state = VoiceState.QUIET
-        self._num_blocks = 0  # in stopping
-        self._network_state = np.zeros(_STATE_SHAPE, np.float32)
+        self._speech = _Detector(no_evidence=0.75, enough=0.12)
+        self._laughter = _Detector(no_evidence=0.2, enough=3.0)  # it pauses between bursts
 
-    def detect(self, samples: NDArray[np.float32]) -> VoiceState:
-        """Return the state after the next block, shape (512,)."""
-        return self.update(self.speech_probability(samples))
+    @property
+    def is_speech(self) -> bool:
+        """Whether someone speaks or sings, so the audio is recognized."""
+        return self._speech.is_on
 
-    def speech_probability(self, samples: NDArray[np.float32]) -> float:
-        """Return the probability of speech in the next block, shape (512,)."""
-        mirrored = samples[_CONTEXT_SAMPLES:0:-1]
-        inputs = {"input": np.concatenate([mirrored, samples])[None], "state": self._network_state}
-        probability, self._network_state = _network().run(["output", "stateN"], inputs)
-        return float(probability[0, 0])
+    @property
+    def is_laughter(self) -> bool:
+        """Whether someone laughs."""
+        return self._laughter.is_on
 
-    def update(self, probability: float) -> VoiceState:
-        """Return the state after a block with this speech probability."""
-        if self.state is VoiceState.QUIET:
-            if probability >= _PROBABLE:
-                self.state = VoiceState.SPEAKING
-        elif probability >= _IMPROBABLE:
-            self.state, self._num_blocks = VoiceState.SPEAKING, 0
-        else:
-            self._num_blocks += 1
-            self.state = VoiceState.STOPPING
-            if self._num_blocks >= _STOP_BLOCKS:
-                self.state, self._num_blocks = VoiceState.QUIET, 0
-        return self.state
+    def update(self, voice: Floats) -> None:
+        """Take the probabilities of a position, (4,), by ``Voice``."""
+        self._speech.update(float(voice[Voice.SPEECH] + voice[Voice.SUNG]))
+        self._laughter.update(float(voice[Voice.LAUGHTER]))
 
 
-@cache
-def _network() -> Any:
-    """Return the network that all detectors share."""
-    return open_network(_NETWORK.read_bytes())
+class _Detector:
+    """Follows the probability of one kind of voice."""
+
+    def __init__(self, *, no_evidence: float, enough: float) -> None:
+        self.is_on = False
+        self._no_evidence = no_evidence
+        self._enough = enough
+        self._evidence = 0.0
+        self._num_improbable = 0  # positions in a row
+
+    def update(self, probability: float) -> None:
+        """Take the probability at the next position."""
+        self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
+        if self.is_on:
+            self.is_on = self._num_improbable < _STOP_POSITIONS
+            return
+        self._evidence = max(0.0, self._evidence + probability - self._no_evidence)
+        self.is_on = self._evidence >= self._enough
+        if self.is_on:
+            self._evidence = 0.0

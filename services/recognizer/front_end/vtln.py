@@ -38,7 +38,7 @@ Deviations from the paper:
 - The log-mel bands are interpolated. Their filters stay in place, because the audio is no longer
   available.
 
-Only the Gaussian mixture model uses VTLN: the neural models learned low voices from data. Kaldi's
+Only the Gaussian mixture model uses VTLN: the networks learned low voices from data. Kaldi's
 tracker (:mod:`.pitch`) gives other values than this one, which would change the model's scores.
 
 Cost: about 1 ms per second of audio. A frame's pitch depends on the samples up to the frame's end,

@@ -1,4 +1,4 @@
-"""The neural model's front end: Whisper's log-mel bands, live.
+"""The front end of the networks: Whisper's log-mel bands, live.
 
 Source: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision", section
 2.2; the mel scale and the bands are those of Slaney 1998, "Auditory toolbox".

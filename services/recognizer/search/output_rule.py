@@ -21,7 +21,7 @@ class OutputRuleConfig:
 
 
 # Defaults of the models that need other parameters, by the model's name.
-MODEL_RULES = dict.fromkeys(("neural", "gmm"), OutputRuleConfig(1, 0.9))
+MODEL_RULES = dict.fromkeys(("light", "gmm"), OutputRuleConfig(1, 0.9))
 
 
 class OutputRule:

@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import open_file
 from kouxing.training.device import DEVICE
-from kouxing.training.neural.network import Encoder, Network, Shape
-from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
+from kouxing.training.networks.network import Encoder, Shape
+from kouxing.training.networks.teacher import NUM_LAYERS, WholeEncoder
 
 _FILE_NAME = "model.bin"
 _MIN_VERSION = 4
@@ -165,13 +165,6 @@ def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
 
 def init_encoder(whisper: Path, num_states: int) -> WholeEncoder:
     """Make the teacher's encoder, with Whisper's weights."""
-    encoder = WholeEncoder(Shape(num_states=num_states, look_aheads=(), layers=NUM_LAYERS))
+    encoder = WholeEncoder(Shape(num_states=num_states, layers=NUM_LAYERS))
     load_whisper(encoder, whisper)
     return encoder.eval().to(DEVICE)
-
-
-def init_network(whisper: Path, num_states: int, look_aheads: tuple[int, ...]) -> Network:
-    """Make the causal network, with Whisper's weights."""
-    network = Network(Shape(num_states=num_states, look_aheads=look_aheads))
-    load_whisper(network, whisper)
-    return network

@@ -1,7 +1,8 @@
 """Align recordings with their texts, and let a teacher label them.
 
-The teacher (:mod:`kouxing.training.neural.teacher`) learns the alignment and labels all recordings,
-clean and whole. A target is the average of both, or only the teacher's label if there is no text.
+The teacher (:mod:`kouxing.training.networks.teacher`) learns the alignment and labels all
+recordings, clean and whole. A target is the average of both, or only the teacher's label if there
+is no text.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
 from kouxing.services.recognizer.acoustic.network import NetworkModel
-from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.search.decoder import Segment
 from kouxing.services.recognizer.search.forced_path import (
     segments_of_path,
@@ -27,8 +27,8 @@ from kouxing.services.recognizer.search.forced_path import (
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations
-from kouxing.training.neural.batches import Recording, Targets
-from kouxing.training.neural.teacher import WholeEncoder, train_teacher
+from kouxing.training.networks.batches import Recording, Targets
+from kouxing.training.networks.teacher import WholeEncoder, train_teacher
 from kouxing.training.search_weights import all_scores
 from kouxing.training.training_set import (
     FRAMES_PER_MINUTE,
@@ -39,7 +39,6 @@ from kouxing.training.training_set import (
 )
 
 STATES_PER_PHONE = 3
-_LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; those with more are trained less
 _MIN_STAY, _MAX_STAY = 0.05, 0.98
 _LM_SCALE = 2.0  # chosen on development data
 _PRIOR_SCALE = 0.5  # of the states' log priors; chosen on development data
@@ -144,9 +143,6 @@ def _align_all(
     new_place = (2 * place + 1) * STATES_PER_PHONE // (2 * num_states[phone])
     if isinstance(aligner, NetworkModel):
         aligner = replace(aligner, acoustic_scale=1.0)
-    if isinstance(aligner, NeuralModel):
-        layer = int(np.abs(aligner.look_aheads - _LOOK_AHEAD_FRAMES).argmin())
-        aligner = replace(aligner, output_layer=layer)
 
     def align(number: int) -> tuple[NDArray[np.int64], list[Segment]] | None:
         example = examples[number]

@@ -41,15 +41,15 @@ from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
 from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.neural.batches import (
+from kouxing.training.networks.batches import (
     Recording,
     Sample,
     Targets,
     padded_batch,
     sampling_probs,
 )
-from kouxing.training.neural.network import Encoder, Readout, ReadoutShape, Shape
-from kouxing.training.neural.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
+from kouxing.training.networks.network import Encoder, Readout, ReadoutShape, Shape
+from kouxing.training.networks.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
 from kouxing.training.training_set import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder

@@ -1,0 +1,144 @@
+"""Light model: the phones of the small ear, for weak or busy machines.
+
+The ear runs on all audio, so these phones cost only their search. HMMs and phone language model are
+those of the block model.
+
+======== ============================================================== ==================
+symbol   meaning                                                        shape
+======== ============================================================== ==================
+q        log posteriors of the phones, from the ear                     (frames, phones)
+prior    prior of the phones, to a power below one                      (phones,)
+======== ============================================================== ==================
+
+    log b(x) = acoustic_scale * (q - log prior), the same for all states of a phone
+
+The ear's posteriors after frame ``t`` are those of frame ``t - PHONES_LAG_FRAMES``. At the end of a
+segment, the last ones are repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticModel,
+    AcousticStream,
+    Floats,
+    Topology,
+    Work,
+)
+from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.ear import PHONES_LAG_FRAMES, load_ear
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
+
+_ACOUSTIC_SCALE = 1.0
+
+
+class EarPhones:
+    """A front end that runs the ear: its log posteriors, (frames, phones)."""
+
+    def __init__(self) -> None:
+        self._mel = WhisperMel()
+        self._ear = load_ear().create_stream()
+        self._rows = np.empty((0, load_ear().num_phones), np.float32)
+        self._frames = np.empty((0, NUM_MELS), np.float32)
+
+    def accept_waveform(self, samples: Floats) -> Floats:
+        """Take samples, shape (n,), 16 kHz, in [-1, 1]; return the new rows."""
+        self._frames = np.concatenate([self._frames, self._mel.accept_waveform(samples)])
+        rows = [self._rows[:0]]
+        while len(self._frames) >= FRAMES_PER_POSITION:
+            position = self._ear.accept_position(self._frames[:FRAMES_PER_POSITION])
+            rows.append(position.phones[np.newaxis].repeat(FRAMES_PER_POSITION, axis=0))
+            self._frames = self._frames[FRAMES_PER_POSITION:]
+        return np.concatenate(rows)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightModel(AcousticModel):
+    """Scores from the ear's phones."""
+
+    log_prior: Floats  # (phones,)
+
+    def create_front_end(self) -> EarPhones:
+        """Create a front end, for audio that passes through no other ear."""
+        return EarPhones()
+
+    def create_stream(self) -> LightStream:
+        """Create the stream of one speaker."""
+        return LightStream(self)
+
+    def score(self, work: Sequence[Work]) -> list[Floats]:
+        """Score the ear's rows of several streams; None ends a stream's segment."""
+        return [self._scores_of(cast(LightStream, stream).take(rows)) for stream, rows in work]
+
+    def _scores_of(self, rows: Floats) -> Floats:
+        num_states = np.diff(self.topology.first_state)
+        scores = np.float32(_ACOUSTIC_SCALE) * (rows - self.log_prior)
+        return np.repeat(scores, num_states, axis=1)
+
+
+class LightStream(AcousticStream):
+    """Scores of one speaker's speech, segment by segment."""
+
+    uses_ear = True
+    look_ahead_frames = PHONES_LAG_FRAMES
+
+    def __init__(self, model: LightModel) -> None:
+        super().__init__(model)
+        self._no_rows = np.empty((0, len(model.log_prior)), np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the segment."""
+        self.start(0)
+
+    def start(self, num_missing: int) -> None:
+        """Start where another stream stopped, ``num_missing`` frames before the next one."""
+        self._num_missing = num_missing  # frames that have no scores yet
+        self._num_early = PHONES_LAG_FRAMES - num_missing  # rows for frames that have scores
+        self._last = self._no_rows
+
+    def take(self, rows: Floats | None) -> Floats:
+        """Return the rows of the next frames to score."""
+        if rows is None:
+            rows = self._last.repeat(self._num_missing, axis=0)
+            self.reset()
+            return rows
+        self._num_missing += len(rows)
+        if len(rows):
+            self._last = rows[-1:]
+        if self._num_early < 0 and len(rows):
+            rows = np.concatenate([rows[:1].repeat(-self._num_early, axis=0), rows])
+            self._num_early = 0
+        num_early = min(len(rows), self._num_early)
+        self._num_early -= num_early
+        self._num_missing -= len(rows) - num_early
+        return rows[num_early:]
+
+
+def light_model(topology: Topology, log_prior: Floats) -> LightModel | None:
+    """Build the model for HMMs with a prior of their states, (states,).
+
+    Returns None if the ear has other phones.
+    """
+    inventory = topology.inventory
+    if (inventory.language, len(inventory)) != (DEFAULT_LANGUAGE, load_ear().num_phones):
+        return None
+    priors = np.add.reduceat(np.exp(log_prior), topology.first_state[:-1])
+    return LightModel(topology=topology, log_prior=np.log(priors))
+
+
+def light_model_from(archive: Archive) -> LightModel:
+    """Build the model from the file of a block model; ``ValueError`` if something does not fit."""
+    topology = topology_from(archive)
+    model = light_model(topology, archive.floats("log_prior", topology.num_states))
+    if model is None:
+        raise ValueError("the small ear has other phones")
+    return model

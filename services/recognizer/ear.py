@@ -1,0 +1,126 @@
+"""The small ear: a recurrent network that follows all audio, with and without speech.
+
+It computes what the voice detector and the lip predictor need. A position is 20 ms of audio, two
+log-mel frames.
+
+======== ======================================================== ==================
+symbol   meaning                                                  shape
+======== ======================================================== ==================
+x        the two frames of a position                             (160,)
+h        state of the recurrent layers                            (state width,)
+f        features for a lip predictor                             (features,)
+q        log posteriors of the phones of the default language,    (phones,)
+         for the frames ``PHONES_LAG_FRAMES`` earlier
+v        probabilities of the kinds of voice (:class:`Voice`),    (4,)
+         for the audio 40 ms earlier
+======== ======================================================== ==================
+
+:mod:`kouxing.training.ear` trains the network.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats
+from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive
+from kouxing.services.recognizer.acoustic.network import (
+    FRAMES_PER_POSITION,
+    check_outputs,
+    open_session,
+    run_session,
+)
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.shared.errors import UserError
+
+EAR_PATH = Path(__file__).parent / "models" / "ear.npz"
+FORMAT = "ear 1"
+
+PHONES_LAG_FRAMES = 5
+LIP_DELAYS_S = (0.015, 0.055, 0.155)  # of the lips at the end of the features
+
+_OUTPUTS = ["features", "phones", "voice", "new_state"]
+_MAX_WIDTH = 4096
+
+
+class Voice(IntEnum):
+    """Kinds of voice."""
+
+    NONE = 0
+    SPEECH = 1
+    SUNG = 2  # or held
+    LAUGHTER = 3
+
+
+class HeardPosition(NamedTuple):
+    """What the ear computes at a position; shapes as above."""
+
+    frames: Floats  # x as (2, 80)
+    features: Floats
+    phones: Floats
+    voice: Floats
+
+
+class Ear:
+    """The network, shared by any number of streams."""
+
+    def __init__(self, file: NDArray[np.uint8]) -> None:
+        """Open an ONNX file; ``ValueError`` if it does not contain a small ear."""
+        self._session = open_session(file)
+        nodes = [*self._session.get_inputs(), *self._session.get_outputs()]
+        widths = {node.name: node.shape[-1] for node in nodes}
+        self.state_width, self.num_features, self.num_phones = (
+            widths.get(name, 0) for name in ("state", "features", "phones")
+        )
+        for width in (self.state_width, self.num_features, self.num_phones):
+            if not (isinstance(width, int) and 1 <= width <= _MAX_WIDTH):
+                raise ValueError(f"its network has the widths {widths}")
+        state = np.zeros(self.state_width, np.float32)
+        values = self.run(np.zeros((FRAMES_PER_POSITION, NUM_MELS), np.float32), state)
+        sizes = (self.num_features, self.num_phones, len(Voice), self.state_width)
+        check_outputs(values, [(size,) for size in sizes])
+
+    def run(self, frames: Floats, state: Floats) -> list[Floats]:
+        """Compute f, q, v and the new state from x as (2, 80) and h."""
+        inputs = {"frames": frames.reshape(1, -1), "state": state[np.newaxis]}
+        return [output[0] for output in run_session(self._session, _OUTPUTS, inputs)]
+
+    def create_stream(self) -> EarStream:
+        """Create the stream of one session."""
+        return EarStream(self)
+
+
+class EarStream:
+    """The positions of one session's audio."""
+
+    def __init__(self, ear: Ear) -> None:
+        self._ear = ear
+        self._state = np.zeros(ear.state_width, np.float32)
+
+    def accept_position(self, frames: Floats) -> HeardPosition:
+        """Take the next position's frames, (2, 80)."""
+        features, phones, voice, self._state = self._ear.run(frames, self._state)
+        return HeardPosition(frames, features, phones, voice)
+
+
+@cache
+def load_ear(path: Path = EAR_PATH) -> Ear:
+    """Read a model file; ``UserError`` if it is missing, broken or of another format."""
+    archive = read_archive(path)
+    try:
+        return _ear_from(archive)
+    except ValueError as error:
+        raise UserError(f"small ear {path}: {error}; train it again") from error
+
+
+def _ear_from(archive: Archive) -> Ear:
+    form = str(archive.array("format", ()))
+    if form != FORMAT:
+        raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
+    return Ear(archive.array("network", None).astype(np.uint8))

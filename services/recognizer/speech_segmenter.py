@@ -1,0 +1,181 @@
+"""Finds the speech in one session's audio, and predicts the lips during it.
+
+    samples -> front ends -> small ear -> [speech only] frames, lip frames
+
+Time is media time, counted from the first sample. Feature frame ``t`` covers the 10 ms around the
+middle of its window. Any chunking of the same audio gives the same result, because every step
+processes whole positions, in order.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.ear import HeardPosition, load_ear
+from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
+from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
+from kouxing.services.recognizer.lip_frames import LipFrameStream
+from kouxing.shared.phones.events import LipPositions
+
+PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
+_DETECTION_S = 0.06  # the ear's look-ahead, and a position
+# Positions end at odd frames, POSITION_LAG_S before a multiple of 20 ms. Speech starts at one.
+_FIRST_FRAME_PARITY = 1
+_SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip frame needs
+_BLOCK_FRAMES = 4  # of a block of the network; blocks start with the speech
+_PRE_ROLL_FRAMES = round((PRE_ROLL_S + _DETECTION_S) / HOP_S)
+_MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_POSITION
+
+
+@dataclass(frozen=True, slots=True)
+class SpeechStart:
+    """Speech starts. Its first frame is ``frame``."""
+
+    frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class SpeechEnd:
+    """Speech has ended before ``frame``."""
+
+    frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class SpeechFrames:
+    """The next frames of speech; they end with a position."""
+
+    features: Floats  # (n, k), of the front end
+    phones: Floats  # (n, phones), the ear's log posteriors after each frame
+
+
+SpeechItem: TypeAlias = SpeechStart | SpeechEnd | SpeechFrames | LipPositions
+
+
+class SpeechSegmenter:
+    """Follows the audio of one session.
+
+    Parameters
+    ----------
+    front_end
+        Computes the feature frames.
+    lip_stream
+        Predicts lip frames during speech, if any.
+    start_frame
+        Frame at which speech started, if another recognizer processed its start; negative before
+        the audio. The first speech then starts where the network's blocks align with those of the
+        other recognizer.
+    """
+
+    def __init__(
+        self,
+        front_end: FrontEnd,
+        lip_stream: LipFrameStream | None = None,
+        start_frame: int | None = None,
+    ) -> None:
+        self._front_end = front_end
+        self._mel = None if isinstance(front_end, WhisperMel) else WhisperMel()
+        self._lip_stream = lip_stream
+        self._start_frame = start_frame
+        self._ear = load_ear().create_stream()
+        self._detector = VoiceActivityDetector()
+        self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
+        self._features: Floats | None = None  # its feature frames
+        # Features and positions before speech
+        self._recent: deque[tuple[Floats, HeardPosition]] = deque(maxlen=_MAX_RECENT)
+        self._num_frames = 0
+        self._is_speaking = False
+
+    @property
+    def is_laughter(self) -> bool:
+        """Whether someone laughs at the end of the audio."""
+        return self._detector.is_laughter
+
+    def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
+        """Take samples, 16 kHz mono, shape (n,); yield what follows from them."""
+        features = self._front_end.accept_waveform(samples)
+        mels = features if self._mel is None else self._mel.accept_waveform(samples)
+        self._mels = np.concatenate([self._mels, mels])
+        if self._features is not None:
+            features = np.concatenate([self._features, features])
+        while len(self._mels) >= FRAMES_PER_POSITION:
+            position = self._ear.accept_position(self._mels[:FRAMES_PER_POSITION])
+            yield from self._process(features[:FRAMES_PER_POSITION], position)
+            self._mels = self._mels[FRAMES_PER_POSITION:]
+            features = features[FRAMES_PER_POSITION:]
+        self._features = features
+
+    def input_finished(self) -> Iterator[SpeechItem]:
+        """End the audio."""
+        if self._is_speaking:
+            yield self._end_speech()
+
+    def _process(self, features: Floats, position: HeardPosition) -> Iterator[SpeechItem]:
+        """Process a position: start or end speech, predict lips."""
+        self._num_frames += len(features)
+        if self._is_speaking:
+            yield _frames_of([(features, position)])
+        else:
+            self._recent.append((features, position))
+        self._detector.update(position.voice)
+        if self._is_speaking and not self._detector.is_speech:
+            yield self._end_speech()
+        elif self._is_speaking:
+            yield from self._predict_lips(position, self._num_frames - 1)
+        elif self._detector.is_speech:
+            yield from self._start_speech()
+
+    def _start_speech(self) -> Iterator[SpeechItem]:
+        first = self._first_frame()
+        if self._num_frames - first < FRAMES_PER_POSITION:
+            return
+        self._is_speaking = True
+        self._start_frame = None
+        yield SpeechStart(first)
+        num_frames = self._num_frames - first
+        frames = _frames_of(self._recent)
+        yield SpeechFrames(frames.features[-num_frames:], frames.phones[-num_frames:])
+        if self._lip_stream is not None:
+            self._lip_stream.reset()
+        newest = self._num_frames - 1 - FRAMES_PER_POSITION * (len(self._recent) - 1)
+        for _, position in self._recent:
+            if newest >= first + _SEEN_AFTER_FRAMES:
+                yield from self._predict_lips(position, newest)
+            newest += FRAMES_PER_POSITION
+        self._recent.clear()
+
+    def _first_frame(self) -> int:
+        """Return the frame at which speech starts if it is detected now."""
+        oldest = self._num_frames - FRAMES_PER_POSITION * len(self._recent)
+        first = max(oldest, self._num_frames - _PRE_ROLL_FRAMES)
+        first += (_FIRST_FRAME_PARITY - first) % FRAMES_PER_POSITION
+        if self._start_frame is not None:
+            first -= (first - self._start_frame) % _BLOCK_FRAMES
+            first += _BLOCK_FRAMES * (first < oldest)
+        return first
+
+    def _end_speech(self) -> SpeechEnd:
+        self._is_speaking = False
+        return SpeechEnd(self._num_frames)
+
+    def _predict_lips(self, position: HeardPosition, newest_frame: int) -> list[LipPositions]:
+        """Return the lip frames that follow from a position, whose last frame is given."""
+        if self._lip_stream is None:
+            return []
+        known_s = newest_frame * HOP_S + WINDOW_S
+        return self._lip_stream.process_position(known_s, position.frames, position.features)
+
+
+def _frames_of(positions: Sequence[tuple[Floats, HeardPosition]]) -> SpeechFrames:
+    """Return the frames of some positions."""
+    phones = np.stack([position.phones for _, position in positions])
+    features = np.concatenate([features for features, _ in positions])
+    return SpeechFrames(features, phones.repeat(FRAMES_PER_POSITION, axis=0))

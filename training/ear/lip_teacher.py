@@ -1,0 +1,180 @@
+"""The lip teacher predicts the lips of a speaker from the whole recording.
+
+It learns from filmed speech. Its inputs come from networks that hear the clean recording to its
+end, and its recurrent layer runs both ways. It therefore follows unseen speakers more closely than
+a live network can. It labels speech without video, so that the small ear learns lips from many
+voices.
+
+    z = P clip((h - mean) / deviation, -6, 6)
+    q = log(phones + 0.001) / 3 + 1
+
+====== ============================================================== ==================
+symbol meaning                                                        shape
+====== ============================================================== ==================
+h      positions of Whisper's encoder after three layers, one every   (positions, 1536)
+       20 ms
+P      projection to principal components of variance 1               (1536, 128)
+phones posteriors of the phones, of the block network                 (positions, phones)
+z, q   inputs                                                         (positions, ...)
+====== ============================================================== ==================
+
+Sources: Schuster and Paliwal 1997, "Bidirectional recurrent neural networks"; Xie et al. 2020,
+"Self-training with noisy student improves ImageNet classification" (only the student's input is
+noisy).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from kouxing.corpora.feature_cache import as_integers
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.corpora.parallel import process_in_order
+from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.training.ear.teachers import Teachers
+from kouxing.training.lips.recipe import standardize, units_of
+from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.lips.targets import closed_below, targets_at
+
+Floats = NDArray[np.float32]
+
+POSITION_S = 0.02
+NUM_EPOCHS = 12
+_NUM_COMPONENTS = 128
+_MAX_DEVIATIONS = 6.0
+_MIN_DEVIATION = 1e-3
+_STRIDE = 2  # every second position is used for the principal components
+_PART_SAMPLES, _MIN_SAMPLES = 320_000, 8000  # of a recording
+_MAX_REPEATS = 6  # of the clips of small sources
+_NUM_NETWORKS = 4
+_PARTS = ("mean", "deviation", "directions")
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What the networks hear of a recording; row p is centered on 20 (p + 1) ms."""
+
+    encoder: Floats  # (positions, 1536)
+    phones: Floats  # (positions, phones)
+
+
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """Projection of the encoder's positions to principal components of variance 1."""
+
+    mean: Floats  # (features,)
+    deviation: Floats  # (features,)
+    directions: Floats  # (features, components)
+
+    @classmethod
+    def of(cls, positions: Floats) -> Projection:
+        """Fit it to positions, (n, features)."""
+        some = positions[::_STRIDE]
+        mean, deviation = some.mean(axis=0), some.std(axis=0) + _MIN_DEVIATION
+        standard = _standard(some, mean, deviation)
+        variances, directions = np.linalg.eigh(standard.T @ standard / len(standard))
+        first = slice(-1, -1 - _NUM_COMPONENTS, -1)
+        scale = np.sqrt(np.maximum(variances[first], _MIN_DEVIATION))
+        return cls(mean, deviation, directions[:, first] / scale)
+
+    def apply(self, positions: Floats) -> Floats:
+        """Project positions, (n, features) to (n, components)."""
+        return _standard(positions, self.mean, self.deviation) @ self.directions
+
+
+def _standard(positions: Floats, mean: Floats, deviation: Floats) -> Floats:
+    standard: Floats = (positions - mean) / deviation
+    return standard.clip(-_MAX_DEVIATIONS, _MAX_DEVIATIONS)
+
+
+@dataclass(frozen=True, slots=True)
+class LipTeacher:
+    """Trained networks, whose mean output counts."""
+
+    projection: Projection
+    networks: Sequence[LipNetwork]
+
+    @torch.no_grad()
+    def lips_of(self, heard: Heard) -> Floats:
+        """Predict FAPs in canonical units, closure and lip to teeth: (positions, 17)."""
+        inputs = torch.from_numpy(_inputs(self.projection, heard))
+        outputs = torch.stack([network(inputs[None])[0, :, 0] for network in self.networks])
+        lips: Floats = outputs.mean(dim=0).numpy()
+        lips[:, len(LIP_FAPS) :] = expit(lips[:, len(LIP_FAPS) :])
+        return lips
+
+    def save(self, path: Path) -> None:
+        """Write the teacher."""
+        projection = {name: torch.from_numpy(getattr(self.projection, name)) for name in _PARTS}
+        networks = [network.state_dict() for network in self.networks]
+        torch.save({"projection": projection, "networks": networks}, path)
+
+    @classmethod
+    def load(cls, path: Path) -> LipTeacher:
+        """Read a file of :meth:`save`."""
+        state = torch.load(path, weights_only=True)
+        networks = []
+        for weights in state["networks"]:
+            sizes = weights["entry.weight"].shape[1], 1, len(weights["offset"])
+            networks.append(LipNetwork(*sizes, both_ways=True).eval())
+            networks[-1].load_state_dict(weights)
+        return cls(Projection(*(state["projection"][name].numpy() for name in _PARTS)), networks)
+
+
+def hear(teachers: Teachers, samples: Floats) -> Heard:
+    """Run the networks on a whole recording at 16 kHz."""
+    heard = []
+    for start in range(0, max(1, len(samples) - _MIN_SAMPLES), _PART_SAMPLES):
+        part = samples[start : start + _PART_SAMPLES + WINDOW_SAMPLES]
+        outputs = teachers.compute_targets(as_integers(part))
+        heard.append((outputs.encoder, outputs.phones))
+    encoder, phones = zip(*heard, strict=True)
+    return Heard(np.concatenate(encoder), np.concatenate(phones))
+
+
+def train_lip_teacher(
+    clips: Sequence[LipClip],
+    heard: Sequence[Heard],
+    phones: Mapping[str, Sequence[Phone]],
+    seed: int,
+) -> LipTeacher:
+    """Train the teacher on filmed clips; ``phones`` has those of clips in its language, by name."""
+    projection = Projection.of(np.concatenate([one.encoder for one in heard]))
+    closed_at = closed_below(clips)
+    targets = []
+    for clip, one in zip(clips, heard, strict=True):
+        time_s = POSITION_S * np.arange(1.0, 1 + len(one.encoder))
+        known = phones.get(clip.name)
+        targets.append(targets_at(clip, known, closed_at[clip.speaker], time_s, [0.0]))
+    units = units_of(targets)
+    speakers = sorted({clip.speaker for clip in clips})
+    num_clips = Counter(clip.source for clip in clips)
+    examples = []
+    for clip, one, target in zip(clips, heard, targets, strict=True):
+        rows = _inputs(projection, one), standardize(target, units)
+        example = Example(*rows, speakers.index(clip.speaker))
+        repeats = max(1, min(_MAX_REPEATS, max(num_clips.values()) // num_clips[clip.source]))
+        examples += repeats * [example]
+
+    def train(number: int) -> LipNetwork:
+        network, _ = train_network(
+            examples, num_epochs=NUM_EPOCHS, seed=seed + number, both_ways=True
+        )
+        return network
+
+    return LipTeacher(projection, list(process_in_order(train, range(_NUM_NETWORKS))))
+
+
+def _inputs(projection: Projection, heard: Heard) -> Floats:
+    phones = np.log(heard.phones + 1e-3) / 3 + 1
+    return np.concatenate([projection.apply(heard.encoder), phones], axis=1).astype(np.float32)
