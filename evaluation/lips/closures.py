@@ -84,10 +84,14 @@ def is_closed_at(moments_s: Array, mouth: Mouth) -> Mask:
 
 
 def contacts(made: Mouth, real: Mouth) -> list[Contact]:
-    """Return the closures of made lips. A contact starts when open lips close."""
+    """Return the closures of made lips. A contact starts when open lips close.
+
+    Where the real mouth is not known, such as after the end of the clip, nothing counts.
+    """
     is_open = made.opening > _OPEN
     opened_s = made.time_s[is_open]
     touching = made.is_closed & ~is_open & is_near(made.time_s, opened_s, _OPEN_WINDOW_S)
+    touching &= is_near(made.time_s, real.time_s, WINDOW_S)
     # A contact's number is how often the lips have opened before it. Contact 0 is the initial rest.
     state = np.where(is_open, 1, -1)[is_open | touching]
     number = np.cumsum(np.diff(state, prepend=-1) > 0)[state < 0]

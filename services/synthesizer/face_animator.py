@@ -145,6 +145,7 @@ class FaceAnimator:
             return
         if isinstance(event, EndOfSound):
             self._add_event(SpeechChange(active=False, time_s=time_s))
+            self._pass_to_lips(event)
             yield from self._frames_until(time_s + self._delay_s + REST_S)
             return
         self._add_event(event)

@@ -94,6 +94,15 @@ def test_counts_missed_and_false_closures() -> None:
     assert not second.is_true
 
 
+def test_closures_after_the_end_of_the_clip_do_not_count() -> None:
+    real = mouth((0.5, 0.5), (1.5, 1.5))
+    made = mouth((0.5, 0.5), (3.5, 3.5))
+    is_known = real.time_s < 3.0
+    curves = {"opening": real.opening[is_known]}
+    clip = Mouth(real.time_s[is_known], curves, real.is_closed[is_known])
+    assert closures(made, clip) == Detections(real=2, met=1, made=1, true=1)
+
+
 def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:
     faps = np.zeros((4, NUM_FAPS))
     faps[:, 4] = [-100.0, -110.0, np.nan, -300.0]

@@ -1,6 +1,6 @@
 """Live learnt lips: predicted lip frames and phones in, mouth FAPs out.
 
-    lip frames -> stabilize -> closures -> lip track -> transition
+    lip frames -> stabilize -> closures -> lip track -> transition -> rest
     phones -> dynamic visemes -> tongue
 
 The recognizer predicts ``LipPositions`` from the audio, 50 per second during speech. Small changes
@@ -11,8 +11,8 @@ loudness, so the amplitude modifier is off.
 
 A lip frame is processed once, when its FAP frame is due, without waiting for the next lip frame. If
 lip frames are late, a *transition* keeps the mouth continuous in position and velocity. After the
-last lip frame the mouth moves to rest within 150 ms. Until the first lip frame arrives, the dynamic
-visemes move the whole mouth.
+last lip frame the track closes within 150 ms. In pauses the lips stay ajar (`rest`). Until the
+first lip frame arrives, the dynamic visemes move the whole mouth.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from kouxing.services.synthesizer.lips.learnt.closures import (
     log_odds_of,
     separate_lips,
 )
+from kouxing.services.synthesizer.lips.learnt.rest import RestingLips, part_lips
 from kouxing.services.synthesizer.lips.learnt.track import HOLD_S, MAX_GAP_S, LipTrack
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
@@ -115,14 +116,17 @@ class LearntStream:
         self._on_track = still(self._neutral)  # the track at the last frame
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._rest: RestTransition | None = None  # while media time stands still
+        self._resting = RestingLips()
+        self._ajar = 0.0  # share of the ajar mouth at the last frame
         self._late_s = 0.0  # lateness of the newest lip frame
         self._time_s = start_s  # of the last frame
         self._mouth = still(self._neutral)
         self._tongue = self._neutral
 
     def add_event(self, event: SoundEvent) -> None:
-        """Add a lip frame, a phone, a revision, or a change of voice activity."""
+        """Add a lip frame, a phone, a revision, a level, or a change of voice activity."""
         self._visemes.add_event(event)
+        self._resting.add_event(event)
         match event:
             case LipPositions():
                 self._add_lip_frame(event)
@@ -147,6 +151,7 @@ class LearntStream:
     def flush(self) -> None:
         """Drop the known events and return to rest within 150 ms."""
         self._visemes.flush()
+        self._resting.flush()
         self._queue.clear()
         for phones in (self._bilabials, self._labiodentals):
             phones.clear()
@@ -158,12 +163,14 @@ class LearntStream:
         """Return the mouth at a media time, seconds; times rise."""
         visemes = self._visemes.frame_at(time_s)
         self._tongue = visemes.faps
+        self._resting.follow_voice(time_s)
         if self._has_lip_frames:
             self._follow_track(time_s)
         else:
             step_s = max(time_s - self._time_s, 1e-3)
             self._mouth = FapState(visemes.faps, (visemes.faps - self._mouth.value) / step_s)
             self._rest = None
+        self._ajar = self._resting.share_at(time_s)
         self._time_s = time_s
         return self._frame(visemes.articulation)
 
@@ -171,6 +178,7 @@ class LearntStream:
         """Return the mouth one step closer to rest."""
         visemes = self._visemes.relax(step_s)
         self._tongue = visemes.faps
+        self._ajar = self._resting.relax(step_s)
         if self._rest is None:
             self._rest = RestTransition(self._mouth, self._neutral, _REST_S)
         self._mouth = self._rest.step(step_s)
@@ -220,9 +228,9 @@ class LearntStream:
         separate_lips(faps)
         rule = self._rule
         teeth = self._labiodentals.log_odds(frame.time_s) - _TEETH_LOG_ODDS
-        closure = rule.log_odds(
-            faps, log_odds_of(frame.closure), self._bilabials.log_odds(frame.time_s)
-        )
+        phones = self._bilabials.log_odds(frame.time_s)
+        closure = rule.log_odds(faps, log_odds_of(frame.closure), phones)
+        closure -= self._resting.doubt_at(frame.time_s, frame.closure, phones)
         lip_to_teeth(faps, closure_share(teeth, rule.doubt))
         share = closure_share(closure, rule.doubt)
         before, newest = self._shares
@@ -234,6 +242,7 @@ class LearntStream:
 
     def _frame(self, articulation: Articulation) -> MouthFrame:
         faps = self._mouth.value.copy()
+        part_lips(faps, self._ajar)
         faps[_UNTRACKED] = self._tongue[_UNTRACKED]
         return MouthFrame(faps, articulation)
 

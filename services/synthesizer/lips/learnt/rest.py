@@ -1,0 +1,176 @@
+"""Lips in pauses: they stay ajar, close slowly, and part before the next sound.
+
+Filmed speakers hold 0.4 to 0.6 of their range in a pause within a turn. They close in 0.4 s if it
+lasts, and part 0.3 s before the next sound. The lip predictor shows little of this, because half of
+its training data rests closed.
+
+======  =========================================================  ====
+symbol  meaning                                                    unit
+======  =========================================================  ====
+s       share of the way from the predicted mouth to an ajar one   1
+======  =========================================================  ====
+
+    goal of s = 1  from the start of a pause for at most HOLD_S,
+                   and from LEAD_S before voice activity to its first sound
+                0  otherwise
+
+The share follows cubics, so the mouth moves without corners. A sound is a level at most
+``_RANGE_DB`` below the loudest recent one. Silence is a pause once ``_MIN_PAUSE_S`` of it are
+known, because the closure of a stop is shorter. In a pause, lips close for a phone and for a likely
+closure shortly before a sound. If the lip predictor is nearly certain that they are closed, they
+stay closed until the next sound. All times are media times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, SpeechChange
+
+HOLD_S = 0.85  # lips stay ajar until this time after the last sound
+LEAD_S = 0.36  # lips part this long before voice activity, if it is known
+PART_S, CLOSE_S = 0.15, 0.4  # the ways to the ajar mouth, and back if the pause lasts
+CERTAIN = 0.98  # probability from which the lip predictor closes lips in a pause
+_YIELD_S = 0.06  # the way back before a sound, and to lips that the predictor closes
+_END_S = 0.25  # the way back after the end of the sound
+_RELAX_S = 0.12  # the way back while no sound arrives
+_MIN_PAUSE_S = 0.12
+_RANGE_DB = 25.0
+_FADE_DB = 0.2  # per level; the loudest one fades, so a bang counts only for a short time
+_LAST_SOUND_S = 0.03  # silence known this long after a lip frame makes its closure doubtful
+_ONSET_S, _LIKELY = 0.15, 0.8  # so shortly before a sound, a closure this probable counts
+_DOUBT = 3.0  # log odds
+
+_AJAR_FAPS = {
+    fap: units
+    for units, faps in (
+        (110.0, [3]),
+        (-55.0, [4, 51]),
+        (-45.0, [8, 9, 55, 56]),
+        (-125.0, [5, 52]),
+        (-105.0, [10, 11, 57, 58]),
+    )
+    for fap in faps
+}
+AJAR = np.array([_AJAR_FAPS.get(fap, 0.0) for fap in MOUTH_FAPS])  # (num_mouth_faps,) FAP units
+
+
+class RestingLips:
+    """The share of the ajar mouth in one session."""
+
+    def __init__(self) -> None:
+        self._levels: deque[tuple[float, float]] = deque()  # of future frames: time s, dB
+        self._changes: deque[SpeechChange] = deque()  # of future frames
+        self._is_voice = self._has_ended = False
+        self._loudest_db = -math.inf
+        self._known_s = -math.inf  # the levels are known up to here
+        self._sound_s = -math.inf  # end of the last sound, or start of the voice activity
+        self._stays_shut = True  # until the next sound
+        self._is_phone = False  # a phone closes the lips
+        self._time_s = math.inf  # of the last frame
+        self._goal = 0.0
+        self._way, self._elapsed_s = _way_to(0.0, 0.0, 0.0, 1.0), 0.0
+
+    def add_event(self, event: SoundEvent) -> None:
+        """Add a level, a change of voice activity, or the end of the sound."""
+        match event:
+            case Progress():
+                self._levels.append((event.time_s, event.level_db))
+                self._loudest_db = max(event.level_db, self._loudest_db - _FADE_DB)
+                self._known_s = event.time_s
+            case SpeechChange():
+                self._changes.append(event)
+            case EndOfSound():
+                self._has_ended = True
+
+    def flush(self) -> None:
+        """Drop the known events; the next frames lead to rest."""
+        self._levels.clear()
+        self._changes.clear()
+        self._is_voice, self._sound_s = False, -math.inf
+
+    def follow_voice(self, time_s: float) -> None:
+        """Process the events up to the time of a frame; times rise."""
+        while self._changes and self._changes[0].time_s <= time_s:
+            change = self._changes.popleft()
+            if change.active and not self._is_voice:
+                self._sound_s, self._stays_shut = change.time_s, False
+            self._is_voice = change.active
+        while self._levels and self._levels[0][0] <= time_s:
+            level_s, level_db = self._levels.popleft()
+            if self._is_sound(level_db):
+                self._sound_s, self._stays_shut = level_s, False
+
+    def doubt_at(self, time_s: float, closure: float, phones: float) -> float:
+        """Return the log odds that silence subtracts from a closure at a lip frame's time.
+
+        ``closure`` is the predicted probability, and ``phones`` are the log odds that phones add.
+        """
+        self._is_phone = phones > 0.0
+        if self._is_phone:
+            return 0.0
+        ends_s, next_s = time_s + _LAST_SOUND_S, self._next_sound_s()
+        is_silent = self._is_voice and self._known_s > ends_s and next_s > self._known_s
+        is_onset = _YIELD_S < next_s - time_s <= _ONSET_S
+        if closure >= (_LIKELY if is_onset else CERTAIN):
+            self._stays_shut |= is_silent or is_onset
+            return 0.0
+        if self._goal > 0.0:
+            return math.inf
+        return _DOUBT if is_silent else 0.0
+
+    def share_at(self, time_s: float) -> float:
+        """Return the share at the time of a frame."""
+        next_s = self._next_sound_s()
+        soon_s = time_s + LEAD_S
+        if self._has_ended:
+            self._head_for(0.0, _END_S)
+        elif any(change.active and change.time_s <= soon_s for change in self._changes):
+            self._head_for(1.0, PART_S)
+        elif self._is_phone or self._stays_shut or next_s <= time_s + _YIELD_S:
+            self._head_for(0.0, _YIELD_S)
+        elif time_s > self._sound_s + HOLD_S:
+            self._head_for(0.0, CLOSE_S)
+        elif not self._is_voice or min(next_s, self._known_s) >= self._sound_s + _MIN_PAUSE_S:
+            self._head_for(1.0, PART_S)
+        self._elapsed_s += max(time_s - self._time_s, 0.0)
+        self._time_s = time_s
+        return self._share()
+
+    def relax(self, step_s: float) -> float:
+        """Return the share one step closer to rest while media time stands still."""
+        self._head_for(0.0, _RELAX_S)
+        self._elapsed_s += step_s
+        return self._share()
+
+    def _is_sound(self, level_db: float) -> bool:
+        return self._is_voice and level_db >= self._loudest_db - _RANGE_DB
+
+    def _next_sound_s(self) -> float:
+        return next((time_s for time_s, db in self._levels if self._is_sound(db)), math.inf)
+
+    def _head_for(self, goal: float, duration_s: float) -> None:
+        if goal != self._goal:
+            velocity = float(self._way.at(self._elapsed_s).velocity[0])
+            self._way = _way_to(goal, self._share(), velocity, duration_s)
+            self._goal, self._elapsed_s = goal, 0.0
+
+    def _share(self) -> float:
+        return self._goal + float(self._way.value_at(self._elapsed_s)[0])
+
+
+def _way_to(goal: float, share: float, velocity: float, duration_s: float) -> Transition:
+    """Return the way from a share and its velocity to a goal."""
+    difference = FapState(np.array([share - goal]), np.array([velocity]))
+    return Transition(difference, np.array([duration_s]))
+
+
+def part_lips(faps: NDArray[np.float64], share: float) -> None:
+    """Move the mouth, FAPs (num_mouth_faps,), towards the ajar one, in place."""
+    faps += share * (AJAR - faps)
