@@ -1,4 +1,4 @@
-"""The initial networks, with the weights of Whisper's encoder.
+"""Load the weights of Whisper's encoder.
 
 Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (weights
 published by OpenAI under the MIT license). The file format is CTranslate2's (MIT license,
