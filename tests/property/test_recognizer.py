@@ -13,7 +13,8 @@ from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import FrameScores, SpeechEnd, SpeechStart
+from kouxing.services.recognizer.speech_scorer import FrameScores
+from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Waveform
 from tests.live_streams import LiveStream
