@@ -1,7 +1,7 @@
 """From clips of tracked lips to the lip model.
 
     clips -> [small ear] -> principal components -> recurrent network with each speaker's units
-                         -> the ear's own lips   -> mean of the two
+                         -> the ear's own lips   -> weighted mean
 
 The recipe trains on every clip that is not held out and whose license allows it. These clips do not
 determine any setting. Each clip is used as it is, and once augmented. Clips of small sources are
