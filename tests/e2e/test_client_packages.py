@@ -10,6 +10,7 @@ import sys
 import threading
 import venv
 from collections.abc import Iterator
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -297,13 +298,13 @@ def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser
 @contextlib.contextmanager
 def speech(system: System) -> Iterator[None]:
     """Speak in the session that the faces show."""
-    samples = np.resize(samples_of_file(SPEECH)[:24000], 240_000)
+    samples = samples_of_file(SPEECH)[:24000]
     ended = threading.Event()
     with Client(system.control) as client:
         session = client.open_session(name="seen", encoding="f32le")
 
         def speak() -> None:
-            for begin in range(0, len(samples), 1600):
+            for begin in cycle(range(0, len(samples), 1600)):
                 session.push(samples[begin : begin + 1600])
                 if ended.wait(0.1):
                     return
