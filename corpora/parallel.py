@@ -1,7 +1,5 @@
 """Process items in parallel, on all cores of a machine with more than two."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections import deque

@@ -1,7 +1,5 @@
 """How well mouths agree with others at the same times: correlation, error, lag and closures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

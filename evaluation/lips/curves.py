@@ -1,7 +1,5 @@
 """Curves of a mouth: correlation, error and lag of two curves, and how often a curve turns."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Both figures are normalized for each speaker, because microphones and faces differ.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 

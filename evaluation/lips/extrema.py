@@ -9,8 +9,6 @@ The misalignment is the mean absolute offset of the pairs of a clip.
 Long clips are cut into pieces of 8 s, because the paper's sequences are sentences.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d

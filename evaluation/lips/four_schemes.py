@@ -14,8 +14,6 @@ corrects it (eq. 4, figure 3). A wrong phone stays, and its duration stays the m
 phone counts when the rule emits the next one; by then the search has measured its duration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest

@@ -4,8 +4,6 @@ Source: Wang & Cai 2003, eq. 6: every frame blends all visemes and silences. Li 
 schemes 1 (phones of a forced alignment) and 2 (recognized phones with their times).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

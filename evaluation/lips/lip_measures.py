@@ -4,8 +4,6 @@ A *take* is a clip with a mouth to judge. The mouth is made by a lip model, or i
 one, which shows what to aim for. All figures are pooled over the clips.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

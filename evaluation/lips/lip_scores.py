@@ -5,8 +5,6 @@ The frames are those that the services would send, with clean sound, and with ot
 clip that a shipped model may be trained on. *Mocap* clips are motion capture instead of video.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Print the scores of lips in one table that fits a screen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from rich.console import Console

@@ -1,7 +1,5 @@
 """Mouths to compare: tracked ones, and those that a lip model makes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

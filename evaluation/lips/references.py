@@ -1,7 +1,5 @@
 """Clips with tracked lips, their phones, and when somebody speaks in them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

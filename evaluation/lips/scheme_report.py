@@ -1,7 +1,5 @@
 """Print the comparison of the four schemes of Li et al. 2011."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby, pairwise
 

@@ -10,8 +10,6 @@
 Only the mouth moves, with an expressiveness of 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

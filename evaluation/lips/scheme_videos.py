@@ -1,7 +1,5 @@
 """Videos of the four schemes, for a listening test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path

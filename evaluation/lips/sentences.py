@@ -1,7 +1,5 @@
 """Test sentences: from a corpus, from clips of tracked lips, or the samples of the package."""
 
-from __future__ import annotations
-
 import csv
 from collections import defaultdict
 from collections.abc import Sequence

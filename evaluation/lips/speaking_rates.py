@@ -17,8 +17,6 @@ the real lips are known.
 If a clip's transcript is not known, the recognized syllables serve as the text, as in the paper.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -6,8 +6,6 @@ otherwise. The model runs with the learnt parameters and with the initial ones, 
 hand. Each frame counts for the nearest viseme. The level of the voice is not used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

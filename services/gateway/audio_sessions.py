@@ -4,8 +4,6 @@ Audio arrives in real time and cannot wait. If the recognizer is too slow, audio
 time continues.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable

@@ -4,8 +4,6 @@ A page can start senders only to programs on the gateway's machine and to addres
 configuration. It cannot make the gateway send to arbitrary hosts.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict

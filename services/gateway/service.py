@@ -6,8 +6,6 @@ browsers' messages. Sends status-request and set-face to control, messages to br
 audio-chunk to recognizers, as any client does.
 """
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import math

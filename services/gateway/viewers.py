@@ -1,7 +1,5 @@
 """Viewers: browsers that each show one session."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

@@ -7,8 +7,6 @@ There is a path for any text. Its *fit* shows whether the text was spoken: one m
 the path loses to the best phone of every frame, relative to the loss of an average phone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice

@@ -4,8 +4,6 @@ It gets what the small ear computes at every position, 50 times a second during 
 lip frames. A model offers several delays, of which the recognizer chooses one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol, Self
 

@@ -9,8 +9,6 @@ VAD adds up to 60 ms. For input above 16 kHz, the resampler adds 2 ms. The paper
 differences that look 40 ms ahead, so its delay is 85 ms. It states 45 ms, without the differences.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TypeAlias

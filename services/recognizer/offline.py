@@ -3,8 +3,6 @@
 Source: Li et al. 2011, sections 1 and 2.2, without the output rule.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -4,8 +4,6 @@ The five verbs are those of sherpa-onnx: create_stream, accept_waveform, is_read
 and get_result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

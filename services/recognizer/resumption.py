@@ -5,8 +5,6 @@ back 2.5 s. It does not emit the results of that audio. Everything that the lost
 for later audio is void.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace

@@ -6,8 +6,6 @@ Sends: phone, lip-positions, speech, progress (synthesizer, acknowledged), the s
 but with the audio itself (subscribers), speech (control), acknowledge, error (clients).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

@@ -1,7 +1,5 @@
 """One session of the recognizer service: its audio, its stream and its synthesizer."""
 
-from __future__ import annotations
-
 import math
 import secrets
 from collections.abc import Sequence

@@ -5,8 +5,6 @@
 Any chunking of the same audio gives the same result.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

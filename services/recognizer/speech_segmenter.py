@@ -7,8 +7,6 @@ middle of its window. Any chunking of the same audio gives the same result, beca
 processes whole positions, in order.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

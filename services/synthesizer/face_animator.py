@@ -11,8 +11,6 @@ replaces the one of another process (`resume`), and when the lip model changes (
 must close for speech close during the transition as well.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence

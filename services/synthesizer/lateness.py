@@ -6,8 +6,6 @@ of the last 10 s. Older frames are useless for this, because clocks drift and a 
 audio.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 

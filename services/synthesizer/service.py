@@ -9,8 +9,6 @@ does audio faster than real time. Only while a live stream is stalled, the wall 
 to rest.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

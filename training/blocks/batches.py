@@ -8,8 +8,6 @@ clean, and slightly longer than the network does. A tempo is drawn for the frame
 batch has its own random generator, so resumed training gives the same network.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Sequence

@@ -26,8 +26,6 @@ recurrent layer use floats. onnxruntime may sum a product with a single row in a
 recurrent layer has one row for each session, so the first session's row is repeated.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -40,8 +40,6 @@ Position ``p`` has seen the frames up to ``2 p + 2``, so a block that starts at 
 the frames up to ``2 (p + B + R)``. Bands are floored at eight decades below the loudest one so far.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

@@ -21,8 +21,6 @@ constant and fall to 0, and the result is a running mean of the weights. During 
 trains only the readout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import islice

@@ -6,8 +6,6 @@ and formants. Music, voices or noise are added in the background, then the augme
 Every batch has its own random generator, so resumed training gives the same network.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

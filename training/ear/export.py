@@ -18,8 +18,6 @@ new_state   states after the step                                            (se
 Products use 8-bit integers (:mod:`kouxing.training.networks.onnx_graph`).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -26,8 +26,6 @@ machine translation" (the GRU); Romero et al. 2015, "FitNets: hints for thin dee
 layers as targets).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

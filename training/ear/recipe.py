@@ -7,8 +7,6 @@ If training is interrupted, the same command resumes it. Next to the output, the
 contains the lip teacher and the targets, and ``.checkpoint.pt`` the training state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -8,8 +8,6 @@ Source: Morise, Yokomori and Ozawa 2016, "WORLD: a vocoder-based high-quality sp
 system for real-time applications" (pyworld).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -19,8 +19,6 @@ A principal component is divided by the square root of its standard deviation, s
 components have less weight. Some recordings also have a sung or held copy.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

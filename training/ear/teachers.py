@@ -20,8 +20,6 @@ Source: Eyben et al. 2016, "The Geneva minimalistic acoustic parameter set (GeMA
 research and affective computing" (the effort is its alpha ratio).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass

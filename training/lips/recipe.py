@@ -8,8 +8,6 @@ determine any setting. Each clip is used as it is, and once augmented. Clips of 
 repeated.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -213,8 +211,8 @@ def standardize(target: Floats, units: Units) -> Floats:
 def joined(basis: Basis, network: LipNetwork) -> LipPredictor:
     """Combine the network with the ear's lips; closure and lip to teeth come from the network.
 
-    The FAPs are scaled around their means. The log odds of a closure are raised, so that closures are
-    predicted where this costs least (Bayes decision).
+    The FAPs are scaled around their means. The log odds of a closure are raised, so that closures
+    are predicted where this costs least (Bayes decision).
     """
     weights = {name: value.numpy() for name, value in network.state_dict().items()}
     units, shape = basis.units, (len(DELAYS_S), NUM_OUTPUTS)

@@ -5,8 +5,6 @@ other extents. The network therefore predicts a canonical face. Each speaker's s
 learned with it, and regularized toward 1 and 0.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -13,8 +13,6 @@ touches the teeth within each phone f, aligned with the clip's text or recognize
 have no such label.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 

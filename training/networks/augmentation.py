@@ -23,8 +23,6 @@ was sample s (160 t + 200) of the recording, which is the middle of the source f
     t_source = s t + (s - 1) 200 / 160
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ recordings, clean and whole. A target is the average of both, or only the teache
 is no text.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

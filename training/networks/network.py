@@ -24,8 +24,6 @@ y          log posteriors of the states at two frames                 (positions
 ========== ========================================================== ======================
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

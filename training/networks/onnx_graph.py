@@ -10,8 +10,6 @@ The values of a row therefore do not depend on other rows. Convolutions are prod
 large weights are stored as 16-bit floats, and widened when the file is opened.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -9,8 +9,6 @@ optimal averaging schemes" (the mean, in which late weights count more).
 v are the weights after a step, m their mean, and e is its exponent.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

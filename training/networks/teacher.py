@@ -26,8 +26,6 @@ Whisper takes at most 30 s, so longer recordings are cut into pieces. One core p
 audio in about a second, or 80 s in mixed precision.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -24,8 +24,6 @@ A string is its length in 2 bytes, then its bytes and a zero. Quantized models c
 file is not trusted, so every size in it is checked.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import struct

@@ -1,7 +1,5 @@
 """Loads acoustic models of any kind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Model files: npz archives of plain arrays, without pickle. Every size is checked."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass

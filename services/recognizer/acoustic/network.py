@@ -1,7 +1,5 @@
 """Networks of acoustic models: ONNX files that onnxruntime runs on one thread."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

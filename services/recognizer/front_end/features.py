@@ -26,8 +26,6 @@ Algorithmic delay: feature frame ``t`` needs samples up to ``t * 10 + 25`` ms an
 the textbook's 2.
 """
 
-from __future__ import annotations
-
 import kaldi_native_fbank as knf
 import numba
 import numpy as np

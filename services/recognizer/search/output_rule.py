@@ -7,8 +7,6 @@ Deviation: a frame counts only if the search is confident enough of its last pho
 data, one such frame gives fewer wrong phones, and gives them sooner, than any N without this.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -21,8 +21,6 @@ closure shortly before a sound. If the lip predictor is nearly certain that they
 stay closed until the next sound. All times are media times.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 
