@@ -60,7 +60,7 @@ def reach_error(host: str, port: str, timeout_s: float = 3.0, *, is_zeromq: bool
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as connection:
             if is_zeromq and not _greets(connection):
-                return "no kouxing service answers there; correct the address, or restart it"
+                return "no kouxing service answers there; correct the address, or restart kouxing"
     except TimeoutError:
         return "no answer; open this port in the firewalls between the machines"
     except ConnectionRefusedError:

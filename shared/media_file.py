@@ -34,7 +34,7 @@ _MAX_GAP_OF_BROADCAST_S = 10.0  # its timestamps may start again at any value
 _MIN_MISSING_S = 0.1  # of a track that is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
-# FFmpeg guesses these by the name of the file, and guesses their rate.
+# FFmpeg guesses these from the file's name, and also guesses their rate.
 _RAW_FORMATS = {"alaw", "mulaw", "s8", "u8", "s16le", "s16be", "u16le", "u16be"}
 _TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
 # AVI is not in this list, because its duration includes gaps without packets.

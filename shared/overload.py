@@ -1,8 +1,8 @@
 """The overload policy: what a live session gives up on a busy machine to stay live.
 
 A session is *behind* if late audio is queued. If it is slightly behind, it uses the light acoustic
-model until it has been in time for a while. A session that stays too far behind skips the queued
-audio in one cut and continues with the newest audio. An unpaced session gives up nothing. It takes
+model until it has been on time for a while. A session that stays too far behind skips the queued
+audio in one cut and continues with the newest audio. An unpaced session gives up nothing and takes
 longer instead.
 
 The *lateness* of audio is the time since the audio was due. Audio is due when a sender in real time
@@ -13,7 +13,7 @@ although it was just received. Audio that a client sends ahead of the clock is n
 import math
 
 LIGHT_FROM = 0.75  # fraction of the limit above which a session uses the light model
-LIGHT_FOR_S = 2.0  # time for which it continues to use it
+LIGHT_FOR_S = 2.0  # time for which a session that is on time still uses it
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
 REPORT_INTERVAL_S = 1.0  # between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
@@ -37,7 +37,7 @@ class Overload:
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: on arrival
         self._late_since_s = math.inf  # when the session exceeded its limit
-        self._light_until_s = -math.inf  # when it has been in time for a while
+        self._light_until_s = -math.inf  # when it has been on time for a while
         self._reported_s, self._report_due_s = 0.0, -math.inf  # part of skipped_s; next report
 
     def add(self, duration_s: float, now_s: float, *, has_waiting: bool) -> None:

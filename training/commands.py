@@ -151,7 +151,7 @@ def blocks(
 ) -> None:
     """Train the block model, and write its model card.
 
-    Repeat the command to resume an interrupted run. It may have another number of steps.
+    Repeat the command to resume an interrupted run. The number of steps may change.
     """
     with _neural_training(output, force=force):
         from kouxing.training.blocks.recipe import train_blocks

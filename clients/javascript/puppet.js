@@ -112,7 +112,7 @@ function morphAvatar(scene, meshes) {
 }
 
 /**
- * Return a function that opens the jaw bone, whose argument is the opening from 0 to 1. The bone moves
+ * Return a function that opens the jaw bone. Its argument is the opening, 0 to 1. The bone moves
  * teeth and tongue; it stays at rest if it also moves a mesh with a shape that opens the mouth.
  */
 function findJaw(scene, targets) {

@@ -1,4 +1,4 @@
-"""Closures of lips: how many real ones a mouth makes, and how many of its closures are real.
+"""Closures of lips: which real ones a mouth reproduces, and which of its closures are real.
 
 Lips that touch near an opening are a contact. Lips that touch elsewhere are at rest.
 """
@@ -86,7 +86,7 @@ def is_closed_at(moments_s: Array, mouth: Mouth) -> Mask:
 def contacts(made: Mouth, real: Mouth) -> list[Contact]:
     """Return the closures of made lips. A contact starts when open lips close.
 
-    Where the real mouth is not known, such as after the end of the clip, nothing counts.
+    Closures where the real mouth is unknown, such as after the end of the clip, do not count.
     """
     is_open = made.opening > _OPEN
     opened_s = made.time_s[is_open]

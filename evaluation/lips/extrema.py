@@ -38,7 +38,7 @@ def misalignment_s(made: Mouth, real: Mouth) -> float | None:
 
 
 def match_extrema(made: Array, real: Array) -> list[int]:
-    """Return by how many frames made extrema follow the real ones that they match."""
+    """Return the lag of made extrema behind the real ones that they match, frames."""
     kinds = [_extrema(curve) for curve in (made, real)]
     real_extrema = np.flatnonzero(kinds[1])
     offsets = []

@@ -247,7 +247,7 @@ MEASURES: dict[str, Measure] = {
     "turns_per_s": turns_per_s,
     "mtm_ms": misalignment_ms,
 }
-COMPARISONS = {  # measures that compare with the real lips, and say nothing about real lips
+COMPARISONS = {  # measures that compare with the real lips, so the real lips have none
     "r_opening", "r_width", "r_jaw", "r_opening_everywhere", "error", "lag_ms", "closure_f1",
     "closure_precision", "closure_recall", *(f"precision_{name}" for name in CLOSURE_CLASSES),
     "phone_correlation", "mtm_ms",

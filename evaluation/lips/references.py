@@ -57,7 +57,7 @@ class Reference:
         """Whether somebody speaks at the given times.
 
         Voice activity is on, and a loud sound is within 0.1 s. Voice activity alone spans pauses of
-        half a second; the level alone takes noise for speech.
+        half a second; the level alone mistakes noise for speech.
         """
         after = np.searchsorted([change.time_s for change in self.voice], time_s, side="right")
         is_active = np.array([False, *(change.active for change in self.voice)])[after]
@@ -134,8 +134,8 @@ def clips_to_score(
         "the parameters were trained on all clips; use other clips": lambda clip: (
             clip.name not in seen
         ),
-        "no clip has its sound in sync; use other clips": lambda clip: clip.is_in_sync,
-        "no clip measures the lip opening (FAP 4 and 5); add such columns": lambda clip: (
+        "the audio of every clip is out of sync; use other clips": lambda clip: clip.is_in_sync,
+        "no clip contains the lip opening; add columns for FAP 4 and 5": lambda clip: (
             not np.isnan(CURVES["opening"](real_faps(clip))).all()
         ),
     }

@@ -43,7 +43,7 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
 class _Search:
     """Asks control for the session to follow, in a thread because answers may take long.
 
-    The targets' face at rest shows the expressions that control states.
+    The targets' face at rest shows the expressions that control reports.
     """
 
     def __init__(self, session: str, client: Client, senders: Senders) -> None:

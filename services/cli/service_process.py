@@ -27,9 +27,9 @@ HANG_S = 5.0  # without a heartbeat; a loop that is silent for longer hangs
 class ServiceProcess(subprocess.Popen[bytes]):
     """Runs ``python -m kouxing.services.process KIND``. It ends when this process ends.
 
-    ``environment`` is complete but for two variables. A loop that sends no heartbeat for
-    ``hang_limit_s`` hangs; without sessions, for 0.75 s longer. Other options are those of
-    ``subprocess.Popen``.
+    ``environment`` is complete except for two variables. A loop counts as hung if it sends no
+    heartbeat for ``hang_limit_s``. Without sessions, the limit is 0.75 s longer. Other options are
+    those of ``subprocess.Popen``.
     """
 
     def __init__(

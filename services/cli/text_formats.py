@@ -166,7 +166,7 @@ def _read_cues(text: str) -> str:
 def _without_repeats(cues: list[list[str]]) -> list[str]:
     """Return the lines of cues. In rolling captions, a cue repeats the last line of the one before.
 
-    Cues of a single line can also be spoken twice. They are repeats only if others roll.
+    A cue of a single line may really be spoken twice. It is a repeat only if other cues roll.
     """
     cues = [lines for cue in cues if (lines := [line.strip() for line in cue if line.strip()])]
     is_rolling = any(len(cue) > 1 and cue[0] == last[-1] for last, cue in pairwise(cues))

@@ -58,7 +58,7 @@ CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes
 
 @dataclass(slots=True)
 class _FollowedSession:
-    """A session. The gateway subscribes to it from when somebody needs it until it ends."""
+    """A session. The gateway subscribes to it when somebody first needs it, until it ends."""
 
     start: StartSession
     follower: ServiceFollower

@@ -21,7 +21,7 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 class Uploads(ABC):
     """Handles uploads of one kind, one at a time. Nothing is stored."""
 
-    busy_text: ClassVar[str]  # for those that come in the meantime
+    busy_text: ClassVar[str]  # answer to uploads that arrive in the meantime
 
     def __init__(self) -> None:
         self._is_busy = False
@@ -68,7 +68,7 @@ class Uploads(ABC):
     ) -> tuple[int, bytes, str]:
         """Run a command; return its exit status, its output and its messages.
 
-        Raises ``TimeoutError`` after ``limit_s``, and ``UserError`` if nobody waits any more.
+        Raises ``TimeoutError`` after ``limit_s``, and ``UserError`` if nobody waits anymore.
         """
         process = self._process = await asyncio.create_subprocess_exec(
             *command,

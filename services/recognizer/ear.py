@@ -1,7 +1,7 @@
-"""The small ear: a recurrent network that follows all audio, with and without speech.
+"""The small ear: a recurrent network that processes all audio, with and without speech.
 
-It computes what the voice detector and the lip predictor need. A position is 20 ms of audio, two
-log-mel frames.
+It computes the inputs of the voice activity detector and the lip predictor. A position is 20 ms of
+audio, two log-mel frames.
 
 ======== ======================================================== ==================
 symbol   meaning                                                  shape

@@ -252,7 +252,7 @@ def lip_predictor_from(archive: Archive) -> LipPredictor:
     _, units = _sizes(archive, "entry_weights", 2)
     num_lips = _sizes(archive, "lip_weights", 3)[0]
     if num_lips > num_features:
-        raise ValueError(f"it takes {num_lips} lips of {num_features} features")
+        raise ValueError(f"it reads {num_lips} lip values from {num_features} features")
     outputs = (len(delays), NUM_OUTPUTS)
     return LipPredictor(
         delays=delays,

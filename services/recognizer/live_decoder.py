@@ -6,7 +6,8 @@ The shortest delay from a phone's onset to its first hypothesis is
 25 ms window + L * 10 ms + (N - 1) * 10 ms. L is the acoustic model's look-ahead in frames, and N is
 ``num_stable_frames``. The block network runs every 40 ms, so L is 1 to 4. When speech starts, the
 VAD adds up to 60 ms. For input above 16 kHz, the resampler adds 2 ms. The paper has N = 3 and
-differences that look 40 ms ahead, so its delay is 85 ms. It states 45 ms, without the differences.
+differences that look 40 ms ahead, so its delay is 85 ms. The paper states 45 ms, because it leaves
+out the differences.
 """
 
 from collections.abc import Iterable

@@ -22,7 +22,7 @@ _WARM_UP_S = 0.2
 
 
 class Recognizer:
-    """Recognizes phones in any number of live streams; ``rule``: when a phone is emitted.
+    """Recognizes phones in any number of live streams. ``rule`` decides when to emit a phone.
 
     Examples
     --------

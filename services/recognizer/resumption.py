@@ -27,7 +27,7 @@ from kouxing.shared.phones.events import (
 from kouxing.shared.phones.final_time import FinalTime
 
 WARM_UP_S = 2.8  # of audio before that time; docs/recognition.md says how this was chosen
-# Audio starts at a multiple of this time, which network blocks and positions divide. So they are
+# Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
 # aligned as in a session without a loss.
 GRID_S = 0.16
 MAX_REPLAYED = 5000  # audio messages that a client keeps

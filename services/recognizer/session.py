@@ -97,7 +97,7 @@ class RecognizerSession:
         self.without_audio_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
-        self.is_laughing = False  # the person who speaks
+        self.is_laughing = False  # the speaker
         self._published_acoustic = AcousticModel.FULL
         self.sequence_out = 0
         self.num_gaps_counted = 0
@@ -222,7 +222,7 @@ class RecognizerSession:
         return self._numbered(message)
 
     def acoustic_message(self, results: Sequence[StreamOutput]) -> Acoustic | None:
-        """Return the message about the acoustic model in use, if it is due with some results."""
+        """Return the message about the acoustic model in use, if these results make it due."""
         model = AcousticModel.LIGHT if self.stream.is_light else AcousticModel.FULL
         starts = any(isinstance(result, SpeechChange) and result.active for result in results)
         if model == self._published_acoustic and not starts:

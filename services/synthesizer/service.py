@@ -4,9 +4,9 @@ Reacts to: results, phone, lip-positions, speech, progress (recognizer), start-s
 close-session, flush-session, set-face (control).
 Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
 
-Processed audio clocks the frames. A system under load is late but makes the same frames, and so
-does audio faster than real time. Only while a live stream is stalled, the wall clock leads the face
-to rest.
+Processed audio clocks the frames. A system under load therefore makes the same frames late. Audio
+faster than real time also gives the same frames. The wall clock leads the face to rest only while a
+live stream is stalled.
 """
 
 import itertools

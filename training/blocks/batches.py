@@ -1,10 +1,10 @@
 """Batches for the block network: clean speech for the teacher, disturbed speech for the network.
 
-The disturbances are those of :mod:`kouxing.training.networks.augmentation`, and background music
+The disturbances are those of :mod:`kouxing.training.networks.augmentation`, plus background music
 and voices, clipping and lossy coding.
 
-An excerpt is cut from the concatenated recordings, and its speed is drawn. The teacher sees it
-clean, and slightly longer than the network does. A tempo is drawn for the frames of both. Every
+An excerpt is cut from the concatenated recordings, at a random speed. The teacher gets it clean,
+and slightly longer than the network does. A random tempo applies to the frames of both. Every
 batch has its own random generator, so resumed training gives the same network.
 """
 

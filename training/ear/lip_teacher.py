@@ -1,8 +1,8 @@
 """The lip teacher predicts the lips of a speaker from the whole recording.
 
-It learns from filmed speech. Its inputs come from networks that hear the clean recording to its
-end, and its recurrent layer runs both ways. It therefore follows unseen speakers more closely than
-a live network can. It labels speech without video, so that the small ear learns lips from many
+It learns from filmed speech. Its inputs come from networks that process the whole clean
+recording, and its recurrent layer runs both ways. It therefore follows unseen speakers more closely
+than a live network can. It labels speech without video, so that the small ear learns lips from many
 voices.
 
     z = P clip((h - mean) / deviation, -6, 6)
@@ -62,7 +62,7 @@ _PARTS = ("mean", "deviation", "directions")
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What the networks hear of a recording; row p is centered on 20 (p + 1) ms."""
+    """Outputs of the networks for a recording; row p is centered on 20 (p + 1) ms."""
 
     encoder: Floats  # (positions, 1536)
     phones: Floats  # (positions, phones)

@@ -4,8 +4,8 @@
                          -> the ear's own lips   -> weighted mean
 
 The recipe trains on every clip that is not held out and whose license allows it. These clips do not
-determine any setting. Each clip is used as it is, and once augmented. Clips of small sources are
-repeated.
+determine any setting. Each clip is used twice, unchanged and augmented. Clips of small sources
+are repeated.
 """
 
 from collections import Counter
@@ -51,7 +51,7 @@ _NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
 _MISSED_CLOSURE = 2.0  # cost of a missed closure, false closures
 # Predictions vary less than real lips, most of all in width. These factors correct about half of
-# it, at no cost in correlation.
+# that, at no cost in correlation.
 _EXTENT_FACTOR, _WIDTH_FACTOR = 1.2, 1.3
 _WIDTH_FAPS = (6, 53)
 

@@ -1,1 +1,1 @@
-"""What the trainings of the networks share: Whisper's encoder, labels, augmentation, export."""
+"""Code that the network trainings share: Whisper's encoder, labels, augmentation, export."""

@@ -62,7 +62,7 @@ class Optimizer(Generic[N]):
     ) -> N:
         """Train, and return the network with the running mean of the weights.
 
-        ``loss_of`` computes the loss of a step. It may add the gradients of parts of it itself.
+        ``loss_of`` computes the loss of a step. It may itself add gradients of parts of the loss.
         ``rate_factor_of`` computes the factor of the learning rates. Each step has its own random
         state. The state is saved in ``checkpoint``, and training resumes from this file if it
         exists.

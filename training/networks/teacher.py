@@ -135,7 +135,7 @@ class Teacher:
         return [labels[number] for number in range(len(sounds))]
 
     def _targets_of(self, sounds: Sequence[NDArray[np.int16]]) -> Iterator[Targets]:
-        """Yield the targets of recordings; all but the last are no longer than it."""
+        """Yield the targets of recordings. The last recording must be the longest."""
         longest = frames_in(len(sounds[-1]))
         if longest > _PIECE_FRAMES:  # each alone, in pieces
             features = [torch.from_numpy(self.encoder.features(sound))[None] for sound in sounds]

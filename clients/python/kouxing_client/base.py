@@ -27,7 +27,7 @@ class FaceSettings(TypedDict, total=False):
     lip_model: str
     """lip model that moves the mouth"""
     acoustic: str
-    """``light`` finds phones in less time with more errors; ``full`` undoes this"""
+    """``light`` finds phones in less time with more errors; ``full`` switches back"""
     expressions: Mapping[str, float]
     """strengths from 0 to 1 by name, in place of those before; ``{}`` fades them now"""
     hold_s: float

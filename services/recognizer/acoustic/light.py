@@ -140,5 +140,5 @@ def light_model_from(archive: Archive) -> LightModel:
     topology = topology_from(archive)
     model = light_model(topology, archive.floats("log_prior", topology.num_states))
     if model is None:
-        raise ValueError("the small ear has other phones")
+        raise ValueError("its phones differ from those of the small ear")
     return model

@@ -168,7 +168,7 @@ def write(spelling: str) -> str:
 def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
 
-    Bopomofo in brackets, or with the sound of the characters before it, is their reading.
+    Bopomofo gives the reading of the characters before it if it is in brackets or sounds like them.
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
     dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
     (``nihao``) are split only if most letters are pinyin, because words of other languages may look

@@ -1,4 +1,4 @@
-"""Lips in pauses: they stay ajar, close slowly, and part before the next sound.
+"""Lips in pauses: they stay ajar (slightly open), close slowly, and part before the next sound.
 
 Filmed speakers hold 0.4 to 0.6 of their range in a pause within a turn. They close in 0.4 s if it
 lasts, and part 0.3 s before the next sound. The lip predictor shows little of this, because half of
@@ -33,16 +33,16 @@ from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, Speec
 
 HOLD_S = 0.85  # lips stay ajar until this time after the last sound
 LEAD_S = 0.36  # lips part this long before voice activity, if it is known
-PART_S, CLOSE_S = 0.15, 0.4  # the ways to the ajar mouth, and back if the pause lasts
+PART_S, CLOSE_S = 0.15, 0.4  # time to the ajar mouth, and back if the pause lasts
 CERTAIN = 0.98  # probability from which the lip predictor closes lips in a pause
-_YIELD_S = 0.06  # the way back before a sound, and to lips that the predictor closes
-_END_S = 0.25  # the way back after the end of the sound
-_RELAX_S = 0.12  # the way back while no sound arrives
+_YIELD_S = 0.06  # time back before a sound, and to lips that the predictor closes
+_END_S = 0.25  # time back after the end of the audio
+_RELAX_S = 0.12  # time back while no audio arrives
 _MIN_PAUSE_S = 0.12
 _RANGE_DB = 25.0
 _FADE_DB = 0.2  # per level; the loudest one fades, so a bang counts only for a short time
 _LAST_SOUND_S = 0.03  # silence known this long after a lip frame makes its closure doubtful
-_ONSET_S, _LIKELY = 0.15, 0.8  # so shortly before a sound, a closure this probable counts
+_ONSET_S, _LIKELY = 0.15, 0.8  # this shortly before a sound, a closure this probable counts
 _DOUBT = 3.0  # log odds
 
 _AJAR_FAPS = {
@@ -76,7 +76,7 @@ class RestingLips:
         self._way, self._elapsed_s = _way_to(0.0, 0.0, 0.0, 1.0), 0.0
 
     def add_event(self, event: SoundEvent) -> None:
-        """Add a level, a change of voice activity, or the end of the sound."""
+        """Add a level, a change of voice activity, or the end of the audio."""
         match event:
             case Progress():
                 self._levels.append((event.time_s, event.level_db))
@@ -170,5 +170,5 @@ def _way_to(goal: float, share: float, velocity: float, duration_s: float) -> Tr
 
 
 def part_lips(faps: NDArray[np.float64], share: float) -> None:
-    """Move the mouth, FAPs (num_mouth_faps,), towards the ajar one, in place."""
+    """Move the mouth, FAPs (num_mouth_faps,), toward the ajar one, in place."""
     faps += share * (AJAR - faps)
