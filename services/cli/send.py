@@ -7,9 +7,10 @@ import signal
 import threading
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
-from kouxing_client import Client, FapFrame, KouxingError, Results, Session, SessionState
+from kouxing_client import Client, FapFrame, KouxingError, Results, Session
 
 from kouxing.services.senders.senders import Senders
 from kouxing.services.senders.target import Target
@@ -18,6 +19,7 @@ from kouxing.shared.terminal import print_message
 
 SEARCH_PERIOD_S = 0.2
 STEP_S = 0.05
+_TOLERANCE_S = 0.05  # of the times at which a session was opened
 
 
 def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_seed: int) -> None:
@@ -40,6 +42,19 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
             _send_frames(search, client, senders)
 
 
+@dataclass(frozen=True, slots=True)
+class _Opening:
+    """The name of a session, and when it was opened at the earliest and at the latest."""
+
+    session: str
+    earliest_s: float
+    latest_s: float
+
+    def is_after(self, other: _Opening) -> bool:
+        """Return whether this is another session, also if it has the same name."""
+        return self.session != other.session or self.earliest_s > other.latest_s + _TOLERANCE_S
+
+
 class _Search:
     """Asks control for the session to follow, in a thread because answers may take long.
 
@@ -47,7 +62,7 @@ class _Search:
     """
 
     def __init__(self, session: str, client: Client, senders: Senders) -> None:
-        self.newest: SessionState | None = None
+        self.newest: _Opening | None = None
         self._session = session
         self._client = client
         self._senders = senders
@@ -65,13 +80,19 @@ class _Search:
     def _run(self) -> None:
         while not self._ended.wait(SEARCH_PERIOD_S):
             with contextlib.suppress(KouxingError):  # control restarts
+                asked_s = time.monotonic()
                 status = self._client.status()
+                answered_s = time.monotonic()
                 published = [
                     state
                     for state in status.sessions
                     if "faps" in state.endpoints and self._session in ("", state.session)
                 ]
-                self.newest = min(published, key=lambda state: state.age_s, default=self.newest)
+                if published:
+                    newest = min(published, key=lambda state: state.age_s)
+                    self.newest = _Opening(
+                        newest.session, asked_s - newest.age_s, answered_s - newest.age_s
+                    )
                 face = status.resting_face
                 if face.get("expressions") is not None:
                     self._senders.express(face["expressions"], face["hold_s"])
@@ -79,22 +100,20 @@ class _Search:
 
 def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
     """Send the frames of the session that was found last, forever."""
-    state: SessionState | None = None
+    followed: _Opening | None = None
     session: Session | None = None
     frames: Results[FapFrame] | None = None
     while True:
         newest = search.newest
-        if newest is not None and (state is None or _is_new_session(newest, state)):
+        if newest is not None and (followed is None or newest.is_after(followed)):
             if session is not None:
                 session.close()
-            state = None
+            followed = None
             with contextlib.suppress(KouxingError):  # it is closed already, or control restarts
                 session = client.follow(newest.session)
                 frames = session.frames()
                 print_message(f"following session {newest.session}")
-                state = newest
-        else:
-            state = newest
+                followed = newest
         frame: FapFrame | None = None
         with contextlib.suppress(KouxingError):  # the session was closed before its last frame
             frame = None if frames is None else frames.get(STEP_S)
@@ -102,10 +121,6 @@ def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
             senders.show(frame.time_s, np.array(frame.values, np.float32))
         elif frames is None or frames.has_ended:
             time.sleep(STEP_S)
-
-
-def _is_new_session(session: SessionState, before: SessionState) -> bool:
-    return session.session != before.session or session.age_s < before.age_s
 
 
 def _report(url: str, problem: str) -> None:
