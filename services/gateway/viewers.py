@@ -43,6 +43,7 @@ class Viewer:
     shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
     queue: ViewerQueue = field(default_factory=ViewerQueue)
     shown: tuple[str, int] | None = None  # session and epoch last announced to the viewer
+    has_rest: bool = False  # whether it got the face at rest, with which its player starts
     moved_s: float = -math.inf  # when the newest frame was sent
 
 
@@ -139,18 +140,19 @@ class Viewers:
         self._put_shapes(viewers, MessageKind.SHAPES, "weights", epoch, media_time, faps)
 
     def show_rest(self, face: RestingFace, now_s: float) -> None:
-        """Send the face at rest to viewers without recent frames of a session."""
-        viewers = [viewer for viewer in self._viewers if now_s >= viewer.moved_s + PAUSE_S]
+        """Send the face at rest to new viewers, and to those without recent frames of a session."""
+        viewers = [viewer for viewer in self._viewers if now_s >= _rest_from_s(viewer)]
         faps = face.faps(now_s).astype("<f4").tobytes()
         message = wire.binary(wire.REST_TYPE, 0, 0, faps)
         for viewer in viewers:
+            viewer.has_rest = True
             self._put(viewer, MessageKind.REST, message)
         self._put_shapes(viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
 
     @property
     def rest_from_s(self) -> float:
         """When the first viewer is due to get the face at rest; infinite without viewers."""
-        return min((viewer.moved_s for viewer in self._viewers), default=math.inf) + PAUSE_S
+        return min(map(_rest_from_s, self._viewers), default=math.inf)
 
     @property
     def newest(self) -> str:
@@ -289,6 +291,11 @@ class Viewers:
 
     def _status(self) -> str:
         return wire.text("status", missing=self._missing)
+
+
+def _rest_from_s(viewer: Viewer) -> float:
+    """Return when a viewer is due to get the face at rest."""
+    return viewer.moved_s + PAUSE_S if viewer.has_rest else -math.inf
 
 
 def _limit_send_buffers(request: web.Request) -> None:
