@@ -13,7 +13,7 @@ folder names further clips and speakers to hold out.
 import csv
 import itertools
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,6 +141,13 @@ def read_clips(
         what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
         raise UserError(f"no {what} in {folder}; give a folder with .flac, .csv and .json files")
     return clips
+
+
+def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> list[LipClip]:
+    """Return the clips that a model may be trained on. By default, their license must allow it."""
+    return [
+        clip for clip in clips if clip.part != "held" and (any_license or may_ship(clip.license))
+    ]
 
 
 def read_clip(path: Path) -> LipClip:

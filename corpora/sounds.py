@@ -21,6 +21,7 @@ from kouxing.shared.user_file import read_text, split_lines
 
 _MAX_BYTES = 16 << 20
 _BY_FILE = ("music", "noise")
+_BACKGROUNDS = ("music", "noise", "babble")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,13 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
 def held_out(sounds: Sequence[Sound], kind: str) -> list[Sound]:
     """Return the held-out sounds of a kind."""
     return [sound for sound in sounds if sound.kind == kind and sound.is_held_out]
+
+
+def training_backgrounds(sounds: Sequence[Sound]) -> list[NDArray[np.int16]]:
+    """Return the music, noise and babble that may be mixed with speech in training."""
+    return [
+        sound.samples for sound in sounds if sound.kind in _BACKGROUNDS and not sound.is_held_out
+    ]
 
 
 def _parts(kind: str, path: Path) -> list[Sound]:

@@ -1,7 +1,11 @@
-"""The device that networks are trained on: a GPU if there is one."""
+"""The device that networks are trained on: a GPU if one is available."""
+
+import os
 
 import torch
 
+# The usual check initializes CUDA, after which forked processes could not use it.
+os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 

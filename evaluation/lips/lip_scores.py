@@ -11,8 +11,7 @@ from pathlib import Path
 
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import LipClip, aligned_phones, read_clips
-from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.lip_clips import LipClip, aligned_phones, read_clips, training_clips
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES, Take
 from kouxing.evaluation.lips.live_faces import Samples, events_of_faces, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth
@@ -144,11 +143,7 @@ def takes_of(
 
 def known_speakers(folder: Path) -> set[str]:
     """Return the speakers of clips that a shipped model may be trained on."""
-    return {
-        clip.speaker
-        for clip in read_clips(folder, language=None)
-        if clip.part != "held" and may_ship(clip.license)
-    }
+    return {clip.speaker for clip in training_clips(read_clips(folder, language=None))}
 
 
 def groups_of(clip: LipClip, known: set[str]) -> list[str]:

@@ -23,6 +23,7 @@ from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_R
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
 from kouxing.training.networks.augmentation import (
     Samples,
+    add_sounds,
     change_speed,
     disturb,
     scale_level,
@@ -189,14 +190,8 @@ def _add_background(sound: Samples, material: Material, rng: np.random.Generator
         others = [material.backgrounds[int(rng.integers(len(material.backgrounds)))]]
     else:
         return sound
-    background = np.zeros(len(sound), np.float32)
-    for other in others:
-        start = int(rng.integers(len(other)))
-        voice = as_floats(np.resize(other[start : start + len(sound)], len(sound)))
-        background += voice / (np.sqrt(np.mean(voice**2)) + np.float32(_TINY))
-    snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
-    level = np.sqrt(np.mean(sound**2) / (np.mean(background**2) + _TINY)) * 10 ** (-snr_db / 20)
-    return sound + np.float32(level) * background
+    mixed = add_sounds(sound, others, rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB), rng)
+    return mixed.astype(np.float32)
 
 
 def _distort(sound: Samples, rng: np.random.Generator) -> Samples:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_floats, as_integers
 from kouxing.corpora.parallel import process_in_order
-from kouxing.corpora.sounds import read_sounds
+from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
@@ -56,7 +56,6 @@ BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY = 2.0  # most of the network's errors are deletions
 _MIX = Mix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
-_BACKGROUNDS = ("music", "noise", "babble")
 _SUNG_SHARE, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # of a recording, that are sung
 _FRAMES_PER_POSITION = 2
@@ -129,11 +128,7 @@ def train_blocks(
     num_states = STATES_PER_PHONE * len(before.inventory)
     whole = init_encoder(whisper, num_states)
     errors = RowErrors()
-    backgrounds = [
-        sound.samples
-        for sound in read_sounds(sounds, shipping=shipping)
-        if sound.kind in _BACKGROUNDS and not sound.is_held_out
-    ]
+    backgrounds = training_backgrounds(read_sounds(sounds, shipping=shipping))
     examples = load_examples(
         corpora, errors, before.inventory, shipping=shipping, with_samples=True
     )

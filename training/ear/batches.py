@@ -13,14 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.ear import LIP_DELAYS_S, Voice
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.training.ear.lip_teacher import POSITION_S
 from kouxing.training.ear.network import NUM_INPUTS
 from kouxing.training.ear.targets import PITCH, VOICE, Columns, Piece, Samples
 from kouxing.training.ear.teachers import POSITION_SAMPLES
-from kouxing.training.networks.augmentation import Sound, change_speed, disturb, scale_level
+from kouxing.training.networks.augmentation import (
+    Sound,
+    add_sounds,
+    change_speed,
+    disturb,
+    scale_level,
+)
 
 Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
@@ -140,7 +146,7 @@ def _add_background(
     else:
         background = material.backgrounds[int(rng.integers(len(material.backgrounds)))]
         others = [_change_pitch(background, rng)]
-    return mix(sound, others, snr_db, rng)
+    return add_sounds(sound, others, snr_db, rng)
 
 
 def _change_pitch(samples: Samples, rng: np.random.Generator) -> Samples:
@@ -148,14 +154,3 @@ def _change_pitch(samples: Samples, rng: np.random.Generator) -> Samples:
     at = np.arange(0, len(samples) - 1, rng.uniform(_MIN_PITCH, _MAX_PITCH))
     changed: Samples = np.interp(at, np.arange(len(samples)), samples).astype(np.int16)
     return changed
-
-
-def mix(sound: Sound, others: Sequence[Samples], snr_db: float, rng: np.random.Generator) -> Sound:
-    """Add other sounds of equal levels, together ``snr_db`` below a sound, from random starts."""
-    background = np.zeros(len(sound))
-    for other in others:
-        turned = np.roll(other, -int(rng.integers(len(other))))
-        repeated = as_floats(np.resize(turned, len(sound)))
-        background += repeated / (np.sqrt(np.mean(repeated**2)) + _TINY)
-    level = np.sqrt(np.mean(np.square(sound)) / (np.mean(background**2) + _TINY))
-    return np.asarray(sound + level * 10 ** (-snr_db / 20) * background)

@@ -25,7 +25,6 @@ noisy).
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,24 +37,23 @@ from scipy.special import expit
 from kouxing.corpora.feature_cache import as_integers
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.parallel import process_in_order
+from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.training.ear.teachers import Teachers
-from kouxing.training.lips.recipe import standardize, units_of
+from kouxing.training.lips.recipe import repeats_by_source, standardize, units_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
 
 Floats = NDArray[np.float32]
 
-POSITION_S = 0.02
 NUM_EPOCHS = 12
 _NUM_COMPONENTS = 128
 _MAX_DEVIATIONS = 6.0
 _MIN_DEVIATION = 1e-3
 _STRIDE = 2  # every second position is used for the principal components
 _PART_SAMPLES, _MIN_SAMPLES = 320_000, 8000  # of a recording
-_MAX_REPEATS = 6  # of the clips of small sources
 _NUM_NETWORKS = 4
 _PARTS = ("mean", "deviation", "directions")
 
@@ -158,13 +156,12 @@ def train_lip_teacher(
         targets.append(targets_at(clip, known, closed_at[clip.speaker], time_s, [0.0]))
     units = units_of(targets)
     speakers = sorted({clip.speaker for clip in clips})
-    num_clips = Counter(clip.source for clip in clips)
+    repeats = repeats_by_source(clips)
     examples = []
     for clip, one, target in zip(clips, heard, targets, strict=True):
         rows = _inputs(projection, one), standardize(target, units)
         example = Example(*rows, speakers.index(clip.speaker))
-        repeats = max(1, min(_MAX_REPEATS, max(num_clips.values()) // num_clips[clip.source]))
-        examples += repeats * [example]
+        examples += repeats[clip.source] * [example]
 
     def train(number: int) -> LipNetwork:
         network, _ = train_network(

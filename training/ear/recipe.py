@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
-from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips, training_clips
 from kouxing.corpora.parallel import process_in_order
-from kouxing.corpora.sounds import read_sounds
-from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out, may_ship
+from kouxing.corpora.sounds import read_sounds, training_backgrounds
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.ear import Voice
@@ -38,7 +38,6 @@ from kouxing.training.networks.optimizer import Optimizer, warm_up_and_decay_fac
 from kouxing.training.training_set import Report, read_utterances, weights_of
 
 _RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 200, 0.5
-_BACKGROUNDS = ("music", "noise", "babble")
 _OTHER_VOICES = {"laughter": Voice.LAUGHTER, "breath": Voice.NONE}  # by the kind of a sound
 _OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
 
@@ -87,10 +86,8 @@ def train_ear(
     ]
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
-    sounds = [
-        one for one in read_sounds(sources.sounds, shipping=sources.shipping) if not one.is_held_out
-    ]
-    backgrounds = [sound.samples for sound in sounds if sound.kind in _BACKGROUNDS]
+    sounds = read_sounds(sources.sounds, shipping=sources.shipping)
+    backgrounds = training_backgrounds(sounds)
     if not backgrounds:
         raise UserError("no music or noise to mix with the speech; give a folder with --sounds")
     others = [
@@ -101,12 +98,18 @@ def train_ear(
             _OTHER_VOICES[sound.kind],
         )
         for sound in sounds
-        if sound.kind in _OTHER_VOICES
+        if sound.kind in _OTHER_VOICES and not sound.is_held_out
     ]
-    recordings = [*_speech_of(sources, utterances), *others]
+    clips = training_clips(
+        read_clips(sources.clips, any_license=not sources.shipping, language=None),
+        any_license=not sources.shipping,
+    )
+    if not any(clip.is_in_sync for clip in clips):
+        raise UserError(f"no clip in {sources.clips} may be used; give clips with a free license")
+    recordings = [*_speech_of(sources, utterances, clips), *others]
     folder = output.with_suffix(".targets")
     folder.mkdir(parents=True, exist_ok=True)
-    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", sources, teachers, seed)
+    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", clips, teachers, seed)
     store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
     trained = _train_network(
         Material(store.pieces(), backgrounds, Columns(len(inventory))),
@@ -129,13 +132,15 @@ def train_ear(
     errors.report_to(report)
 
 
-def _speech_of(sources: Sources, utterances: Sequence[Utterance]) -> list[Recording]:
+def _speech_of(
+    sources: Sources, utterances: Sequence[Utterance], clips: Sequence[LipClip]
+) -> list[Recording]:
     """List all speech. Sources are weighted by the square root of their size; the sum is 1."""
     weights = zip(utterances, weights_of(utterances), strict=True)
     of_sources = [[(one.path, weight * one.seconds) for one, weight in weights]]
     for folder in sources.untranscribed:
         of_sources.append([(path, 1.0) for path in audio_files(folder) if not is_held_out(path)])
-    paths = [sources.clips / f"{clip.name}.flac" for clip in _clips_of(sources)]
+    paths = [sources.clips / f"{clip.name}.flac" for clip in clips]
     of_sources.append([(path, 1.0) for path in paths])
     shares = np.sqrt([sum(path.stat().st_size for path, _ in source) for source in of_sources])
     recordings = []
@@ -153,17 +158,12 @@ def _read(path: Path) -> Samples:
     return as_integers(read_audio(path))
 
 
-def _load_lip_teacher(path: Path, sources: Sources, teachers: Teachers, seed: int) -> LipTeacher:
-    """Load the lip teacher, or train it on the clips.
-
-    Raises UserError if there are no clips to train on.
-    """
+def _load_lip_teacher(
+    path: Path, all_clips: Sequence[LipClip], teachers: Teachers, seed: int
+) -> LipTeacher:
+    """Load the lip teacher, or train it on the clips whose audio is in sync."""
     if not path.exists():
-        clips = [clip for clip in _clips_of(sources) if clip.is_in_sync]
-        if not clips:
-            raise UserError(
-                f"no clip in {sources.clips} may be used; give clips with a free license"
-            )
+        clips = [clip for clip in all_clips if clip.is_in_sync]
         heard = list(process_in_order(partial(hear, teachers), [clip.samples for clip in clips]))
         model = load_model(model_path("blocks"))
         phones = {
@@ -175,16 +175,6 @@ def _load_lip_teacher(path: Path, sources: Sources, teachers: Teachers, seed: in
         train_lip_teacher(clips, heard, phones, seed).save(unfinished)
         unfinished.replace(path)
     return LipTeacher.load(path)
-
-
-def _clips_of(sources: Sources) -> list[LipClip]:
-    """Read the clips that may be used for training."""
-    clips = read_clips(sources.clips, any_license=not sources.shipping, language=None)
-    return [
-        clip
-        for clip in clips
-        if clip.part != "held" and (may_ship(clip.license) or not sources.shipping)
-    ]
 
 
 def _train_network(

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
-from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips, training_clips
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.ear import LIP_DELAYS_S
@@ -86,9 +85,7 @@ def train_lips(
     used, or a file cannot be read.
     """
     clips = read_clips(folder, any_license=any_license, language=None)
-    used = [
-        clip for clip in clips if clip.part != "held" and (any_license or may_ship(clip.license))
-    ]
+    used = training_clips(clips, any_license=any_license)
     if not used:
         raise UserError(
             f"no clip in {folder} may be used; give clips with a free license, or --any-license"
@@ -106,10 +103,11 @@ def train_lips(
     filmed = [*trained_on, *copies]
     targets = _targets(load_model(), filmed, closed_below(clips))
     basis = basis_of(trained_on, targets)
+    repeats = repeats_by_source(used)
     examples = [
         example
         for stretch, example in zip(filmed, examples_of(filmed, targets, basis), strict=True)
-        for _ in range(_num_repeats(stretch.clip, used))
+        for _ in range(repeats[stretch.clip.source])
     ]
     network, losses = train_network(examples, num_epochs=NUM_EPOCHS, seed=seed)
     lips = joined(basis, network)
@@ -163,10 +161,11 @@ def examples_of(speech: Sequence[Speech], targets: Sequence[Floats], basis: Basi
     ]
 
 
-def _num_repeats(clip: LipClip, clips: Sequence[LipClip]) -> int:
-    """Return how often a clip is used, so that no source outweighs the others."""
-    num_clips = Counter(one.source for one in clips)
-    return max(1, min(_MAX_REPEATS, max(num_clips.values()) // num_clips[clip.source]))
+def repeats_by_source(clips: Sequence[LipClip]) -> dict[str, int]:
+    """Return how often to use the clips of each source, so that none outweighs the others."""
+    num_clips = Counter(clip.source for clip in clips)
+    most = max(num_clips.values())
+    return {source: min(_MAX_REPEATS, most // number) for source, number in num_clips.items()}
 
 
 def principal_components(features: Floats) -> tuple[Floats, Floats]:

@@ -23,6 +23,7 @@ was sample s (160 t + 200) of the recording, which is the middle of the source f
     t_source = s t + (s - 1) 200 / 160
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
 
+from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
 
 Samples = NDArray[np.float32]
@@ -82,6 +84,22 @@ def disturb(samples: Sound, rng: np.random.Generator) -> Samples:
     if rng.random() < _COLOR_PROB:
         sound = _color(sound, rng)
     return sound.astype(np.float32)
+
+
+def add_sounds(
+    samples: Sound, others: Sequence[NDArray[np.int16]], snr_db: float, rng: np.random.Generator
+) -> Sound:
+    """Add other sounds of equal levels, together ``snr_db`` below the samples.
+
+    They start anywhere, and are repeated if they are too short.
+    """
+    background = np.zeros(len(samples))
+    for other in others:
+        turned = np.roll(other, -int(rng.integers(len(other))))
+        repeated = as_floats(np.resize(turned, len(samples)))
+        background += repeated / (np.sqrt(np.mean(repeated**2)) + _TINY)
+    level = np.sqrt(np.mean(np.square(samples)) / (np.mean(background**2) + _TINY))
+    return np.asarray(samples + level * 10 ** (-snr_db / 20) * background)
 
 
 def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
