@@ -10,7 +10,7 @@ from kouxing_client import Client
 from tests.e2e.following import RATE_HZ, Stream, samples_of_file
 from tests.system import CHAIN, CHEAP, DEMO, System, wait_until
 
-STOPPED_S = 3
+STOPPED_S = 2  # far less than the time after which control counts a service as lost
 SETTINGS = {
     **CHEAP,
     "KOUXING_RECOGNIZER_MAX_BEHIND_S": "0.2",
