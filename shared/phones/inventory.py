@@ -8,6 +8,7 @@ A language is a Python package with ``phones.tsv`` and a function ``pronounce``.
 - ``spell``, a function that spells a syllable's phones; by default the symbols in a row
 - ``write``, a function that returns a spelling or a phone as it is printed; by default unchanged
 - ``CODE``, the ISO 639-1 code that recordings use for the language
+- ``universal.tsv``, the phones of the universal inventory (``universal``) that make up each phone
 
 ``BUILT_IN`` lists the languages of kouxing. An installed distribution adds a language with an entry
 point in the group ``kouxing.languages``: the language's name, and the package.
@@ -26,21 +27,22 @@ before_rounded  the phone's viseme before a rounded one, if different; may be em
 =============== ===================================================================================
 """
 
-import csv
 import importlib
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import resources
 from importlib.metadata import entry_points
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
-BUILT_IN = {"mandarin": "kouxing.shared.phones.mandarin"}
+BUILT_IN = {name: f"kouxing.shared.phones.{name}" for name in ("mandarin", "universal")}
 DEFAULT_LANGUAGE = "mandarin"
+UNIVERSAL = "universal"  # the phones of all languages
 ENTRY_POINTS = "kouxing.languages"
 KINDS = ("initial", "vowel", "silence")
 MAX_PHONES = 255  # model files count phones in 8 bits
@@ -67,6 +69,7 @@ class PhoneInventory:
     spell: Callable[[Syllable], str] = "".join  # phones of a syllable to its spelling
     write: Callable[[str], str] = str  # a spelling or a phone as printed: "ni3" is "nǐ"
     code: str = ""  # ISO 639-1, such as "zh"; empty: no recordings have it
+    universal: Mapping[str, Syllable] = field(default_factory=dict)  # universal phones, by phone
 
     def __post_init__(self) -> None:
         wrong = [phone for phone in self.phones if not _SYMBOL.fullmatch(phone)]
@@ -142,9 +145,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
             known = ", ".join(sorted({*BUILT_IN, *installed}))
             raise UserError(f"language {language!r} is not installed; choose from: {known}")
     try:
-        text = resources.files(package).joinpath("phones.tsv").read_text("utf-8")
-        lines = [line for line in text.splitlines() if not line.startswith("#")]
-        rows = list(csv.DictReader(lines, delimiter="\t"))
+        rows = read_table(package, "phones.tsv")
         lexicon = importlib.import_module(package)
         return PhoneInventory(
             language=language,
@@ -160,9 +161,20 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
             spell=getattr(lexicon, "spell", "".join),
             write=getattr(lexicon, "write", str),
             code=getattr(lexicon, "CODE", ""),
+            universal=_universal_phones(package, language),
         )
     except (OSError, ImportError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"language {language}: cannot read package {package}: {error}") from None
+
+
+def _universal_phones(package: str, language: str) -> Mapping[str, Syllable]:
+    """Return the universal phones of each phone; empty if the language does not list them."""
+    if language == UNIVERSAL:
+        return {row["phone"]: (row["phone"],) for row in read_table(package, "phones.tsv")}
+    if not resources.files(package).joinpath("universal.tsv").is_file():
+        return {}
+    rows = read_table(package, "universal.tsv")
+    return {row["phone"]: tuple(row["universal"].split()) for row in rows}
 
 
 def _viseme_shares(text: str) -> VisemeShares:
