@@ -1,6 +1,10 @@
 """The phones of a language, loaded from the language's package.
 
-A language is a Python package with ``phones.tsv`` and a function ``pronounce``. It may also have:
+A language is a package of tables (``table_language``), if it has ``language.toml``. Its phones are
+those of the universal inventory.
+
+A language with phones of its own is a Python package with ``phones.tsv`` and a function
+``pronounce``. It may also have:
 
 - ``transcribe``, a function that returns a text's syllables with their spelling, and the parts that
   it cannot read
@@ -30,17 +34,20 @@ before_rounded  the phone's viseme before a rounded one, if different; may be em
 import importlib
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from importlib import resources
 from importlib.metadata import entry_points
+from typing import Any
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.table import read_table
+from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
-BUILT_IN = {name: f"kouxing.shared.phones.{name}" for name in ("mandarin", "universal")}
+_NAMES = "english french german italian mandarin portuguese russian spanish universal"
+BUILT_IN = {name: f"kouxing.shared.phones.{name}" for name in _NAMES.split()}
 DEFAULT_LANGUAGE = "mandarin"
 UNIVERSAL = "universal"  # the phones of all languages
 ENTRY_POINTS = "kouxing.languages"
@@ -125,6 +132,13 @@ class PhoneInventory:
         )
         return Transcript(tuple(syllables))
 
+    def in_universal_phones(self, phones: Sequence[str]) -> Syllable:
+        """Return phones of this language as phones of the universal inventory.
+
+        Raises ``KeyError`` if the language does not list them.
+        """
+        return tuple(universal for phone in phones for universal in self.universal[phone])
+
     def _of_kind(self, kind: str) -> frozenset[str]:
         return frozenset(
             phone for phone, other in zip(self.phones, self.kinds, strict=True) if other == kind
@@ -145,26 +159,58 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
             known = ", ".join(sorted({*BUILT_IN, *installed}))
             raise UserError(f"language {language!r} is not installed; choose from: {known}")
     try:
-        rows = read_table(package, "phones.tsv")
+        if resources.files(package).joinpath(SETTINGS).is_file():
+            return _inventory_of_tables(language, load_table_language(package))
         lexicon = importlib.import_module(package)
-        return PhoneInventory(
-            language=language,
-            phones=tuple(row["phone"] for row in rows),
-            kinds=tuple(row["kind"] for row in rows),
-            visemes={row["phone"]: _viseme_shares(row["visemes"]) for row in rows},
-            before_rounded={
-                row["phone"]: row["before_rounded"] for row in rows if row["before_rounded"]
-            },
-            pronounce=lexicon.pronounce,
-            transcribe=getattr(lexicon, "transcribe", None),
-            readable=getattr(lexicon, "READABLE", _WORDS),
-            spell=getattr(lexicon, "spell", "".join),
-            write=getattr(lexicon, "write", str),
-            code=getattr(lexicon, "CODE", ""),
-            universal=_universal_phones(package, language),
-        )
+        own = _universal_phones(package, language)
+        return _inventory_of(language, read_table(package, "phones.tsv"), lexicon, own)
     except (OSError, ImportError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"language {language}: cannot read package {package}: {error}") from None
+
+
+def _inventory_of(
+    language: str,
+    rows: Sequence[Mapping[str, str]],
+    lexicon: Any,
+    universal: Mapping[str, Syllable],
+) -> PhoneInventory:
+    """Return the inventory of a table of phones, and of the functions of a module."""
+    return PhoneInventory(
+        language=language,
+        phones=tuple(row["phone"] for row in rows),
+        kinds=tuple(row["kind"] for row in rows),
+        visemes={row["phone"]: _viseme_shares(row["visemes"]) for row in rows},
+        before_rounded={
+            row["phone"]: row["before_rounded"] for row in rows if row["before_rounded"]
+        },
+        pronounce=lexicon.pronounce,
+        transcribe=getattr(lexicon, "transcribe", None),
+        readable=getattr(lexicon, "READABLE", _WORDS),
+        spell=getattr(lexicon, "spell", "".join),
+        write=getattr(lexicon, "write", str),
+        code=getattr(lexicon, "CODE", ""),
+        universal=universal,
+    )
+
+
+def _inventory_of_tables(language: str, tables: TableLanguage) -> PhoneInventory:
+    """Return the inventory of a language that uses the universal phones."""
+    universal = load_inventory(UNIVERSAL)
+    phones = tables.phones
+    return replace(
+        universal,
+        language=language,
+        phones=phones,
+        kinds=tuple(universal.kinds[universal.index[phone]] for phone in phones),
+        visemes={phone: universal.visemes[phone] for phone in phones},
+        before_rounded={
+            phone: viseme for phone, viseme in universal.before_rounded.items() if phone in phones
+        },
+        pronounce=tables.pronounce,
+        transcribe=tables.transcribe,
+        code=tables.code,
+        universal={phone: (phone,) for phone in phones},
+    )
 
 
 def _universal_phones(package: str, language: str) -> Mapping[str, Syllable]:

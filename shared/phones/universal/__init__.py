@@ -11,27 +11,31 @@ features  24 features of panphon, ``+``, ``-`` or ``0``; the file's head names t
 
 A phone's symbol is made of letters a-z, as on the wire; ``write`` returns its IPA letter. A
 diphthong is two phones. Length, stress and tone are not part of a phone. Secondary palatalization
-is left out, except for ɲ and ʎ.
+is left out, except for ɲ and ʎ. Texts may mix languages (``mixed_text``).
 """
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.phones.universal.segments import ipa_of, read_ipa
 
-__all__ = ["pronounce", "spell", "write"]
+__all__ = ["pronounce", "read_ipa", "spell", "transcribe", "write"]
 
 
 def pronounce(text: str) -> list[tuple[str, ...]]:
-    """Return the phones of each word of a text in IPA.
+    """Return the phones of each word or character; ``UserError`` if a part cannot be read."""
+    transcript = transcribe(text)
+    if transcript.dropped:
+        raise UserError(f"cannot read {transcript.dropped[0]!r}; choose its language")
+    return transcript.phones
 
-    Raises ``UserError`` if a symbol is unknown.
-    """
-    words = []
-    for word in text.split():
-        phones, unknown = read_ipa(word)
-        if unknown:
-            raise UserError(f"cannot read {unknown[0]!r} in {word!r}; write IPA")
-        words.append(phones)
-    return [phones for phones in words if phones]
+
+def transcribe(text: str) -> Transcript:
+    """Return the words and characters of a text; each script is read in its language."""
+    from kouxing.shared.phones.universal.mixed_text import (  # noqa: PLC0415 (it loads inventories)
+        read_mixed_text,
+    )
+
+    return read_mixed_text(text)
 
 
 def spell(phones: tuple[str, ...]) -> str:
@@ -39,6 +43,6 @@ def spell(phones: tuple[str, ...]) -> str:
     return "".join(map(ipa_of, phones))
 
 
-def write(symbol: str) -> str:
-    """Return the IPA letter of a phone; other texts stay as they are."""
-    return ipa_of(symbol)
+def write(spelling: str) -> str:
+    """Return the IPA letter of a phone; a spelling stays as it is."""
+    return ipa_of(spelling)

@@ -72,3 +72,15 @@ def _spellings() -> dict[str, tuple[str, ...]]:
         row["ipa"]: tuple(row["phones"].split()) for row in read_table(__package__, "other_ipa.tsv")
     }
     return {unicodedata.normalize("NFD", ipa): phones for ipa, phones in spellings.items()}
+
+
+@cache
+def nearest_phone(phone: str, phones: tuple[str, ...]) -> str:
+    """Return the phone of a list with the most common features; itself if it is listed."""
+    if phone in phones:
+        return phone
+    known, own = features(), features()[phone]
+    spoken = [other for other in phones if other in known]
+    return min(
+        spoken, key=lambda other: sum(a != b for a, b in zip(known[other], own, strict=True))
+    )

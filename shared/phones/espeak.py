@@ -1,0 +1,67 @@
+"""Letters to sounds by espeak-ng, a program that runs as a process of its own (GPL-3)."""
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+
+from kouxing.shared.errors import UserError
+
+_TIMEOUT_S = 60.0
+_INSTALL = (
+    "espeak-ng is missing, which reads texts in this language; install it"
+    " (Debian: apt-get install espeak-ng; macOS: brew install espeak-ng)"
+)
+
+
+def sound_out(phrases: Sequence[Sequence[str]], voice: str) -> list[list[str]]:
+    """Return the IPA of each word of each phrase; phones of more than one letter are tied.
+
+    A word is read within its phrase, or alone if espeak-ng joins words of the phrase. A word
+    without sound has an empty text. ``voice`` is one of espeak-ng.
+
+    Raises ``UserError`` if espeak-ng is missing or fails.
+    """
+    together = _lines_of([" ".join(phrase) for phrase in phrases], voice)
+    spoken = [line.split() for line in together]
+    alone = [
+        [line] if len(phrase) == 1 else words if len(words) == len(phrase) else None
+        for line, words, phrase in zip(together, spoken, phrases, strict=True)
+    ]
+    missing = [
+        word
+        for words, phrase in zip(alone, phrases, strict=True)
+        if words is None
+        for word in phrase
+    ]
+    rest = iter(_lines_of(missing, voice))
+    return [
+        [next(rest) for _ in phrase] if words is None else words
+        for words, phrase in zip(alone, phrases, strict=True)
+    ]
+
+
+def _lines_of(texts: Sequence[str], voice: str) -> list[str]:
+    """Return the IPA of each text, which has no punctuation."""
+    lines = _run(texts, voice) if texts else []
+    if len(lines) == len(texts):
+        return lines
+    return [" ".join(_run([text], voice)) for text in texts]  # espeak-ng splits long texts
+
+
+def _run(texts: Sequence[str], voice: str) -> list[str]:
+    program = shutil.which("espeak-ng")
+    if program is None:
+        raise UserError(_INSTALL)
+    command = [program, "-q", "--ipa", "--tie=\u0361", "-v", voice]
+    try:
+        result = subprocess.run(  # noqa: S603 - no shell
+            command,
+            input="\n".join(texts),
+            capture_output=True,
+            encoding="utf-8",
+            check=True,
+            timeout=_TIMEOUT_S,
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        raise UserError(f"espeak-ng failed: {error}; reinstall it") from None
+    return result.stdout.splitlines()

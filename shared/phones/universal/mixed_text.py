@@ -1,0 +1,54 @@
+"""Texts of several languages: Mandarin with English words, as people speak.
+
+Each script is read in one language. A text in another language needs the language to be chosen.
+Numbers are read in the language of the words before them.
+"""
+
+import unicodedata
+
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
+
+# by the first word of the letters' Unicode names
+_LANGUAGES = {
+    "CJK": "mandarin",
+    "IDEOGRAPHIC": "mandarin",
+    "CYRILLIC": "russian",
+    "LATIN": "english",
+}
+
+
+def read_mixed_text(text: str) -> Transcript:
+    """Return the words and characters of a text, in phones of the universal inventory.
+
+    Raises ``UserError`` if a language needs espeak-ng, and it is missing.
+    """
+    syllables: list[SpokenSyllable] = []
+    dropped: list[str] = []
+    for language, part in _parts_of(unicodedata.normalize("NFKC", text)):
+        inventory = load_inventory(language)
+        transcript = inventory.read(part)
+        dropped += transcript.dropped
+        syllables += (
+            SpokenSyllable(
+                syllable.text, syllable.spelling, inventory.in_universal_phones(syllable.phones)
+            )
+            for syllable in transcript.syllables
+        )
+    return Transcript(tuple(syllables), tuple(dropped))
+
+
+def _parts_of(text: str) -> list[tuple[str, str]]:
+    """Split a text where its language changes. Returns the language and the text of each part."""
+    parts: list[tuple[str, str]] = []
+    for letter in text:
+        script = unicodedata.name(letter, "").split(" ")[0] if letter.isalpha() else ""
+        language = _LANGUAGES.get(script)
+        if not parts or language not in (None, parts[-1][0]):
+            before = ""
+            if len(parts) == 1 and not parts[0][0]:
+                before = parts.pop()[1]  # numbers before the first word
+            parts.append((language or "", before + letter))
+        else:
+            parts[-1] = parts[-1][0], parts[-1][1] + letter
+    return [(language or "english", part) for language, part in parts]
