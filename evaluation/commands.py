@@ -263,7 +263,7 @@ def schemes(
         chosen = sentences.sample_sentences(model, SENTENCE.parent)
     recognizers = load_recognizers(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
     names = lips or list(lip_models())
-    recognized = recognize_all(model, recognizers, chosen)
+    recognized = recognize_all(recognizers, chosen)
     outcome = score_schemes(recognized, recognizers, names)
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))

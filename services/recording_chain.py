@@ -1,8 +1,8 @@
 """Animates a face from a whole recording.
 
-    sound -> scores -> phones, by offline decoding or forced alignment of a known text
-                    -> lip frames with the longest delay
-                    -> face
+    sound -> phones, recognized as in live audio, or by forced alignment of a known text
+          -> lip frames with the longest delay
+          -> face
 
 The face is the one of the live chain (``Face``), with the same lip models and modifiers. It has the
 longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes blend all
@@ -10,24 +10,23 @@ visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small
 lips, phones also decide where the lips do not close. In the live chain, they arrive too late.
 """
 
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.offline import decode_offline
-from kouxing.services.recognizer.speech_scorer import (
-    ScoreEvent,
-    WithProgress,
-    score_recording,
+from kouxing.services.recognizer.offline import WithProgress
+from kouxing.services.recognizer.speech_segmenter import (
+    SpeechEnd,
+    SpeechItem,
+    SpeechSegmenter,
+    SpeechStart,
 )
-from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
@@ -56,74 +55,54 @@ class AnalyzedRecording:
         return [event for event in self.events if isinstance(event, Phone)]
 
 
-def recognize_recording(
-    model: AcousticModel, samples: NDArray[np.float32], with_progress: WithProgress = iter
-) -> list[Phone]:
-    """Return the phones of ``analyze_recording``, which has the parameters."""
-    return decode_offline(
-        model,
-        score_recording(
-            model, samples, MEDIA_RATE_HZ, silence_s=MAX_DELAY_S, with_progress=with_progress
-        ),
-    )
-
-
 def analyze_recording(
-    model: AcousticModel,
     samples: NDArray[np.float32],
+    phones: Sequence[Phone],
     lip_predictor: LipFrameModel | None = None,
-    aligned: Sequence[Phone] | None = None,
+    *,
+    is_text_known: bool = True,
     with_progress: WithProgress = iter,
 ) -> AnalyzedRecording:
-    """Find the phones, lip frames, voice activity and levels of a recording.
+    """Find the lip frames, voice activity and levels of a recording.
 
     Parameters
     ----------
-    model
-        The acoustic model.
     samples
         16 kHz mono, shape (n,).
+    phones
+        The phones of the recording, recognized or of a known text.
     lip_predictor
         The network that predicts learnt lips, if any.
-    aligned
-        The phones of the known text; None: phones are recognized.
+    is_text_known
+        Whether the phones are those of a known text.
     with_progress
         Shows the progress.
     """
     lip_stream = None
     if lip_predictor is not None:
         lip_stream = lip_predictor.create_stream(lip_predictor.delays_s[-1:])
-    lip_positions: list[LipPositions] = []
-    changes: list[SpeechChange] = []
+    segmenter = SpeechSegmenter(WhisperMel(), lip_stream)
+    events: list[SoundEvent] = []
 
-    def scores() -> Iterator[ScoreEvent]:
-        """Yield the events for decoding, and collect the others."""
-        for event in score_recording(
-            model,
-            samples,
-            MEDIA_RATE_HZ,
-            lip_stream,
-            silence_s=MAX_DELAY_S,
-            with_progress=with_progress,
-        ):
-            if isinstance(event, LipPositions):
-                if event.time_s >= 0.0:
-                    lip_positions.append(event)
-                continue
-            if isinstance(event, SpeechStart | SpeechEnd):
-                is_start = isinstance(event, SpeechStart)
-                changes.append(SpeechChange(active=is_start, time_s=frame_time_s(event.frame)))
-            yield event
+    def add_events(items: Iterable[SpeechItem]) -> None:
+        for item in items:
+            if isinstance(item, SpeechStart | SpeechEnd):
+                is_start = isinstance(item, SpeechStart)
+                events.append(SpeechChange(active=is_start, time_s=frame_time_s(item.frame)))
+            elif isinstance(item, LipPositions) and item.time_s >= 0.0:
+                events.append(item)
 
-    if aligned is None:
-        phones = decode_offline(model, scores())
-    else:
-        phones = [replace(phone, confidence=1.0) for phone in aligned]
-        deque(scores(), maxlen=0)
+    for start in with_progress(range(0, len(samples), MEDIA_RATE_HZ)):
+        add_events(segmenter.accept_waveform(samples[start : start + MEDIA_RATE_HZ]))
+    silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)
+    add_events(segmenter.accept_waveform(silence))
+    add_events(segmenter.input_finished())
+    if is_text_known:
+        phones = [replace(phone, confidence=1.0) for phone in phones]
     return AnalyzedRecording(
         duration_s=len(samples) / MEDIA_RATE_HZ,
-        events=[*phones, *lip_positions, *changes, *progress_of(samples, MAX_DELAY_S)],
-        is_text_known=aligned is not None,
+        events=[*phones, *events, *progress_of(samples, MAX_DELAY_S)],
+        is_text_known=is_text_known,
     )
 
 

@@ -29,10 +29,12 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 
 SCHEMES = (1, 2, 3, 4)
@@ -111,17 +113,22 @@ def all_conditions(recognizers: Sequence[TestedRecognizer], lips: Sequence[str])
 
 
 def recognize_all(
-    model: AcousticModel, recognizers: Sequence[TestedRecognizer], sentences: Sequence[Sentence]
+    recognizers: Sequence[TestedRecognizer], sentences: Sequence[Sentence]
 ) -> list[RecognizedSentence]:
-    """Run all recognizers on all sentences. ``model`` is the one of the aligned phones."""
+    """Run all recognizers on all sentences."""
     lips = load_lip_predictor()
     recognized = []
     for sentence in track(sentences, description="recognizing", transient=True):
         samples, phones = sentence.clip.samples, sentence.aligned
-        aligned = None if phones is None else analyze_recording(model, samples, lips, phones)
+        aligned = None if phones is None else analyze_recording(samples, phones, lips)
         outputs = {
             tested.name: RecognizerOutput(
-                analyze_recording(tested.model, samples, lips),
+                analyze_recording(
+                    samples,
+                    recognize(tested.model, samples, MEDIA_RATE_HZ),
+                    lips,
+                    is_text_known=False,
+                ),
                 live_events(tested.model, samples, lips, _DELAYS_S, tested.config),
                 tested.has_paper_rule,
             )

@@ -1,7 +1,7 @@
 """Error rates and delays of the recognizer, in clean and disturbed speech.
 
-Offline decoding and the live output rule (Li et al. 2011, eq. 4) are measured in clean speech, by
-speaking rate, and in disturbed speech (:mod:`~kouxing.evaluation.recognizer.disturbances`):
+The output rule (Li et al. 2011, eq. 4) is measured in clean speech, by speaking rate, and in
+disturbed speech (:mod:`~kouxing.evaluation.recognizer.disturbances`):
 
 - phone error rate: insertions, deletions and substitutions per reference phone, without silence, by
   speaker, with a bootstrap interval over speakers;
@@ -12,7 +12,8 @@ speaking rate, and in disturbed speech (:mod:`~kouxing.evaluation.recognizer.dis
 
 A live recognizer has two hypotheses. The first hypothesis holds each phone as first emitted, by the
 rule or, unlike in the paper, along with the next phone. The final hypothesis holds the corrected
-phones. Every recording is a separate session, so the live mean starts from the prior each time.
+phones, which are also those of a whole recording. Every recording is a separate session, so the
+live mean starts from the prior each time.
 """
 
 from collections import defaultdict
@@ -39,7 +40,6 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.live_decoder import LiveDecoder
-from kouxing.services.recognizer.offline import decode_offline
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.phones.events import Phone
@@ -49,7 +49,7 @@ from kouxing.shared.terminal import CONSOLE
 # the paper's rule and a rule with fewer errors, which are measured in clean speech
 RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))
 CHUNK_SAMPLES = 160  # 10 ms, as live audio arrives
-HYPOTHESES = ("offline", "first", "final")
+HYPOTHESES = ("first", "final")
 _NUM_RESAMPLES = 2000
 
 
@@ -57,7 +57,6 @@ _NUM_RESAMPLES = 2000
 class Recognition:
     """The phones of one recording, by hypothesis, without silence."""
 
-    offline: list[Phone]
     first: list[Phone] = field(default_factory=list)
     emitted_s: list[float] = field(default_factory=list)  # media time of each of ``first``
     final: list[Phone] = field(default_factory=list)
@@ -164,16 +163,12 @@ def evaluate_recognizer(
         samples = reference.read_audio()
         for name, disturb in disturbances.items():
             scored = _score(model, disturb(samples))
-            decoded = decode_offline(model, (event for _, events in scored for event in events))
-            offline = spoken(decoded, model.inventory)
-            recognition = _recognize(model, scored, rule, offline)
+            recognition = _recognize(model, scored, rule)
             speech[name].add(reference, recognition)
             if name == CLEAN:
                 speech[reference.rate_name].add(reference, recognition)
                 for other in rules:
-                    by_rule[_rule_name(other)].add(
-                        reference, _recognize(model, scored, other, offline)
-                    )
+                    by_rule[_rule_name(other)].add(reference, _recognize(model, scored, other))
     rng = np.random.default_rng(0)
     return {
         "recordings": len(references),
@@ -210,10 +205,9 @@ def _recognize(
     model: AcousticModel,
     scored: Sequence[tuple[float, list[ScoreEvent]]],
     rule: OutputRuleConfig,
-    offline: list[Phone],
 ) -> Recognition:
     decoder = LiveDecoder(model.topology, rule)
-    out = Recognition(offline)
+    out = Recognition()
     known: set[int] = set()
     for time_s, scores in scored:
         events = decoder.decode(scores)

@@ -22,6 +22,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables
 from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
+from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -118,16 +119,24 @@ def animate(
         faces = [_stream(chain, samples, progress) for chain in chains]
         events = chains[-1].events
     else:
-        phones = None
-        if transcript is not None:
+        if transcript is None:
+            with_progress = partial(progress.track, description="recognizing")
+            phones = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+        else:
             with_progress = partial(progress.track, description="aligning")
             alignment = align_syllables(
                 model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress
             )
             report_mismatch(source, alignment)
             phones = alignment.phones
-        with_progress = partial(progress.track, description="recognizing")
-        recording = analyze_recording(model, samples, predictor, phones, with_progress)
+        with_progress = partial(progress.track, description="finding the lips")
+        recording = analyze_recording(
+            samples,
+            phones,
+            predictor,
+            is_text_known=transcript is not None,
+            with_progress=with_progress,
+        )
         with_progress = partial(progress.track, description="animating")
         faces = [
             animate_recording(recording, lip_model, config, with_progress)

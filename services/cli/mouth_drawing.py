@@ -24,13 +24,9 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.speech_scorer import WithProgress
+from kouxing.services.recognizer.offline import WithProgress, recognize
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
-from kouxing.services.recording_chain import (
-    analyze_recording,
-    animate_recording,
-    recognize_recording,
-)
+from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, rounded_contour
@@ -181,7 +177,7 @@ def _time_phones(
         return phones
     model = load_model()
     if transcript is None:
-        return recognize_recording(model, samples, with_progress)
+        return recognize(model, samples, MEDIA_RATE_HZ, with_progress)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     report_mismatch(source, alignment)
     return alignment.phones
@@ -196,9 +192,8 @@ def _widths(
     """Return times, and the distance of the corners at each, relative to the mouth at rest."""
     if lips is DrawnLips.FERGUSON:
         return np.zeros(1), np.ones(1)
-    model = load_model()
     predictor = load_lip_predictor() if lips is DrawnLips.LEARNT else None
-    recording = analyze_recording(model, samples, predictor, timed, with_progress)
+    recording = analyze_recording(samples, timed, predictor, with_progress=with_progress)
     frames = animate_recording(
         recording, load_lip_model(name=lips), SynthesizerConfig(lips=lips, expressiveness=1.0)
     )

@@ -210,7 +210,7 @@ def phones(
     """Recognize the phones of audio files, with their times."""
     from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.recognizer.acoustic.load import load_model
-    from kouxing.services.recording_chain import recognize_recording
+    from kouxing.services.recognizer.offline import recognize
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.phone_files import format_phones
 
@@ -230,7 +230,7 @@ def phones(
         duration_s = len(samples) / MEDIA_RATE_HZ
         with open_progress() as progress:
             with_progress = partial(progress.track, description="recognizing")
-            recognized = recognize_recording(model, samples, with_progress)
+            recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
         if not recognized:
             print_message(f"{source}: no speech was found")
         write_output(format_phones(recognized, style, duration_s), target)

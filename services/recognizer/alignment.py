@@ -22,13 +22,13 @@ from kouxing.services.recognizer.front_end.features import (
     frames_in,
 )
 from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.services.recognizer.offline import WithProgress
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
     segments_of_path,
     utterance_graph,
     viterbi_path,
 )
-from kouxing.services.recognizer.speech_scorer import WithProgress
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable

@@ -24,7 +24,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     empty_scores,
 )
 from kouxing.services.recognizer.front_end.features import HOP_S, frame_time_s
-from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
+from kouxing.services.recognizer.search.decoder import Decoder, Segment
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import (
     FrameScores,
@@ -33,8 +33,6 @@ from kouxing.services.recognizer.speech_scorer import (
 from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
 
-FINALIZE_AFTER_S = 0.2  # after a phone's end; waiting longer corrects nothing more
-_FINALIZE_AFTER_FRAMES = round(FINALIZE_AFTER_S / HOP_S)
 _DEFAULT_CONFIDENCE = 0.5  # of a phone that was not emitted before it was final
 
 StreamOutput: TypeAlias = SoundEvent | Waveform
@@ -50,9 +48,12 @@ class LiveDecoder:
     The paper never corrects an emitted phone. Here, whenever a phone is emitted, the best string
     corrects the earlier ones. Such a phone is emitted again under its ``index``, with the measured
     onset and duration, or with another symbol. Phones that the rule passed over are emitted
-    together with the next one. A surplus phone is withdrawn (``Phone.is_withdrawn``). The last
-    emission of a phone has ``final`` true and comes ``FINALIZE_AFTER_S`` after its end, or when
-    speech ends. Silence within speech is a phone like any other.
+    together with the next one. A surplus phone is withdrawn (``Phone.is_withdrawn``). Silence
+    within speech is a phone like any other.
+
+    A phone is final when all paths of the search over settled scores share it, or speech has ended.
+    So the final phones are those of a traceback over the whole speech, and their confidence is the
+    mean over their frames. The output rule and the provisional scores affect neither.
 
     If the model has provisional scores, the search continues over them. When the next scores come,
     it restarts from the last settled frame. The output rule gets each frame once, as soon as the
@@ -77,7 +78,8 @@ class LiveDecoder:
                 self._start_speech(event.frame)
                 out.append(SpeechChange(active=True, time_s=frame_time_s(event.frame)))
             elif isinstance(event, SpeechEnd):
-                rest = segments_after(self._decoder.final_path(), self._done)
+                path = self._settled.final_path()
+                rest = [segment for segment in path if segment.start >= self._done]
                 if self._open and len(rest) > 1 and rest[-1].phone == self._silence:
                     rest.pop()  # the end of speech implies it
                 out += self._revise(rest, num_following=0)
@@ -92,6 +94,7 @@ class LiveDecoder:
         self._start_frame = frame
         self._done = 0  # the decoder's frame up to which phones are final
         self._num_checked = 0  # frames that the output rule has had
+        self._confidence = np.empty(0)  # of the settled frames from ``_done`` on
         self._provisional = empty_scores(self._topology.num_states)  # the last ones searched
         self._settled.reset()
         self._decoder = self._settled
@@ -105,10 +108,12 @@ class LiveDecoder:
             known = known[:0]  # the search over provisional scores restarts
         self._decoder = self._settled
         out = self._search(scores.settled)
+        if len(scores.settled):
+            self._settled.forget_before(self._done)
+            self._settled.drop_records()
         if len(scores.provisional):
             self._ahead = self._decoder = self._ahead or Decoder(self._topology)
             if not len(known):
-                self._settled.forget_before(self._done)
                 self._decoder.copy_state(self._settled)
             out += self._search(scores.provisional[len(known) :])
         return out
@@ -116,11 +121,13 @@ class LiveDecoder:
     def _search(self, scores: Floats) -> list[Phone]:
         """Continue the search; the output rule gets the frames that it has not had."""
         num_checked = max(0, self._num_checked - self._decoder.num_frames)
-        self._decoder.advance(scores[:num_checked])
+        confidence = [self._decoder.advance(scores[:num_checked])]
         out: list[Phone] = []
         for frame in range(num_checked, len(scores)):
-            self._decoder.advance(scores[frame : frame + 1])
+            confidence.append(self._decoder.advance(scores[frame : frame + 1]))
             out += self._emit_phone()
+        if self._decoder is self._settled:
+            self._confidence = np.concatenate([self._confidence, *confidence])
         return out
 
     def _emit_phone(self) -> list[Phone]:
@@ -157,19 +164,25 @@ class LiveDecoder:
             silence = self._inventory.silence
             emitted.append(replace(self._open.pop(0), symbol=silence, duration_s=0.0, final=True))
             self._num_final, num_before = self._num_final + 1, num_before - 1
-        final_until = self._decoder.num_frames - (_FINALIZE_AFTER_FRAMES if num_following else 0)
+        final_until = self._settled.shared_end if num_following else self._settled.num_frames
         known = dict(enumerate(self._open))
         self._open = []
-        first_index = self._num_final
+        first_index, first_frame = self._num_final, self._done
         for number, segment in enumerate(segments):
             onset_s = self._time_s(segment.start)
+            is_final = segment.end <= final_until
+            if is_final:
+                span = slice(segment.start - first_frame, segment.end - first_frame)
+                confidence = float(self._confidence[span].mean())
+            else:
+                confidence = known[number].confidence if number in known else _DEFAULT_CONFIDENCE
             phone = Phone(
                 index=first_index + number,
                 symbol=self._inventory.phones[segment.phone],
                 onset_s=onset_s,
                 duration_s=self._time_s(segment.end) - onset_s,
-                confidence=known[number].confidence if number in known else _DEFAULT_CONFIDENCE,
-                final=segment.end <= final_until,
+                confidence=confidence,
+                final=is_final,
             )
             if phone != known.get(number):
                 emitted.append(phone)
@@ -177,6 +190,7 @@ class LiveDecoder:
                 self._finalize(phone)
             else:
                 self._open.append(phone)
+        self._confidence = self._confidence[self._done - first_frame :]
         return emitted
 
     def _finalize(self, phone: Phone) -> None:

@@ -1,4 +1,4 @@
-"""Audio to state scores of speech: what live and offline recognition share.
+"""Audio to state scores of speech.
 
     samples -> speech segmenter -> [speech only] acoustic model -> events
 
@@ -6,11 +6,9 @@ Any chunking of the same audio gives the same result.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
-
-import numpy as np
+from typing import TypeAlias
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
@@ -19,8 +17,6 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Work,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.speech_segmenter import (
@@ -46,7 +42,6 @@ class FrameScores:
     provisional: Floats  # (k, states) of the frames after those, until the next FrameScores
 
 
-WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, or a progress bar
 ScoreEvent: TypeAlias = (
     SpeechStart
     | SpeechEnd
@@ -174,43 +169,3 @@ def score_streams(scorers: Sequence[SpeechScorer]) -> None:
         scores = model.score([scorer.next_work() for scorer in batch])
         for scorer, settled in zip(batch, scores, strict=True):
             scorer.add_scores(settled)
-
-
-def score_recording(
-    model: AcousticModel,
-    samples: Floats,
-    sample_rate_hz: int,
-    lip_stream: LipFrameStream | None = None,
-    *,
-    silence_s: float = 0.0,
-    with_progress: WithProgress = iter,
-) -> Iterator[ScoreEvent]:
-    """Score a whole recording, second by second.
-
-    Parameters
-    ----------
-    model, lip_stream
-        As for :class:`SpeechScorer`.
-    samples
-        The recording, shape (n,) or (n, channels).
-    sample_rate_hz
-        Sample rate of the recording.
-    silence_s
-        Duration of the silence to append.
-    with_progress
-        Shows the progress.
-    """
-    scorer = SpeechScorer(model, lip_stream)
-    resampler = Resampler(sample_rate_hz, 1 if samples.ndim == 1 else samples.shape[1])
-
-    def score(more: Floats) -> list[ScoreEvent]:
-        scorer.accept_waveform(more)
-        score_streams([scorer])
-        return scorer.get_events()
-
-    for start in with_progress(range(0, len(samples), sample_rate_hz)):
-        yield from score(resampler.accept_waveform(samples[start : start + sample_rate_hz]))
-    yield from score(resampler.finish())
-    yield from score(np.zeros(round(silence_s * SAMPLE_RATE_HZ), np.float32))
-    scorer.input_finished()
-    yield from score(np.zeros(0, np.float32))

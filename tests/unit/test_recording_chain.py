@@ -9,6 +9,7 @@ from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -22,7 +23,9 @@ STILL = SynthesizerConfig(idle_motion_seed=0, expressiveness=1.0)
 
 def test_dynamic_visemes_are_the_full_model() -> None:
     samples = read_audio(VOWELS_FILE)[0][:, 0]
-    heard = analyze_recording(load_model(), samples)
+    heard = analyze_recording(
+        samples, recognize(load_model(), samples, 16_000), is_text_known=False
+    )
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
     made = np.array([faps for _, faps in animate_recording(heard, lips, STILL)])
@@ -37,7 +40,7 @@ def test_of_a_known_text_every_closing_lip_shuts_and_vowels_are_open() -> None:
     samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
     model = load_model()
     aligned = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
-    heard = analyze_recording(model, samples[:, 0], load_lip_predictor(), aligned)
+    heard = analyze_recording(samples[:, 0], aligned, load_lip_predictor())
     frames = animate_recording(heard, load_lip_model(name="learnt"), STILL)
     times_s = np.array([time_s for time_s, _ in frames])
     opening = np.array([-faps[3] - faps[4] for _, faps in frames])  # of the inner lips
@@ -54,7 +57,7 @@ def test_of_a_known_text_every_closing_lip_shuts_and_vowels_are_open() -> None:
 def test_every_phone_of_a_sentence_with_many_rounded_vowels_is_right() -> None:
     samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
     model = load_model()
-    heard = analyze_recording(model, samples)
-    spoken = [phone.symbol for phone in heard.phones if phone.symbol != model.inventory.silence]
+    phones = recognize(model, samples, 16_000)
+    spoken = [phone.symbol for phone in phones if phone.symbol != model.inventory.silence]
     text = model.inventory.pronounce("五月的湖边，我和女儿读书、画鱼。")
     assert spoken == [phone for syllable in text for phone in syllable]

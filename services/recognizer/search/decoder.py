@@ -19,7 +19,7 @@ record   (end, phone, link): a phone that ended there, and     (records, 3)
 
 The best string may still change, except for the part that all live paths share. From time to time,
 that part is stored and the records that no path needs are dropped (partial traceback). So the
-memory stays bounded in endless speech.
+memory stays bounded in endless speech. Phones in that part are final (``shared_end``).
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Decoder:
     def reset(self) -> None:
         """Start a new stretch of speech at frame 0."""
         self.num_frames = 0
-        self._shared: list[Segment] = []  # phones that no later frame can change
+        self._shared: list[Segment] = []  # phones that no later frame can change; the latest
         self._last_shared = _NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # in the phone
@@ -124,14 +124,20 @@ class Decoder:
         for values, new in zip(self._tokens, other._tokens, strict=True):
             values[: self._num_tokens] = new[: self._num_tokens]
 
-    def advance(self, scores: NDArray[np.float32]) -> None:
-        """Search the next frames, given the scores of their states, (frames, states)."""
-        while len(scores):
+    def advance(self, scores: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Search the next frames, given the scores of their states, (frames, states).
+
+        Returns the confidence in the last phone after each frame, (frames,).
+        """
+        confidence = np.empty(len(scores))
+        num_advanced = 0
+        while num_advanced < len(scores):
             if self._num_records + _MAX_TOKENS > len(self._records):
                 self.drop_records()
-            num_done, self._num_tokens, self._num_records, token, state, self._confidence = _steps(
+            num_done, self._num_tokens, self._num_records, token, state = _steps(
                 self.num_frames,
-                scores,
+                scores[num_advanced:],
+                confidence[num_advanced:],
                 self._num_tokens,
                 self._tokens,
                 _token_table(len(self._graph.last_phone)),
@@ -142,7 +148,10 @@ class Decoder:
             )
             self._best = (token, state)
             self.num_frames += num_done
-            scores = scores[num_done:]
+            num_advanced += num_done
+        if num_advanced:
+            self._confidence = float(confidence[-1])
+        return confidence
 
     @property
     def last_phone(self) -> LastPhone:
@@ -152,21 +161,24 @@ class Decoder:
         return LastPhone(phone, self._end(self._tokens.link[self._best]), self._confidence)
 
     def path_since(self, frame: int) -> list[Segment]:
-        """Return the phones of the best string so far after a frame, without its last phone.
+        """Return the phones of the best string that start at a frame or later, without the last.
 
-        They may still change. The first is cut to begin at the frame, if less than half of it is
-        cut off; otherwise it is left out. Earlier phones are forgotten.
+        Those that end after ``shared_end`` may still change.
         """
-        self.forget_before(frame)
-        path = self._trace(int(self._tokens.link[self._best]))
-        return [*self._shared, *segments_after(path, frame)]
+        path = [*self._shared, *self._trace(int(self._tokens.link[self._best]))]
+        return [segment for segment in path if segment.start >= frame]
+
+    @property
+    def shared_end(self) -> int:
+        """Frame up to which all paths had the same phones when ``drop_records`` was last called."""
+        return self._end(self._last_shared)
 
     def forget_before(self, frame: int) -> None:
-        """Forget phones before a frame that all paths share; no path will contain them."""
-        self._shared = segments_after(self._shared, frame)
+        """Forget the phones before a frame; ``shared_end`` is not before it."""
+        self._shared = [segment for segment in self._shared if segment.start >= frame]
 
     def final_path(self) -> list[Segment]:
-        """Return the best string of all frames, at the end of the speech."""
+        """Return the best string at the end of the speech, without phones that were forgotten."""
         if self.num_frames == 0:
             return []
         first_state, log_leave = self._hmms.first_state, self._hmms.log_leave
@@ -230,19 +242,11 @@ def _token_table(num_contexts: int) -> NDArray[np.int16]:
     return table
 
 
-def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
-    """Return the segments that lie mostly after a frame, cut to start there."""
-    return [
-        Segment(segment.phone, max(segment.start, frame), segment.end)
-        for segment in segments
-        if segment.end - frame > max(frame - segment.start, 0)
-    ]
-
-
 @numba.njit(cache=True, nogil=True)
 def _steps(
     frame: int,
     observed: NDArray[np.float32],
+    confidence: NDArray[np.float64],
     num_tokens: int,
     tokens: _Tokens,
     token_of: NDArray[np.int16],
@@ -250,13 +254,13 @@ def _steps(
     num_records: int,
     hmms: _Hmms,
     graph: Graph,
-) -> tuple[int, int, int, int, int, float]:
+) -> tuple[int, int, int, int, int]:
     """Advance all paths by the observed frames, or as far as there is room for their records.
 
-    Returns the numbers of frames, tokens and records; the best token, its best state, and the
-    confidence.
+    Fills in the confidence after each frame. Returns the numbers of frames, tokens and records;
+    the best token, and its best state.
     """
-    num_done, token, state, confidence = 0, 0, 0, 0.0
+    num_done, token, state = 0, 0, 0
     for number in range(num_tokens):
         token_of[tokens.context[number]] = number
     while num_done < len(observed) and num_records + len(tokens.context) <= len(records):
@@ -267,11 +271,11 @@ def _steps(
         token, state = _advance_states(
             observed[num_done], num_tokens, tokens, entry, entry_link, hmms, graph
         )
-        confidence = _normalize_scores(token, state, num_tokens, tokens, records, graph)
+        confidence[num_done] = _normalize_scores(token, state, num_tokens, tokens, records, graph)
         num_done += 1
     for number in range(num_tokens):
         token_of[tokens.context[number]] = _NO_TOKEN
-    return num_done, num_tokens, num_records, token, state, confidence
+    return num_done, num_tokens, num_records, token, state
 
 
 @numba.njit(cache=True, nogil=True)
