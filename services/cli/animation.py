@@ -47,6 +47,7 @@ class Motion:
     samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
     phones: list[Phone] | None = None  # spoken phones in order; None if the source has no sound
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
+    source: Path | None = None
 
 
 def slow_down(motion: Motion, speed: float) -> Motion:
@@ -79,6 +80,7 @@ def read_motion(source: Path, sound: Path | None) -> Motion:
         animation.frame_rate_hz,
         min(animation.frame_rate_hz, _MAX_IMAGE_RATE_HZ),
         None if sound is None else read_mono_16k(sound),
+        source=sound or source,
     )
 
 
@@ -151,6 +153,7 @@ def animate(
         samples,
         spoken,
         write_syllables(spoken, transcript, model.inventory),
+        source,
     )
 
 

@@ -143,12 +143,21 @@ def listen(
     ] = ListenOutput.FAPS,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="File for the frames: .fap, .csv, .jsonl or .glb."),
+        typer.Option(
+            "--output",
+            "-o",
+            help="File for the frames (.fap, .csv, .jsonl or .glb), or for drawn mouths (.tsv, .xml"
+            " or .json of Rhubarb Lip Sync).",
+        ),
     ] = None,
     form: Annotated[
-        CurveForm,
-        typer.Option("--as", help="Values of the frames. Shapes are printed as JSON lines."),
-    ] = CurveForm.FAPS,
+        CurveForm | None,
+        typer.Option(
+            "--as",
+            help="Values of the frames. Shapes are printed as JSON lines, and the drawn mouths of"
+            " rhubarb when they change. Default: the first of the format.",
+        ),
+    ] = None,
     force: Force = False,
     control: Control = "",
 ) -> None:

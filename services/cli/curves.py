@@ -19,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
+from kouxing.services.cli.cues import CUE_FORMATS, CUE_KINDS, write_cues
 from kouxing.services.cli.options import CurveForm, ExportOptions
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float32]
 Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
+_SHAPE_FORMS = (CurveForm.ARKIT, CurveForm.OCULUS, CurveForm.VRM)
 _LIVE_LINK_RATE_HZ = 60  # of the time code; the app's default
 
 
@@ -44,6 +47,8 @@ class Curves:
     rows: Iterable[Row]
     frame_rate_hz: float | None = None  # None: estimated from the times of the frames
     phones: Sequence[Phone] | None = None  # spoken phones by onset; tables get a column for them
+    source: Path | None = None  # recording
+    duration_s: float | None = None  # of the recording; None: until the last frame
 
 
 class CurveExporter(ABC):
@@ -54,13 +59,14 @@ class CurveExporter(ABC):
 
     unit: ClassVar[str] = "frame"
     options: ClassVar[frozenset[str]] = frozenset({"lips", "form"})
-    forms: ClassVar[tuple[CurveForm, ...]] = tuple(CurveForm)
+    forms: ClassVar[tuple[CurveForm, ...]]  # the first one is the default
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        if options.form not in self.forms:
-            suffixes = [name for name, cls in CURVE_EXPORTERS.items() if options.form in cls.forms]
+        form = options.form or self.forms[0]
+        if form not in self.forms:
+            suffixes = [name for name, cls in CURVE_EXPORTERS.items() if form in cls.forms]
             raise UserError(
-                f"{output}: this format holds {' or '.join(self.forms)}; for {options.form}, write"
+                f"{output}: this format holds {' or '.join(self.forms)}; for {form}, write"
                 f" {' or '.join(suffixes)}"
             )
         if len(options.lips) > 1:
@@ -68,13 +74,16 @@ class CurveExporter(ABC):
         if not output.parent.is_dir():
             raise write_error(output, FileNotFoundError())
         self._output = output
-        self._form = options.form
+        self._form = form
         self._head = options.head
 
     def export(self, motion: Motion, progress: Progress) -> int:
         """Write all frames of a motion and return their number."""
         rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
-        return self.write(Curves(rows, motion.frame_rate_hz, motion.phones))
+        duration_s = None if motion.samples is None else len(motion.samples) / MEDIA_RATE_HZ
+        return self.write(
+            Curves(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
+        )
 
     @abstractmethod
     def write(self, curves: Curves) -> int:
@@ -86,6 +95,8 @@ class CurveExporter(ABC):
 
 class CsvExporter(CurveExporter):
     """Writes comma-separated values, with a column for each FAP or shape."""
+
+    forms = tuple(form for form in CurveForm if form is not CurveForm.RHUBARB)
 
     def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
@@ -102,7 +113,7 @@ class CsvExporter(CurveExporter):
 class JsonLinesExporter(CurveExporter):
     """Writes a JSON object for each frame."""
 
-    forms = tuple(form for form in CurveForm if form is not CurveForm.LIVELINK)
+    forms = (CurveForm.FAPS, *_SHAPE_FORMS)
 
     def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
@@ -144,11 +155,29 @@ class GlbExporter(CurveExporter):
         return len(frames)
 
 
+class CueExporter(CurveExporter):
+    """Writes cues in a format of Rhubarb Lip Sync: drawn mouths, or Oculus visemes."""
+
+    forms = tuple(CUE_KINDS)
+
+    def write(self, curves: Curves) -> int:
+        """Write the cues when the last frame has arrived."""
+        kind = CUE_KINDS[self._form]
+        frames = [(time_s, faps) for time_s, _, faps in curves.rows]
+        end_s = curves.duration_s or (frames[-1][0] if frames else 0.0)
+        cues = kind.cues_of(frames)
+        suffix = self._output.suffix.lower()
+        text = write_cues(suffix, cues, kind.rest, end_s, curves.source)
+        _write_lines(self._output, text.splitlines())
+        return len(frames)
+
+
 CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
     ".fap": FapExporter,
     ".csv": CsvExporter,
     ".jsonl": JsonLinesExporter,
     ".glb": GlbExporter,
+    **dict.fromkeys(CUE_FORMATS, CueExporter),
 }
 
 

@@ -16,6 +16,7 @@ from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
+from kouxing.shared.face.mouth_shapes import mouth_cues
 from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
@@ -29,14 +30,14 @@ T = TypeVar("T", FapFrame, Phone)
 
 
 def follow(
-    session: str, output: Path | None, shown: ListenOutput, form: CurveForm, control: str
+    session: str, output: Path | None, shown: ListenOutput, form: CurveForm | None, control: str
 ) -> None:
     """Follow a session until it ends; without a name, the newest one, or else the next one.
 
     The frames go to ``output``. Without it, what ``shown`` selects is printed. Raises ``UserError``
     if control does not answer, or the file cannot be written.
     """
-    if shown is not ListenOutput.FAPS and (output is not None or form is not CurveForm.FAPS):
+    if shown is not ListenOutput.FAPS and (output is not None or form is not None):
         raise UserError(f"--show {shown} cannot be combined with --output or --as")
     if form is CurveForm.LIVELINK and output is None:
         raise UserError("--as livelink is a table; add --output face.csv")
@@ -55,6 +56,8 @@ def follow(
             rows = map(_row, arriving)
             count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
     unit = "frame" if shows_faps else shown.value.removesuffix("s")
+    if form is CurveForm.RHUBARB and output is None:
+        unit = "mouth shape"
     print_message(f"session {followed.name} ended: {plural(count, unit)}")
     if results.num_missed:
         print_message(missed_remark(results.num_missed, "frame" if shows_faps else "phone"))
@@ -62,7 +65,7 @@ def follow(
         print_message(f"wrote {output}")
 
 
-def _open_exporter(output: Path, form: CurveForm) -> CurveExporter:
+def _open_exporter(output: Path, form: CurveForm | None) -> CurveExporter:
     exporter = CURVE_EXPORTERS.get(output.suffix.lower())
     if exporter is None:
         raise UserError(
@@ -131,9 +134,12 @@ def _row(frame: FapFrame) -> Row:
     return frame.time_s, frame.sequence, np.array(frame.values, np.float32)
 
 
-def _print_frames(rows: Iterable[Row], form: CurveForm) -> int:
-    """Print frames, a line for each, and return their number."""
-    if form is not CurveForm.FAPS:
+def _print_frames(rows: Iterable[Row], form: CurveForm | None) -> int:
+    """Print frames, a line for each, and return their number; drawn mouths when they change."""
+    if form is CurveForm.RHUBARB:
+        cues = mouth_cues((time_s, faps) for time_s, _, faps in rows)
+        return _print(f"{time_s:.2f}\t{mouth}" for time_s, mouth in cues)
+    if form not in (None, CurveForm.FAPS):
         return _print(json_line(row, form) for row in rows)
     CONSOLE.print(LEGEND, markup=False, highlight=False)
     return _print(

@@ -66,8 +66,8 @@ def render(
             help="Audio or video files, or curves (.fap, .csv, .jsonl) of kouxing or of the app"
             " Live Link Face; '-' is standard input. Then, for a single file, the output: a video"
             " (.mp4, .mov, .webm, or .webp without sound), one picture (.png), numbered pictures"
-            " (a folder, or a pattern such as face%05d.png), curves (.fap, .csv, .jsonl) or an"
-            " animated head (.glb).",
+            " (a folder, or a pattern such as face%05d.png), curves (.fap, .csv, .jsonl), an"
+            " animated head (.glb) or drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).",
         ),
     ],
     output: Annotated[
@@ -96,8 +96,13 @@ def render(
         ),
     ] = None,
     form: Annotated[
-        CurveForm, typer.Option("--as", help="Values to write to a curve file.")
-    ] = CurveForm.FAPS,
+        CurveForm | None,
+        typer.Option(
+            "--as",
+            help="Values to write to a curve file. Default: faps; drawn mouths (rhubarb) in .tsv,"
+            " .xml and .json.",
+        ),
+    ] = None,
     head: HeadName = DEFAULT_HEAD,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "1280x720",
     background: Annotated[

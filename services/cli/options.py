@@ -48,6 +48,7 @@ class CurveForm(StrEnum):
     ARKIT = ShapeSetName.ARKIT
     OCULUS = ShapeSetName.OCULUS
     VRM = ShapeSetName.VRM
+    RHUBARB = "rhubarb"  # drawn mouths, A to H and X, of Rhubarb Lip Sync
     LIVELINK = "livelink"  # ARKit and head angles, as the app Live Link Face records them
 
 
@@ -87,7 +88,7 @@ class ExportOptions:
     """How ``kouxing render`` shows and writes a face. The defaults are those of its options."""
 
     lips: tuple[str, ...] = (DEFAULT_LIP_MODEL,)
-    form: CurveForm = CurveForm.FAPS
+    form: CurveForm | None = None  # None: the first one of the format
     head: str = DEFAULT_HEAD
     size: str = "1280x720"
     background: str = "studio"

@@ -66,7 +66,7 @@ def test_fap_has_the_frame_rate_of_the_motion_or_of_the_times(tmp_path: Path) ->
 
 
 def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
-    for name in ("face.json", "face.txt", "face.avi"):
+    for name in ("face.yaml", "face.txt", "face.avi"):
         output = tmp_path / name
         with pytest.raises(UserError, match=r"unknown format; .*\.mp4, .*\.png, .*\.csv"):
             open_exporter(output, ExportOptions())
@@ -84,6 +84,8 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("no/a.csv", {}, "cannot write"),
         ("no/a.mp4", {}, "cannot write"),
         ("a.jsonl", {"form": CurveForm.LIVELINK}, "for livelink, write .csv"),
+        ("a.csv", {"form": CurveForm.RHUBARB}, "for rhubarb, write .tsv or .xml or .json"),
+        ("a.tsv", {"form": CurveForm.ARKIT}, "holds rhubarb or oculus; for arkit, write .csv"),
         ("a.mp4", {"form": CurveForm.ARKIT}, "--as does not apply .* .fap, .csv"),
         ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
         ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),

@@ -1,0 +1,101 @@
+"""Files of Rhubarb Lip Sync: which mouth is drawn at which time, as TSV, XML or JSON.
+
+Source: README of Rhubarb Lip Sync, "Output formats". Times have two decimals, and the end of the
+recording is truncated to them. A cue ends where the next one starts. The last line of a TSV is the
+end of the recording, with the mouth at rest.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeAlias
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.cli.options import CurveForm
+from kouxing.shared.face.mouth_shapes import CLOSED, REST, SILENCE, Cue, mouth_cues, oculus_cues
+
+Frames: TypeAlias = Iterable[tuple[float, NDArray[np.float32]]]  # times in seconds, FAPs (68,)
+_Span: TypeAlias = tuple[str, str, str]  # start and end, and the mouth between them
+
+
+@dataclass(frozen=True, slots=True)
+class CueKind:
+    """A set of mouths of which one is shown at a time."""
+
+    cues_of: Callable[[Frames], Iterator[Cue]]
+    rest: str
+
+
+CUE_KINDS = {
+    CurveForm.RHUBARB: CueKind(mouth_cues, REST),
+    CurveForm.OCULUS: CueKind(oculus_cues, SILENCE),
+}
+
+
+def write_cues(
+    suffix: str, cues: Iterable[Cue], rest: str, end_s: float, source: Path | None
+) -> str:
+    """Return the cues of a recording as a file, for a suffix in ``CUE_FORMATS``.
+
+    ``end_s`` is the end of the recording. Lips that close for a rest are at rest at once. Equal
+    mouths in a row are one cue.
+    """
+    end = math.floor(100.0 * end_s + 1e-6) / 100.0
+    merged: list[Cue] = []
+    for start_s, mouth in cues:
+        before = merged[-1][1] if merged else ""
+        continues = before == mouth or (before, mouth) == (CLOSED, REST)
+        merged.append((merged.pop()[0] if continues else start_s, mouth))
+    spans = [
+        (f"{start:.2f}", f"{until:.2f}", mouth)
+        for (start, mouth), (until, _) in pairwise([*merged, (end, rest)])
+        if round(start, 2) < round(until, 2)
+    ]
+    return CUE_FORMATS[suffix](spans or [("0.00", f"{end:.2f}", rest)], rest, source)
+
+
+def _tsv(spans: Sequence[_Span], rest: str, _: Path | None) -> str:
+    lines = [f"{start}\t{mouth}\n" for start, _, mouth in spans]
+    return "".join(lines) + f"{spans[-1][1]}\t{rest}\n"
+
+
+def _xml(spans: Sequence[_Span], _: str, source: Path | None) -> str:
+    cues = "".join(
+        f'    <mouthCue start="{start}" end="{end}">{mouth}</mouthCue>\n'
+        for start, end, mouth in spans
+    )
+    return (
+        '<?xml version="1.0" encoding="utf-8"?>\n<rhubarbResult>\n  <metadata>\n'
+        f"    <soundFile>{escape(_name(source))}</soundFile>\n"
+        f"    <duration>{spans[-1][1]}</duration>\n  </metadata>\n"
+        f"  <mouthCues>\n{cues}  </mouthCues>\n</rhubarbResult>\n"
+    )
+
+
+def _json(spans: Sequence[_Span], _: str, source: Path | None) -> str:
+    cues = ",\n".join(
+        f'    {{ "start": {start}, "end": {end}, "value": "{mouth}" }}'
+        for start, end, mouth in spans
+    )
+    sound_file = json.dumps(_name(source), ensure_ascii=False)
+    return (
+        f'{{\n  "metadata": {{\n    "soundFile": {sound_file},\n'
+        f'    "duration": {spans[-1][1]}\n  }},\n  "mouthCues": [\n{cues}\n  ]\n}}\n'
+    )
+
+
+def _name(source: Path | None) -> str:
+    return "" if source is None else str(source.absolute())
+
+
+CUE_FORMATS: dict[str, Callable[[Sequence[_Span], str, Path | None], str]] = {
+    ".tsv": _tsv,
+    ".xml": _xml,
+    ".json": _json,
+}

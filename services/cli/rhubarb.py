@@ -1,0 +1,114 @@
+"""``kouxing-rhubarb``: the command line of Rhubarb Lip Sync, with the lips of kouxing.
+
+Programs that run ``rhubarb`` use kouxing if this command is on their path under that name. Source:
+README of Rhubarb Lip Sync 1.13, "Command-line options" and "Machine-readable status messages".
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.progress import Progress
+
+from kouxing.services.cli.animation import Motion, animate
+from kouxing.services.cli.cues import write_cues
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
+from kouxing.shared.terminal import write_text
+from kouxing.shared.user_file import read_text
+
+_BASIC = {"G": "A", "H": "C", "X": "A"}  # shown instead of a mouth that is not drawn
+_PRESTON_BLAIR = dict(zip("ABCDEFGHX", "MBP etc E AI O U FV L rest".split(), strict=True))
+_MAX_TEXT_BYTES = 8 << 20
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line; exit with status 1 after an error."""
+    options = _parser().parse_args(arguments)
+    try:
+        _report(options, "start", f"reading {options.input}", file=options.input)
+        motion = _animate(options)
+        _report(options, "progress", "finished", value=1.0)
+        result = _format(motion, options)
+        if options.output is None:
+            sys.stdout.write(result)
+        else:
+            write_text(options.output, result)
+    except UserError as error:
+        if options.logFile is not None:
+            write_text(options.logFile, f"[Fatal] {error}\n")
+        _report(options, "failure", str(error), reason=str(error))
+        sys.exit(1)
+    _report(options, "success", "finished")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("rhubarb", description="Animate a mouth from a recording.")
+    program = f"Rhubarb Lip Sync version 1.13.0, in kouxing {version('kouxing')}"
+    add = parser.add_argument
+    add("--version", action="version", version=program)
+    add("input", help="audio or video file")
+    add("-f", "--exportFormat", choices=("tsv", "xml", "json", "dat"), default="tsv")
+    add("-o", "--output", type=Path, help="file to write, which may exist")
+    add("-d", "--dialogFile", type=Path, help="file with the spoken text")
+    add("--extendedShapes", default="GHX", help="which of the mouths G, H and X are drawn")
+    add("--datFrameRate", type=float, default=24.0, help="10 to 100 images per second")
+    add("--datUsePrestonBlair", action="store_true", help="other names of the mouths in dat")
+    add("-q", "--quiet", action="store_true", help="print only errors")
+    add("--machineReadable", action="store_true", help="print the status as JSON")
+    add("--logFile", type=Path, help="file for an error")
+    for names in (("-r", "--recognizer"), ("--consoleLevel",), ("--logLevel",), ("--threads",)):
+        add(*names, help="is ignored")
+    return parser
+
+
+def _animate(options: argparse.Namespace) -> Motion:
+    text = "" if options.dialogFile is None else read_text(options.dialogFile, _MAX_TEXT_BYTES)
+    with Progress(disable=True) as progress:
+        return animate(
+            Path(options.input),
+            [DEFAULT_LIP_MODEL],
+            progress,
+            live=False,
+            text=text.strip() or None,
+            mouth=None,
+            expressiveness=None,
+        )
+
+
+def _format(motion: Motion, options: argparse.Namespace) -> str:
+    """Return the mouths of a recording in the format of the options."""
+    instead = {letter: _BASIC[letter] for letter in _BASIC if letter not in options.extendedShapes}
+    samples = motion.samples if motion.samples is not None else ()
+    end_s, rest = len(samples) / MEDIA_RATE_HZ, instead.get(REST, REST)
+    cues = [(start_s, instead.get(mouth, mouth)) for start_s, mouth in mouth_cues(motion.frames)]
+    if options.exportFormat == "dat":
+        names = _PRESTON_BLAIR if options.datUsePrestonBlair else {}
+        return _moho_switches([*cues, (end_s, rest)], options.datFrameRate, names)
+    return write_cues(f".{options.exportFormat}", cues, rest, end_s, motion.source)
+
+
+def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -> str:
+    """Return the switch data of Moho and OpenToonz: frames, counted from 1, and their mouths.
+
+    If several mouths start in a frame, the last one counts.
+    """
+    if not 10.0 <= rate_hz <= 100.0:
+        raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 images per second")
+    mouths = {1 + int(rate_hz * start_s): names.get(mouth, mouth) for start_s, mouth in cues}
+    return "MohoSwitch1\n" + "".join(f"{frame} {mouth}\n" for frame, mouth in mouths.items())
+
+
+def _report(options: argparse.Namespace, kind: str, text: str, **details: object) -> None:
+    """Print the status to standard error."""
+    level = "Fatal" if kind == "failure" else "Info"
+    if options.quiet and kind != "failure":
+        return
+    if options.machineReadable:
+        text = json.dumps({"type": kind, **details, "log": {"level": level, "message": text}})
+    print(text, file=sys.stderr)

@@ -1,0 +1,99 @@
+"""Nine drawn mouths, A to H and X, and the Oculus visemes, as cues: one at a time, with its start.
+
+The letters are those of Rhubarb Lip Sync (D. S. Wolf, README, "Mouth shapes"), after the studio
+Hanna-Barbera: A closed, B slightly open, C open, D wide open, E slightly rounded, F puckered, G
+lower lip at the upper teeth, H tongue behind the upper teeth, X rest. They follow from the FAPs of
+the face, so that they fit its lips in any language. Thresholds are FAP units, chosen for the
+openings of filmed speakers: 60, 370 and 500 separate A to D.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.face.shapes import OCULUS
+
+Float32 = NDArray[np.float32]
+Cue: TypeAlias = tuple[float, str]  # start in seconds, and the mouth
+
+CLOSED, REST = "A", "X"
+SILENCE = "sil"  # of the Oculus visemes
+_MAX_CLOSED, _MAX_SLIGHTLY_OPEN, _MAX_OPEN = 60.0, 370.0, 500.0  # largest opening of A, B and C
+_ROUNDED = 90.0  # least rounding of E and F
+_PUCKERED = 200.0  # largest opening of F
+_TEETH_GAP, _TEETH_LIFT = 50.0, 80.0  # G: the lower lip is up, the upper lip is raised
+_TONGUE_TIP = 200.0  # least height of the tongue tip in H
+_WEAK = 0.12  # weight below which an Oculus viseme is not shown
+_REST_S = 0.2  # lips that stay closed for longer are at rest
+
+
+def mouth_shape(faps: Float32) -> str:
+    """Return the letter, A to H, of a face with FAPs (68,)."""
+    upper, lower = -float(faps[3]), -float(faps[4])  # how far each lip is from closed lips
+    opening = upper + lower
+    rounding = float(np.mean([faps[15], faps[16], -faps[5], -faps[6]]))  # protrusion, narrowness
+    if lower < _TEETH_GAP and upper > _TEETH_LIFT:
+        return "G"
+    if opening < _MAX_CLOSED:
+        return CLOSED
+    if rounding > _ROUNDED:
+        return "F" if opening < _PUCKERED else "E"
+    if opening < _MAX_SLIGHTLY_OPEN:
+        return "B"
+    if faps[43] > _TONGUE_TIP:
+        return "H"
+    return "C" if opening < _MAX_OPEN else "D"
+
+
+def oculus_viseme(faps: Float32) -> str:
+    """Return the strongest of the 15 Oculus visemes of a face with FAPs (68,).
+
+    ``sil`` is the rest of the weights, so it counts only if all others are weak.
+    """
+    weights = OCULUS.weights(faps)
+    weights[0] = _WEAK
+    return OCULUS.names[int(weights.argmax())]
+
+
+def mouth_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
+    """Yield a cue for each change of the drawn mouth, as soon as it is certain.
+
+    ``frames`` are times in seconds and FAPs (68,). The first cue is that of the first frame. Closed
+    lips are A, and after 0.2 s X.
+    """
+    closed_since_s = -np.inf
+
+    def mouth_of(time_s: float, faps: Float32) -> str:
+        nonlocal closed_since_s
+        shape = mouth_shape(faps)
+        if shape != CLOSED:
+            closed_since_s = np.inf
+        elif closed_since_s == np.inf:
+            closed_since_s = time_s
+        return REST if time_s - closed_since_s > _REST_S - 1e-6 else shape
+
+    return _cues(frames, mouth_of, frozenset({CLOSED, "G"}))
+
+
+def oculus_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
+    """Yield a cue for each change of the strongest Oculus viseme, like :func:`mouth_cues`."""
+    return _cues(frames, lambda _, faps: oculus_viseme(faps), frozenset({"PP", "FF"}))
+
+
+def _cues(
+    frames: Iterable[tuple[float, Float32]],
+    mouth_of: Callable[[float, Float32], str],
+    at_once: frozenset[str],
+) -> Iterator[Cue]:
+    """Yield the mouths that last for two frames; those in ``at_once`` may last for one."""
+    shown = candidate = ""
+    since_s = 0.0
+    for time_s, faps in frames:
+        mouth = mouth_of(time_s, faps)
+        if mouth != shown and (mouth == candidate or mouth in at_once or not shown):
+            yield (since_s if mouth == candidate else time_s), mouth
+            shown = mouth
+        elif mouth != candidate:
+            candidate, since_s = mouth, time_s

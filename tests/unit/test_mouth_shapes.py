@@ -1,0 +1,117 @@
+"""Drawn mouths: their letters, cues over time, and the files of Rhubarb Lip Sync."""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from kouxing.services.cli import rhubarb
+from kouxing.services.cli.cues import write_cues
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.high_level import VISEMES as MPEG4_VISEMES
+from kouxing.shared.face.mouth_shapes import Cue, mouth_cues, mouth_shape, oculus_cues
+from kouxing.shared.face.shapes import OCULUS
+from tests.system import VOWELS_FILE
+
+REST, OPEN, WIDE = np.zeros((3, NUM_FAPS), np.float32)
+OPEN[4], WIDE[4] = -400.0, -600.0  # the lower lip
+HI = [(0.0, "X"), (0.05, "D"), (0.27, "C"), (0.31, "B"), (0.43, "X")]  # of Rhubarb's README
+
+
+@pytest.mark.parametrize(
+    ("viseme", "letter"),
+    [
+        *[("b", "A"), ("z", "B"), ("zh", "B"), ("i", "B"), ("ei", "C"), ("er", "C"), ("a", "D")],
+        *[("ai", "D"), ("o", "E"), ("u", "F"), ("v", "F"), ("f", "G"), ("rest", "A")],
+    ],
+)
+def test_visemes_have_the_letters_of_their_sounds(viseme: str, letter: str) -> None:
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
+    assert mouth_shape(faps) == letter
+
+
+def test_a_raised_tongue_is_seen_in_an_open_mouth() -> None:
+    faps = OPEN.copy()
+    faps[43] = 420.0
+    assert mouth_shape(faps) == "H"
+
+
+def cues(*faces: np.ndarray[tuple[int], np.dtype[np.float32]]) -> list[Cue]:
+    """Return the cues of faces that each last 0.1 s, at 50 Hz."""
+    return list(mouth_cues((number / 50, faces[number // 5]) for number in range(5 * len(faces))))
+
+
+def test_a_cue_starts_when_the_mouth_changes() -> None:
+    assert cues(OPEN, WIDE, WIDE, OPEN) == [(0.0, "C"), (0.1, "D"), (0.3, "C")]
+
+
+def test_closed_lips_are_at_rest_after_a_while() -> None:
+    assert cues(OPEN, REST, OPEN) == [(0.0, "C"), (0.1, "A"), (0.2, "C")]
+    assert cues(OPEN, REST, REST, REST) == [(0.0, "C"), (0.1, "A"), (pytest.approx(0.3), "X")]
+    assert cues(REST, REST) == [(0.0, "X")]
+
+
+def test_one_frame_is_too_short_except_for_a_closure() -> None:
+    frames = [OPEN, OPEN, WIDE, OPEN, REST, OPEN, OPEN]
+    letters = [letter for _, letter in mouth_cues(enumerate(frames))]
+    assert letters == ["C", "A", "C"]
+
+
+def test_oculus_visemes_are_found_again() -> None:
+    names = [name for _, name in oculus_cues(enumerate(np.repeat(MPEG4_VISEMES, 2, axis=0)))]
+    assert names == list(OCULUS.names)
+
+
+def test_tsv_is_that_of_the_readme() -> None:
+    text = write_cues(".tsv", HI, "X", 0.479, None)
+    assert text == "0.00\tX\n0.05\tD\n0.27\tC\n0.31\tB\n0.43\tX\n0.47\tX\n"
+
+
+def test_json_and_xml_have_the_same_cues(tmp_path: Path) -> None:
+    source = tmp_path / "<hi> & bye.wav"
+    content = json.loads(write_cues(".json", HI, "X", 0.47, source))
+    assert content["metadata"] == {"soundFile": str(source), "duration": 0.47}
+    assert content["mouthCues"][1] == {"start": 0.05, "end": 0.27, "value": "D"}
+    root = ET.fromstring(write_cues(".xml", HI, "X", 0.47, source))  # noqa: S314 - our own
+    assert root.findtext("metadata/soundFile") == str(source)
+    assert [
+        {"start": float(cue.attrib["start"]), "end": float(cue.attrib["end"]), "value": cue.text}
+        for cue in root.iterfind("mouthCues/mouthCue")
+    ] == content["mouthCues"]
+
+
+def test_lips_that_close_for_a_rest_are_at_rest_at_once() -> None:
+    text = write_cues(".tsv", [(0.0, "C"), (0.1, "A"), (0.3, "X")], "X", 0.5, None)
+    assert text == "0.00\tC\n0.10\tX\n0.50\tX\n"
+    assert write_cues(".tsv", [], "X", 0.2, None) == "0.00\tX\n0.20\tX\n"
+
+
+@pytest.mark.slow
+def test_runs_like_rhubarb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "out.json"
+    output.write_text("an older file")
+    shapes = ["--extendedShapes", "GX", "--machineReadable"]
+    rhubarb.main(["-f", "json", "-r", "phonetic", *shapes, "-o", str(output), str(VOWELS_FILE)])
+    letters = {cue["value"] for cue in json.loads(output.read_text())["mouthCues"]}
+    assert {"C", "X"} < letters <= set("ABCDEFGX")
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [event["type"] for event in events] == ["start", "progress", "success"]
+    rhubarb.main(["-q", "-f", "dat", "--datUsePrestonBlair", str(VOWELS_FILE)])
+    switches = capsys.readouterr().out.splitlines()
+    assert switches[:2] == ["MohoSwitch1", "1 rest"]
+    assert switches[-1].endswith(" rest")
+
+
+def test_reports_errors_like_rhubarb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "log.txt"
+    with pytest.raises(SystemExit, match="1"):
+        rhubarb.main(["--machineReadable", "--logFile", str(log), str(tmp_path / "no.wav")])
+    assert log.read_text().startswith("[Fatal] ")
+    failure = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert failure["type"] == "failure"
+    assert "no such file" in failure["reason"]
