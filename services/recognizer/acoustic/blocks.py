@@ -14,6 +14,7 @@ x              log-mel bands, at most eight decades below the         (frames, 8
                loudest so far
 y              log posteriors of the states                           (frames, states)
 B, R           positions of a block, and of its right context         positions
+H              positions from one run to the next, the hop            positions
 PAST           positions before a block that it attends to            positions
 prior          prior of the states, to a power below one              (states,)
 acoustic_scale weight of the log scores, chosen on development data   1
@@ -22,23 +23,26 @@ acoustic_scale weight of the log scores, chosen on development data   1
     log b(x) = acoustic_scale * (y - log prior)
 
 Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1``. It sees the frames from
-``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``B`` more positions are complete,
-the network runs on a block and on the ``R`` positions after it, which are the newest. The block's
-scores are settled, and its keys and values are kept. The scores of the right context are
-provisional. When speech starts, the first runs have fewer positions and settle none. The last run
-repeats the segment's last frame once or twice and settles all positions.
+``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``H`` more positions are complete,
+the network runs on up to ``B + R`` positions, the newest ones. It settles the scores of the first
+positions, so that there is room for ``H`` more in the next run, and keeps their keys and values.
+The scores of the other positions, the right context, are provisional. ``H`` is ``B``, and on a
+busy machine a multiple of ``B``: there are fewer runs, and right contexts are shorter. When speech
+starts, the first runs have fewer positions and settle none. The last run repeats the segment's last
+frame once or twice and settles all positions.
 
 The table of positions ends after 30 seconds. Longer speech without a pause starts again at the
 first row, with an empty past.
 
-Sessions that have a block at the same time share one run. The network scales and rounds each row of
-a product separately, so a session's scores are the same to the last bit in any batch and any
-chunking. Keys and values are rings, because attention does not depend on their order. They take
-1.5 MB per speaking session, in 16 bits.
+Sessions that settle the same number of positions at the same time share one run. The network scales
+and rounds each row of a product separately, so a session's scores are the same to the last bit in
+any batch and any chunking. Keys and values are rings, because attention does not depend on their
+order. They take 1.5 MB per speaking session, in 16 bits.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
@@ -49,12 +53,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, Work
-from kouxing.services.recognizer.acoustic.caches import (
-    CacheMemory,
-    CacheSizes,
-    Float16,
-    cache_names,
-)
 from kouxing.services.recognizer.acoustic.light import LightModel, light_model
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
@@ -62,6 +60,7 @@ from kouxing.services.recognizer.acoustic.network import (
     MAX_POSITIONS,
     NetworkModel,
     check_outputs,
+    integer_inputs,
     open_session,
     position_table,
     run_session,
@@ -70,8 +69,12 @@ from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_M
 
 FORMAT = "blocks 2"
 
+Float16 = NDArray[np.float16]
+
 _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # before the caches
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
+# Constants of the file that become inputs: the number of kept positions, and the last of them.
+_KEPT = integer_inputs({"block": 1, "last_of_block": 0})
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
@@ -89,11 +92,6 @@ class BlockModel(NetworkModel):
         return BlockRunner(self.network)
 
     @cached_property
-    def caches(self) -> CacheMemory:
-        """Keys and values of all sessions."""
-        return CacheMemory(self.session.sizes.cache, _MAX_BATCH)
-
-    @cached_property
     def light(self) -> LightModel | None:
         """The model that replaces this one on a busy machine; None: the ear has other phones."""
         return light_model(self.topology, self.log_prior)
@@ -108,13 +106,12 @@ class BlockModel(NetworkModel):
         for stream, (_, frames) in zip(streams, work, strict=True):
             stream.append_frames(frames)
         while ready := [stream for stream in streams if stream.is_due]:
-            for numbers, rings in self.caches.runs([stream.cache for stream in ready]):
-                self._run([ready[number] for number in numbers], rings)
+            num_kept = ready[0].block().num_kept
+            self._run([one for one in ready if one.block().num_kept == num_kept][:_MAX_BATCH])
         return [stream.take_final_scores() for stream in streams]
 
-    def _run(self, streams: Sequence[BlockStream], rings: Float16) -> None:
-        blocks = [stream.block() for stream in streams]
-        log_posteriors, states, new = self.session.run(blocks, rings)
+    def _run(self, streams: Sequence[BlockStream]) -> None:
+        log_posteriors, states, new = self.session.run([stream.block() for stream in streams])
         scores = self.scores_of(log_posteriors)
         for row, stream in enumerate(streams):  # copies: a view would keep the whole batch
             stream.append_outputs(scores[row].copy(), states[row].copy(), new[row])
@@ -145,17 +142,18 @@ class BlockSizes:
     head_size: int
 
     @property
-    def cache(self) -> CacheSizes:
-        """Sizes of a session's cache."""
-        return CacheSizes(2 * self.layers, self.heads, self.past, self.head_size)
+    def rings(self) -> tuple[int, int, int, int]:
+        """Shape of a session's keys of all layers, and then its values."""
+        return 2 * self.layers, self.heads, self.past, self.head_size
 
 
 @dataclass(slots=True)
 class NetworkState:
-    """A session's network state before a block, besides its cache."""
+    """A session's network state before a block."""
 
     state: Floats  # of the recurrent layer, (width,)
-    num_cached: int = 0  # positions in the cache
+    rings: Float16  # keys and values, (2 layers, heads, PAST, size), finite
+    num_cached: int = 0  # positions in the rings
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +163,8 @@ class Block:
     frames: Floats  # (2 positions + 3, 80), from two before the first position's
     row: int  # of the first position in the table
     num_positions: int
+    num_settled: int  # the first ones, whose scores are settled
+    num_kept: int  # the first ones, whose keys and values are kept; 0 if nothing follows
     past: NetworkState
 
 
@@ -172,21 +172,21 @@ class BlockRunner:
     """A network that is ready to run; ``ValueError`` if the file has another kind."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
-        self._session = open_session(file)
+        self._session = open_session(file, _KEPT)
         self.sizes = _sizes_of(self._session)
-        self._names = cache_names(self.sizes.layers)
+        self._names = _cache_names(self.sizes.layers)
         unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
 
-    def run(self, blocks: Sequence[Block], rings: Float16) -> tuple[Floats, Floats, Float16]:
-        """Run the network on the next blocks of ``n`` sessions, with their caches.
+    def run(self, blocks: Sequence[Block]) -> tuple[Floats, Floats, Float16]:
+        """Run the network on the next blocks of ``n`` sessions, which keep equally many positions.
 
-        ``rings`` has the shape (2 layers, n, heads, PAST, size). Returns log posteriors,
-        (n, 2 (B + R), states), undefined for positions that a block lacks; the recurrent layer's
-        new state, (n, width); the block's keys of all layers and then its values,
-        (n, 2 layers, heads, B, size).
+        Returns log posteriors, (n, 2 (B + R), states), undefined for positions that a block lacks;
+        the recurrent layer's state after the kept positions, (n, width); the keys of all layers and
+        then the values of the kept positions, (n, 2 layers, heads, kept, size). If no position is
+        kept, the state is undefined.
         """
-        length = self.sizes.length
+        length, num_kept = self.sizes.length, max(1, blocks[0].num_kept)
         frames = np.zeros((len(blocks), 2 * length + 3, NUM_MELS), np.float32)
         for row, block in enumerate(blocks):
             frames[row, : len(block.frames)] = block.frames
@@ -196,8 +196,12 @@ class BlockRunner:
             "num_positions": np.array([block.num_positions for block in blocks]),
             "num_cached": np.array([block.past.num_cached for block in blocks]),
             "state": np.stack([block.past.state for block in blocks]),
-            **dict(zip(self._names, rings, strict=True)),
+            "block": np.array([num_kept]),
+            "last_of_block": np.array(num_kept - 1),
         }
+        for ring, name in enumerate(self._names):
+            of_sessions = [block.past.rings[ring] for block in blocks]
+            inputs[name] = of_sessions[0][np.newaxis] if len(blocks) == 1 else np.stack(of_sessions)
         log_posteriors, state, new = run_session(self._session, _OUTPUTS, inputs)
         return log_posteriors, state, new
 
@@ -211,8 +215,9 @@ class BlockStream(AcousticStream):
         super().__init__(model)
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
+        self._hop = self._sizes.block  # H
         self._empty_scores = self.provisional
-        self.cache = model.caches.open()  # what lies beyond the past's positions is masked
+        self._rings = np.zeros(self._sizes.rings, np.float16)
         self.reset()
 
     def reset(self) -> None:
@@ -230,7 +235,11 @@ class BlockStream(AcousticStream):
         """Start at the first row of the table of positions, with an empty past."""
         self._row = 0  # of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
-        self.past = NetworkState(np.zeros(self._sizes.state, np.float32))
+        self._past = NetworkState(np.zeros(self._sizes.state, np.float32), self._rings)
+
+    def set_hop(self, num_blocks: int) -> None:
+        """Set the hop of the runs after the next one, as a number of blocks."""
+        self._hop = min(num_blocks * self._sizes.block, self._sizes.length)
 
     def append_frames(self, frames: Floats | None) -> None:
         """Append frames, (n, 80); None, the end of the segment, repeats the last frame."""
@@ -258,34 +267,43 @@ class BlockStream(AcousticStream):
 
     def block(self) -> Block:
         """Return the block that the network must compute next."""
-        num_positions = min(self._num_positions, self._num_due)
-        frames = self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1]
-        return Block(frames, self._row, num_positions, self.past)
+        sizes, num_complete = self._sizes, self._num_positions
+        num_positions = min(num_complete, self._num_due)
+        max_positions = min(sizes.length, MAX_POSITIONS - self._row)
+        if num_positions < max_positions:  # one run replaces several runs that settle nothing
+            num_more = min(num_complete, max_positions) - num_positions
+            num_positions += num_more // sizes.block * sizes.block
+        is_last = self._row + num_positions == MAX_POSITIONS or (
+            self._ended and num_positions == num_complete
+        )
+        num_kept = 0 if is_last else max(0, num_positions + self._hop - sizes.length)
+        return Block(
+            frames=self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1],
+            row=self._row,
+            num_positions=num_positions,
+            num_settled=num_positions if is_last else num_kept,
+            num_kept=num_kept,
+            past=self._past,
+        )
 
     def append_outputs(self, scores: Floats, state: Floats, new: Float16) -> None:
         """Append the scores, new state, and keys and values of ``block()``; shapes as of a run."""
-        sizes, block = self._sizes, self.block()
-        ends_table = block.row + block.num_positions == MAX_POSITIONS
-        if ends_table or (self._ended and block.num_positions == self._num_positions):
-            num_settled = block.num_positions
-        else:
-            num_settled = sizes.block if block.num_positions == sizes.length else 0
-        end = FRAMES_PER_POSITION * num_settled
+        block, past = self.block(), self._sizes.past
+        end = FRAMES_PER_POSITION * block.num_settled
         self._settled.append(scores[:end])
         self.provisional = scores[end : FRAMES_PER_POSITION * block.num_positions]
         self._frames = self._frames[end:]
-        if ends_table:
+        if block.num_settled > block.num_kept:
             self._start_table()
             return
-        if num_settled:
-            slot = self._row % sizes.past
-            self.cache.rings[:, :, slot : slot + sizes.block] = new
-            block.past.num_cached = min(block.past.num_cached + sizes.block, sizes.past)
-            block.past.state = state
-            self._row += num_settled
-        else:
-            self._num_due += sizes.block
-        self._num_due = min(self._num_due, MAX_POSITIONS - self._row)
+        if block.num_kept:
+            slots = np.arange(self._row, self._row + block.num_kept) % past
+            self._rings[:, :, slots] = new
+            self._past.num_cached = min(self._past.num_cached + block.num_kept, past)
+            self._past.state = state
+            self._row += block.num_kept
+        num_due = block.num_positions - block.num_kept + self._hop
+        self._num_due = min(num_due, MAX_POSITIONS - self._row)
 
     def take_final_scores(self) -> Floats:
         """Return the new settled scores, (m, states); at the end those of all remaining frames."""
@@ -303,7 +321,7 @@ def _sizes_of(session: Any) -> BlockSizes:
     shapes = {node.name: list(node.shape[1:]) for node in session.get_inputs()}
     outputs = {node.name: list(node.shape[1:]) for node in session.get_outputs()}
     num_layers = sum(name.startswith("keys_") for name in shapes)
-    if list(shapes) != [*_INPUTS, *cache_names(num_layers)] or list(outputs) != _OUTPUTS:
+    if list(shapes) != [*_INPUTS, *_cache_names(num_layers)] or list(outputs) != _OUTPUTS:
         raise ValueError(f"its network has the inputs {', '.join(shapes)}")
     try:
         length, width = shapes["positions"]
@@ -325,12 +343,16 @@ def _sizes_of(session: Any) -> BlockSizes:
         not are_positive
         or max(length, width, sizes.state, num_layers) > _MAX_SIZE
         or width % 2
-        or not block < length
-        or sizes.past % block
-        or sizes.cache.num_bytes > _MAX_CACHE_BYTES
+        or not block < length <= sizes.past
+        or 2 * math.prod(sizes.rings) > _MAX_CACHE_BYTES
     ):
         raise ValueError(f"its network has the sizes {sizes}")
     return sizes
+
+
+def _cache_names(num_layers: int) -> list[str]:
+    """Return the names of a network's cache inputs, in the order of the rings."""
+    return [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
 
 
 def block_model_from(archive: Archive) -> BlockModel:
@@ -343,10 +365,10 @@ def block_model_from(archive: Archive) -> BlockModel:
         acoustic_scale=float(archive.floats("acoustic_scale")),
     )
     sizes = model.session.sizes
+    past = NetworkState(np.zeros(sizes.state, np.float32), np.zeros(sizes.rings, np.float16))
     frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
-    stream = model.create_stream()
-    block = Block(frames, 0, sizes.length, stream.past)
-    outputs = model.session.run([block], stream.cache.rings[:, np.newaxis])
-    new = (1, 2 * sizes.layers, sizes.heads, sizes.block, sizes.head_size)
+    num_kept = sizes.block + 1  # another number than that of the file
+    outputs = model.session.run([Block(frames, 0, sizes.length, num_kept, num_kept, past)])
+    new = (1, 2 * sizes.layers, sizes.heads, num_kept, sizes.head_size)
     check_outputs(outputs, [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new])
     return model

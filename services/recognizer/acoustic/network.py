@@ -43,10 +43,32 @@ class NetworkModel(AcousticModel):
         return scores
 
 
-def open_session(file: NDArray[np.uint8]) -> Any:
-    """Open a model's ONNX file, given as bytes; ValueError if it is not an ONNX file."""
+def integer_inputs(num_axes: Mapping[str, int]) -> bytes:
+    """Return bytes that make integer constants of an ONNX file inputs, if they are appended to it.
+
+    ``num_axes`` has the axes of each constant, by name; each axis has length 1. Concatenated
+    messages of Protocol Buffers are merged, so the bytes add inputs to the file's graph. An input
+    with the name of a constant replaces it in a run (ONNX IR, "Graphs").
+    """
+
+    def field(number: int, content: bytes) -> bytes:
+        return bytes([number << 3 | 2, len(content)]) + content  # type 2: length and content
+
+    axis, int64 = field(1, bytes([1 << 3, 1])), bytes([1 << 3, 7])
+    inputs = b""
+    for name, num in num_axes.items():
+        tensor = field(1, int64 + field(2, num * axis))
+        inputs += field(11, field(1, name.encode()) + field(2, tensor))
+    return field(7, inputs)
+
+
+def open_session(file: NDArray[np.uint8], inputs: bytes = b"") -> Any:
+    """Open a model's ONNX file, given as bytes, with ``integer_inputs``.
+
+    Raises ``ValueError`` if it is not an ONNX file.
+    """
     try:
-        return open_network(file.tobytes())
+        return open_network(file.tobytes() + inputs)
     except Exception as error:  # onnxruntime's errors have no common base
         raise ValueError(f"its network cannot be read ({error})") from error
 
