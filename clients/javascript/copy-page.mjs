@@ -1,5 +1,6 @@
-// Copies the modules that the package shares with the gateway's page.
+// Copies the modules that the package shares with the gateway's page. A copy outside a checkout keeps its own.
 
+import { existsSync } from "node:fs";
 import { cp, mkdir } from "node:fs/promises";
 
 const SHARED = [
@@ -9,5 +10,9 @@ const SHARED = [
 const PAGE = new URL("../../services/gateway/page/", import.meta.url);
 const COPY = new URL("page/", import.meta.url);
 
-await mkdir(COPY, { recursive: true });
-for (const name of SHARED) await cp(new URL(`${name}.js`, PAGE), new URL(`${name}.js`, COPY));
+if (existsSync(PAGE)) {
+  await mkdir(COPY, { recursive: true });
+  for (const name of SHARED) await cp(new URL(`${name}.js`, PAGE), new URL(`${name}.js`, COPY));
+} else if (!existsSync(COPY)) {
+  throw new Error("there are no modules of the page; install the package from a checkout of kouxing");
+}
