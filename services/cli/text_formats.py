@@ -53,7 +53,12 @@ _LABEL = (  # times of Audacity or CTM, or the name of a recording
     r"(?:\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t|(?:\S+ \d )?\d+\.\d+ +\d+\.\d+ +"
     r"|[A-Za-z]+(?:[\w.-]*?\d){6}[\w.-]*[ \t]+)"
 )
-_TIMES = rf"{_TIME}(?:[ \t]*(?:-->|[-–—~→])[ \t]*{_TIME})?"
+_TIMES = rf"{_TIME}(?:[ \t]*(?:--?>|[-–—~→])[ \t]*{_TIME})?"
+_SECONDS = r"\d+(?:\.\d+[ \t]*s?|[ \t]*s)"
+_LINE_IN_SECONDS = (  # [0.00s -> 3.40s], as faster-whisper prints
+    rf"[(\[]?{_SECONDS}[ \t]*(?:--?>|→)[ \t]*{_SECONDS}[)\]]?"
+    rf"|[(\[]{_SECONDS}[ \t]*[-–—~][ \t]*{_SECONDS}[)\]]"
+)
 _TIMED_LINE = (  # also the line of a speaker, with the time at its end
     rf"(?:[(\[【]{_TIMES}[)\]】]|{_TIMES}(?=[ \t]|$)|\S.{{,30}}?[ \t]+{_TIMES}[ \t]*$)[ \t]*"
 )
@@ -225,7 +230,22 @@ def _read_timed_lyrics(text: str) -> str:
 
 
 def _read_timed_lines(text: str) -> str:
-    return re.sub(rf"^{_TIMED_LINE}", "", text, flags=re.MULTILINE)
+    """Extract the lines without their times.
+
+    If an untimed line follows every timed line, the timed lines contain the names of speakers.
+    """
+    lines = [(re.match(_TIMED_LINE, line), line) for line in text.split("\n")]
+    are_names = all(
+        match is None or (following is None and next_line.strip())
+        for (match, _), (following, next_line) in pairwise([*lines, (None, "")])
+    )
+    return "\n".join(
+        line if match is None else "" if are_names else line[match.end() :] for match, line in lines
+    )
+
+
+def _read_lines_in_seconds(text: str) -> str:
+    return re.sub(rf"^[ \t]*(?:{_LINE_IN_SECONDS})[:：]?", "", text, flags=re.MULTILINE)
 
 
 def _read_text_grid(text: str) -> str:
@@ -332,6 +352,11 @@ _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (
     ("lyrics with times", re.compile(rf"^{_LYRICS_TIME}", re.MULTILINE), _read_timed_lyrics),
     ("SBV", _SBV_TIMES, _read_sbv),
     ("LRC", re.compile(rf"^[ \t]*{_LRC_TIME}", re.MULTILINE), _read_lrc),
+    (
+        "a transcript with times",
+        re.compile(rf"^[ \t]*(?:{_LINE_IN_SECONDS})", re.MULTILINE),
+        _read_lines_in_seconds,
+    ),
     ("MicroDVD or MPL2", re.compile(rf"\A{_FRAMES}"), _read_frame_numbers),
     ("a table of labels", re.compile(rf"\A([^\n]*\n)?{_LABEL}"), _read_labels),
     ("SSML", re.compile(r"<speak\b", re.I), _read_markup),
