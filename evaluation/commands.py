@@ -91,7 +91,7 @@ def recognizer(
     from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.report import print_figures
 
-    check_output(json_file, force=force)
+    check_output(json_file, inputs=[manifest], force=force)
     check_conditions(condition or ())
     models = list(_models(acoustic))
     music = music_from(_read_sounds(sounds))
@@ -132,7 +132,7 @@ def voice(
     from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.voice import evaluate_voice, materials_of, print_voice
 
-    check_output(json_file, force=force)
+    check_output(json_file, inputs=[manifest], force=force)
     models = {name: model for name, model, _ in _models(acoustic)}
     recorded = _read_sounds(sounds)
     music = music_from(recorded)
@@ -247,7 +247,7 @@ def schemes(
     from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.shared.errors import UserError
 
-    check_output(json_file, force=force)
+    check_output(json_file, inputs=[manifest], force=force)
     if manifest and clips:
         raise UserError("use either --manifest or --clips, not both")
     if (audio or split) and not manifest:

@@ -91,7 +91,8 @@ def phone_lm(
     from kouxing.training.phone_lm.open_gram import draw_phones
     from kouxing.training.phone_lm.recipe import train_phone_lm
 
-    check_output(output, force=force)
+    inputs = [*(corpus or []), *(text or []), ngrams, dictionary]
+    check_output(output, inputs=inputs, force=force)
     if (ngrams is None) != (dictionary is None):
         raise UserError("--ngrams needs --dictionary; give both or neither")
     if words is not None and ngrams is None:
@@ -119,7 +120,7 @@ def gmm(
     """Train the Gaussian mixture recognizer, and write its model card."""
     from kouxing.training.gmm.recipe import train_gmm
 
-    check_output(output, force=force)
+    check_output(output, inputs=[*corpus, phone_lm], force=force)
     train_gmm(
         corpus,
         output,

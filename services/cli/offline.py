@@ -154,9 +154,11 @@ def render(
         pairs = [(sources[0], last)]
     else:
         pairs = pair_outputs(files, output, ".mp4")
-    for source, target in pairs:
-        is_folder = target.is_dir()  # of numbered pictures
-        check_output(None if is_folder else target, inputs=[source, sound, mouth], force=force)
+    inputs = [*(source for source, _ in pairs), sound, mouth, Path(head)]
+    if text is not None:
+        inputs.append(Path(text))
+    targets = (None if target.is_dir() else target for _, target in pairs)  # of numbered pictures
+    check_output(*targets, inputs=inputs, force=force)
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
         yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,
@@ -226,8 +228,7 @@ def phones(
     pairs: list[tuple[Path, Path | None]] = [(audio[0], output)]
     if is_folder:
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
-    for source, target in pairs:
-        check_output(target, inputs=[source], force=force)
+    check_output(*(target for _, target in pairs), inputs=audio, force=force)
     model = load_model(acoustic)
 
     def recognize_file(source: Path, target: Path | None) -> None:

@@ -30,6 +30,27 @@ def test_an_output_is_never_an_input(tmp_path: Path) -> None:
         check_output(link, inputs=[None, source, Path("a" * 5000)], force=True)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "render me.wav my.glb --head my.glb",
+        "render me.wav my.csv --text my.csv",
+        "render me.csv my.mp4 --sound my.mp4",
+        "evaluate recognizer --manifest my.json --json my.json",
+        "train phone-lm --text my.txt -o my.txt",
+    ],
+)
+def test_no_option_of_a_command_is_overwritten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for argument in arguments.split():
+        if "." in argument:
+            Path(argument).touch()
+    with pytest.raises(UserError, match="the output is also an input"):
+        app([*arguments.split(), "--force"], standalone_mode=False)
+
+
 def test_pictures_of_heads_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "faces.webp").write_bytes(b"mine")
     with pytest.raises(UserError, match=r"faces.webp exists; add --force"):
