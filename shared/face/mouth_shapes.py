@@ -50,10 +50,13 @@ def mouth_shape(faps: Float32) -> str:
 def oculus_viseme(faps: Float32) -> str:
     """Return the strongest of the 15 Oculus visemes of a face with FAPs (68,).
 
-    ``sil`` is the rest of the weights, so it counts only if all others are weak.
+    ``sil`` is the rest of the weights, so it counts only if all others are weak. ``PP`` needs
+    closed lips; in a blend, it only narrows an opening.
     """
     weights = OCULUS.weights(faps)
     weights[0] = _WEAK
+    if -faps[3] - faps[4] >= _MAX_CLOSED:
+        weights[OCULUS.names.index("PP")] = 0.0
     return OCULUS.names[int(weights.argmax())]
 
 

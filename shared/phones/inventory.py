@@ -122,6 +122,11 @@ class PhoneInventory:
         """Vowels, including the rest of the syllable."""
         return self._of_kind("vowel")
 
+    @cached_property
+    def has_universal_phones(self) -> bool:
+        """Whether the phones are those of the universal inventory, or some of them."""
+        return all(self.universal.get(phone) == (phone,) for phone in self.phones)
+
     def read(self, text: str) -> Transcript:
         """Return a text's syllables with their spelling, and the parts that cannot be read."""
         if self.transcribe is not None:

@@ -16,10 +16,10 @@ def visemes(symbol: str, next_symbol: str | None) -> tuple[tuple[str, float], ..
 def test_rejects_a_language_with_unknown_visemes() -> None:
     check_visemes(INVENTORY)
     for change in (
-        {"visemes": {**INVENTORY.visemes, "a": (("th", 1.0),)}},
-        {"before_rounded": {"d": "th"}},
+        {"visemes": {**INVENTORY.visemes, "a": (("click", 1.0),)}},
+        {"before_rounded": {"d": "click"}},
     ):
-        with pytest.raises(UserError, match="visemes th; use rest, b"):
+        with pytest.raises(UserError, match="visemes click; use rest, b"):
             check_visemes(replace(INVENTORY, **change))
 
 

@@ -50,6 +50,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     LIP_HEIGHT_FAPS,
     REST,
+    TRAINED_VISEMES,
     VISEME_INDEX,
     VISEMES,
 )
@@ -171,6 +172,7 @@ class _FapFit:
         self.fixed = np.zeros(len(VISEMES), dtype=bool)
         labials = [*CLOSURE_FAPS] if MOUTH_FAPS[column] in LIP_HEIGHT_FAPS else []
         self.fixed[[VISEME_INDEX[viseme] for viseme in [REST, *labials]]] = True
+        self.fixed[len(TRAINED_VISEMES) :] = True
         # The initial shapes are from another speaker, so they are scaled to this one.
         curve = self.curve()[0]
         gain = max(float(curve @ self._measured) / max(float(curve @ curve), 1e-9), 0.0)

@@ -21,7 +21,11 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     columns,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
+    TRAINED_VISEMES,
+    VISEME_INDEX,
+    VISEMES,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -153,7 +157,7 @@ def save_parameters(
         + ",\n".join(f"   {line(name, getattr(parameters, name)[i])}" for name in PER_VISEME)
         + f',\n   "level_db": {parameters.level_db[i]:.4g}'
         + "\n  }"
-        for i, viseme in enumerate(VISEMES)
+        for i, viseme in enumerate(TRAINED_VISEMES)
     )
     silence = ",\n".join(f"  {line(name, getattr(parameters, name))}" for name in PER_SILENCE)
     head = "".join(

@@ -7,13 +7,14 @@ Its other features yield to the vowel, more for consonants that are articulated 
 
 import numpy as np
 
+from kouxing.services.synthesizer.lips.dynamic_visemes.derived import add_derived
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     REST,
     ROUNDED_VISEMES,
+    TRAINED_VISEMES,
     VISEME_INDEX,
-    VISEMES,
     static_targets,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
@@ -45,12 +46,12 @@ _CONSONANT_LEVEL_DB = -12.0  # relative to vowels
 
 def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
     """Return the parameters for an exponent ``c``."""
-    shape = (len(VISEMES), NUM_MOUTH_FAPS)
+    shape = (len(TRAINED_VISEMES), NUM_MOUTH_FAPS)
     decay = _MEAN_DISTANCE_S ** (_INITIAL_C - c)
     alpha, closes = np.ones(shape), np.zeros(shape)
-    level_db = np.zeros(len(VISEMES))
+    level_db = np.zeros(len(TRAINED_VISEMES))
     theta_minus, theta_plus = np.full(shape, _VOWEL_THETA), np.full(shape, _VOWEL_THETA)
-    for viseme, row in VISEME_INDEX.items():
+    for row, viseme in enumerate(TRAINED_VISEMES):
         group, _, variant = viseme.partition("_")
         if group in CONSONANTS:
             lips, jaw, rounding, theta = CONSONANTS[group]
@@ -64,16 +65,19 @@ def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
             alpha[row, columns(_ROUNDING_FAPS)] = _ROUNDED_ALPHA
             theta_minus[row, columns(_ROUNDING_FAPS)] = _ROUNDED_THETA_MINUS
         closes[row, columns(CLOSURE_FAPS.get(viseme, ()))] = 1.0
+    trained = {
+        "alpha": alpha,
+        "theta_minus": theta_minus * decay,
+        "theta_plus": theta_plus * decay,
+        "offset_s": np.zeros(shape),
+        "closes": closes,
+        "level_db": level_db,
+    }
     targets = static_targets()
     per_fap = np.ones(NUM_MOUTH_FAPS)
     return VisemeParameters(
-        alpha=alpha,
-        theta_minus=theta_minus * decay,
-        theta_plus=theta_plus * decay,
-        offset_s=np.zeros(shape),
+        **add_derived(trained, VISEME_INDEX),
         target=targets,
-        closes=closes,
-        level_db=level_db,
         alpha_left=per_fap,
         alpha_right=per_fap,
         theta_left=_SILENCE_THETA * decay * per_fap,

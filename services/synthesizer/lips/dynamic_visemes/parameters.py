@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEMES
+from kouxing.services.synthesizer.lips.dynamic_visemes.derived import add_derived
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
+    TRAINED_VISEMES,
+    VISEME_INDEX,
+    VISEMES,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.user_file import check_content, parse_json, read_text
@@ -115,13 +120,13 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
             raise ValueError(f"the format is not '{FORMAT}'")
         _clips_of(data)
         arrays = {
-            name: np.array([data["visemes"][viseme][name] for viseme in VISEMES], dtype=float)
-            for name in PER_VISEME
+            name: np.array([data["visemes"][viseme][name] for viseme in TRAINED_VISEMES], float)
+            for name in (*PER_VISEME, "level_db")
         }
+        arrays = add_derived(arrays, VISEME_INDEX)
         arrays |= {name: np.array(data["silence"][name], dtype=float) for name in PER_SILENCE}
         return VisemeParameters(
             **arrays,
-            level_db=np.array([data["visemes"][viseme]["level_db"] for viseme in VISEMES]),
             c=float(data["c"]),
             closure_ratio=float(data["closure_ratio"]),
             closure_reach_s=float(data["closure_reach_s"]),

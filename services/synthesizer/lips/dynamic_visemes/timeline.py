@@ -31,7 +31,7 @@ _RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after 
 _EXPECTED_AFTER_S = 0.3  # the mouth relaxes after the expected viseme has lasted this long
 # expected visemes: a medium vowel; after a vowel, a less open mouth that keeps its rounding
 _EXPECTED_AFTER_INITIAL, _EXPECTED_AFTER_VOWEL, _EXPECTED_AFTER_ROUNDED = "ei", "i", "u"
-_ROUNDED_AT_THE_END = frozenset({"o", "ou", "u", "v"})
+_ROUNDED_AT_THE_END = frozenset({"o", "ou", "u", "v", "w", "oe", "oeh", "aw"})
 EDGE_S = 0.08  # maximum distance of a viseme's apex from its start and end
 _MIN_PHONE_S = 0.01
 _TOUCHING_S = 0.03  # shorter gaps between phones are rounding errors

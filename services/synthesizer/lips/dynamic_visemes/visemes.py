@@ -2,7 +2,8 @@
 
 The language's inventory lists the visemes of each phone. The visemes are those of Li et al. 2011,
 table 1, each named after a phone. The rounded variants of consonants before rounded vowels, and the
-static targets in ``targets.tsv``, are from Crystal.TTVS (Tsinghua University, Apache-2.0).
+static targets in ``targets.tsv``, are from Crystal.TTVS (Tsinghua University, Apache-2.0). Sounds
+of other languages have visemes that are derived from these (``derived``).
 """
 
 from importlib import resources
@@ -10,22 +11,27 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.synthesizer.lips.dynamic_visemes.derived import (
+    derived_targets,
+    derived_visemes,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeShares
 
 REST = "rest"
-VISEMES = (
+TRAINED_VISEMES = (
     REST,
     *"b f d d_rounded l l_rounded g g_rounded j j_rounded zh zh_rounded z z_rounded".split(),
     *"a ai ao o ou e ei er i u v".split(),
 )
+VISEMES = (*TRAINED_VISEMES, *(viseme.name for viseme in derived_visemes()))
 VISEME_INDEX = {viseme: index for index, viseme in enumerate(VISEMES)}
 
 LIP_HEIGHT_FAPS = (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # lips meet
 LOWER_LIP_FAPS = (5, 10, 11, 52, 57, 58)  # lower lip meets the teeth
 CLOSURE_FAPS = {"b": LIP_HEIGHT_FAPS, "f": LOWER_LIP_FAPS}
 
-ROUNDED_VISEMES = frozenset({"u", "v"})
+ROUNDED_VISEMES = frozenset({"u", "v", "w", "oe"})
 
 
 def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) -> VisemeShares:
@@ -59,8 +65,9 @@ def check_visemes(inventory: PhoneInventory) -> None:
 
 
 def static_targets() -> NDArray[np.float64]:
-    """Read the static targets T (num_visemes, num_mouth_faps), FAP units."""
+    """Return the static targets T (num_visemes, num_mouth_faps), FAP units."""
     text = (resources.files(__package__) / "targets.tsv").read_text("utf-8")
     lines = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     rows = {row[0]: [float(value) for value in row[1:]] for row in lines[1:]}  # as MOUTH_FAPS
-    return np.array([rows[viseme] for viseme in VISEMES])
+    trained = np.array([rows[viseme] for viseme in TRAINED_VISEMES])
+    return np.concatenate([trained, derived_targets(trained, VISEME_INDEX)])

@@ -1,7 +1,8 @@
 """The table of this lip model: typical values of each phone.
 
 Each language has one file in this package, such as ``mandarin.tsv``. ``kouxing train ferguson``
-writes it, and its first lines name the training data.
+writes it, and its first lines name the training data. Languages with universal phones share
+``universal.tsv``.
 
 =============== ===================================================================================
 column          meaning
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 from importlib import resources
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory
 
 MAX_OPENING = 5.0
 COLUMNS = ("phone", "opening", "duration_s", "crossings", "level", "influence")
@@ -43,7 +44,8 @@ def load_table(inventory: PhoneInventory) -> PhoneTable:
 
     Raises ``UserError`` if the language has no table, or the table is damaged.
     """
-    file = resources.files(__package__) / f"{inventory.language}.tsv"
+    name = UNIVERSAL if inventory.has_universal_phones else inventory.language
+    file = resources.files(__package__) / f"{name}.tsv"
     if not file.is_file():
         raise UserError(
             f"the lip model ferguson has no table for {inventory.language}; use another lip model"

@@ -1,0 +1,77 @@
+"""Visemes of sounds that Mandarin lacks, derived from the trained ones by ``derived.tsv``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.table import read_table
+
+Array = NDArray[np.float64]
+_OPENING = (3, 4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # jaw and lip heights
+_WIDTH, _PROTRUSION = (6, 7, 53, 54), (16, 17)
+_TONGUE = (44, 45, 46, 47)
+
+
+@dataclass(frozen=True, slots=True)
+class DerivedViseme:
+    """The difference of a viseme from its base, a trained viseme."""
+
+    name: str
+    base: str
+    opening: float  # times that of the base
+    rounding: float  # times that of the base
+    spread: float  # added to the width, FAP units
+    tongue: str  # viseme with the same tongue, or the values of _TONGUE
+
+
+@cache
+def derived_visemes() -> tuple[DerivedViseme, ...]:
+    """Read the table."""
+    return tuple(
+        DerivedViseme(
+            row["viseme"],
+            row["base"],
+            float(row["opening"]),
+            float(row["rounding"]),
+            float(row["spread"]),
+            row["tongue"],
+        )
+        for row in read_table(__package__, "derived.tsv")
+    )
+
+
+def add_derived(arrays: Mapping[str, Array], index: Mapping[str, int]) -> dict[str, Array]:
+    """Append the rows of the derived visemes to arrays with a row for each trained viseme.
+
+    ``index`` is the row of each trained viseme. A derived viseme has the dominance of its base and
+    a target of its own. It does not close the lips.
+    """
+    bases = [index[viseme.base] for viseme in derived_visemes()]
+    rows = {name: array[bases] for name, array in arrays.items()}
+    if "target" in arrays:
+        rows["target"] = derived_targets(arrays["target"], index)
+    if "closes" in arrays:
+        rows["closes"] = np.zeros_like(rows["closes"])
+    return {name: np.concatenate([array, rows[name]]) for name, array in arrays.items()}
+
+
+def derived_targets(targets: Array, index: Mapping[str, int]) -> Array:
+    """Return the targets (num_derived, num_mouth_faps) from those of the trained visemes."""
+    made = np.empty((len(derived_visemes()), len(MOUTH_FAPS)))
+    opening, width, protrusion, tongue = (
+        [MOUTH_FAPS.index(fap) for fap in faps] for faps in (_OPENING, _WIDTH, _PROTRUSION, _TONGUE)
+    )
+    for row, viseme in zip(made, derived_visemes(), strict=True):
+        row[:] = targets[index[viseme.base]]
+        row[opening] *= viseme.opening
+        row[width] = row[width] * viseme.rounding + viseme.spread
+        row[protrusion] *= viseme.rounding
+        values = viseme.tongue.split()
+        row[tongue] = (
+            targets[index[values[0]], tongue] if len(values) == 1 else [*map(float, values)]
+        )
+    return made
