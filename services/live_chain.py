@@ -94,6 +94,7 @@ class LiveChain:
             delay_s=synthesizer.delay_ms / 1e3,
             idle_motion_seed=synthesizer.idle_motion_seed,
             expressiveness=synthesizer.expressiveness,
+            feeling=synthesizer.feeling,
         )
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.features import frame_time_s
-from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.pcm import SliceMeter
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.offline import WithProgress
@@ -33,7 +33,13 @@ from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.phones.events import EndOfSound, LipPositions, Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import (
+    EndOfSound,
+    LipPositions,
+    Phone,
+    SoundEvent,
+    SpeechChange,
+)
 
 # Tuned on the same held-out clips as the rule of the live chain. If the sound has one closure and
 # the phones have two, the vowel between them counts. No clip has such a place.
@@ -92,16 +98,19 @@ def analyze_recording(
             elif isinstance(item, LipPositions) and item.time_s >= 0.0:
                 events.append(item)
 
-    for start in with_progress(range(0, len(samples), MEDIA_RATE_HZ)):
-        add_events(segmenter.accept_waveform(samples[start : start + MEDIA_RATE_HZ]))
-    silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)
-    add_events(segmenter.accept_waveform(silence))
+    meter = SliceMeter()
+    extended = np.pad(samples, (0, round(MAX_DELAY_S * MEDIA_RATE_HZ)))
+    for start in with_progress(range(0, len(extended), MEDIA_RATE_HZ)):
+        for piece, progress in meter.accept_waveform(extended[start : start + MEDIA_RATE_HZ]):
+            add_events(segmenter.accept_waveform(piece))
+            if progress is not None:
+                events.append(replace(progress, **segmenter.traits._asdict()))
     add_events(segmenter.input_finished())
     if is_text_known:
         phones = [replace(phone, confidence=1.0) for phone in phones]
     return AnalyzedRecording(
         duration_s=len(samples) / MEDIA_RATE_HZ,
-        events=[*phones, *events, *progress_of(samples, MAX_DELAY_S)],
+        events=[*phones, *events],
         is_text_known=is_text_known,
     )
 
@@ -126,6 +135,7 @@ def animate_recording(
         delay_s=MAX_DELAY_S,
         idle_motion_seed=config.idle_motion_seed,
         expressiveness=config.expressiveness,
+        feeling=config.feeling,
     )
     end = EndOfSound(time_s=recording.duration_s + MAX_DELAY_S)
     frames = [

@@ -246,3 +246,21 @@ def ferguson(
 
     check_output(output, force=force)
     train_ferguson(clips, corpus, output, print_message, any_license=any_license)
+
+
+@app.command()
+def traits(
+    recordings: Annotated[
+        Path, typer.Option(help="Folder of speech whose manifest names emotions.")
+    ],
+    sounds: Sounds,
+    output: Model,
+    seed: Seed = 0,
+    any_license: AnyLicense = False,
+    force: Force = False,
+) -> None:
+    """Train the readout of arousal, valence, laughter and breath, and write its model card."""
+    from kouxing.training.traits import train_traits
+
+    check_output(output, force=force)
+    train_traits(recordings, sounds, output, seed=seed, shipping=not any_license)

@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
+from kouxing.corpora.emotions import SpokenEmotion
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.training.search_weights import SearchWeights
@@ -15,7 +16,10 @@ def write_card(
     *,
     title: str,
     details: str,
-    recordings: Sequence[Example] | Sequence[LipClip] | Sequence[Utterance],
+    recordings: Sequence[Example]
+    | Sequence[LipClip]
+    | Sequence[Utterance]
+    | Sequence[SpokenEmotion],
     errors: RowErrors | None = None,
     chosen: SearchWeights | None = None,
     notes: str = "",
@@ -25,7 +29,7 @@ def write_card(
     ``details`` describe the training as part of a sentence. ``chosen`` are the search weights, if
     they were chosen on development data.
     """
-    by_license: dict[str, list[Example | LipClip | Utterance]] = defaultdict(list)
+    by_license: dict[str, list[Example | LipClip | Utterance | SpokenEmotion]] = defaultdict(list)
     for recording in recordings:
         by_license[recording.license or "none given"].append(recording)
     rows = [

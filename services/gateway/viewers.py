@@ -236,7 +236,7 @@ class Viewers:
             else:
                 raise UserError(
                     "expected 'follow' with a session's name, 'play', 'lips', 'acoustic', "
-                    "'express' or 'expressiveness'"
+                    "'express', 'expressiveness' or 'feeling'"
                 )
         except UserError as error:
             self._put(viewer, MessageKind.TEXT, wire.error_text(str(error)))

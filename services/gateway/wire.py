@@ -17,6 +17,7 @@ from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
     check_expressions,
     check_expressiveness,
+    check_feeling,
 )
 from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.user_file import parse_json
@@ -142,6 +143,8 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
         settings["acoustic"] = acoustic
     if (amount := fields.get("expressiveness")) is not None:
         settings["expressiveness"] = check_expressiveness(amount)
+    if (amount := fields.get("feeling")) is not None:
+        settings["feeling"] = check_feeling(amount)
     return FaceSettings(**settings) if settings else None
 
 

@@ -65,6 +65,7 @@ class HeardPosition(NamedTuple):
     features: Floats
     phones: Floats
     voice: Floats
+    state: Floats  # h after the position
 
 
 class Ear:
@@ -106,7 +107,7 @@ class EarStream:
     def accept_position(self, frames: Floats) -> HeardPosition:
         """Take the next position's frames, (2, 80)."""
         features, phones, voice, self._state = self._ear.run(frames, self._state)
-        return HeardPosition(frames, features, phones, voice)
+        return HeardPosition(frames, features, phones, voice, self._state)
 
 
 @cache

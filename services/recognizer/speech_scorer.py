@@ -7,7 +7,7 @@ Any chunking of the same audio gives the same result.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
@@ -98,9 +98,11 @@ class SpeechScorer:
         self._light.start(self._num_unscored - len(provisional))
         self._stream = self._light
 
-    def accept_waveform(self, samples: Floats) -> None:
-        """Queue samples, 16 kHz mono, shape (n,)."""
+    def accept_waveform(self, samples: Floats, progress: Progress | None = None) -> None:
+        """Queue samples, 16 kHz mono, shape (n,), and the measurement of the slice they end."""
         self._queue.extend(self._segmenter.accept_waveform(samples))
+        if progress is not None:
+            self._queue.append(replace(progress, **self._segmenter.traits._asdict()))
         self._release_events()
 
     def input_finished(self) -> None:
@@ -116,11 +118,6 @@ class SpeechScorer:
     def is_ready(self) -> bool:
         """Whether there is audio to score."""
         return bool(self._queue)
-
-    @property
-    def is_laughter(self) -> bool:
-        """Whether someone laughs at the end of the queued audio."""
-        return self._segmenter.is_laughter
 
     @property
     def model(self) -> AcousticModel:

@@ -21,6 +21,7 @@ from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
+from kouxing.services.recognizer.voice_traits import VoiceTraits, load_voice_readout
 from kouxing.shared.phones.events import LipPositions
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
@@ -85,6 +86,7 @@ class SpeechSegmenter:
         self._start_frame = start_frame
         self._ear = load_ear().create_stream()
         self._detector = VoiceActivityDetector()
+        self._traits = load_voice_readout().create_stream()
         self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
         self._features: Floats | None = None  # its feature frames
         # Features and positions before speech
@@ -93,9 +95,9 @@ class SpeechSegmenter:
         self._is_speaking = False
 
     @property
-    def is_laughter(self) -> bool:
-        """Whether someone laughs at the end of the audio."""
-        return self._detector.is_laughter
+    def traits(self) -> VoiceTraits:
+        """What the voice shows at the end of the audio."""
+        return self._traits.newest
 
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
         """Take samples, 16 kHz mono, shape (n,); yield what follows from them."""
@@ -124,6 +126,7 @@ class SpeechSegmenter:
         else:
             self._recent.append((features, position))
         self._detector.update(position.voice)
+        self._traits.accept_position(position)
         if self._is_speaking and not self._detector.is_speech:
             yield self._end_speech()
         elif self._is_speaking:

@@ -10,12 +10,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.front_end.features import frame_at
-from kouxing.services.recognizer.front_end.pcm import SLICE, progress_at, slices
-from kouxing.services.recognizer.front_end.pitch import PitchTracker
+from kouxing.services.recognizer.front_end.pcm import SliceMeter
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.lip_frames import LipFrameModel, delay_for
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
@@ -197,16 +194,14 @@ class _Segment:
         self.scorer = scorer
         self.first_index: int | None = None  # in the session, of the segment's first phone
         self._start = start  # media time, samples at 16 kHz
-        self._num_samples = 0  # since then
-        self._slice: list[Floats] = []  # pieces of the incomplete 20 ms
-        self._pitch = PitchTracker(start // SLICE)
+        self._meter = SliceMeter(start)
         self._resampler = resampler
         self._decoder = decoder
 
     @property
     def media_time(self) -> int:
         """Media time of the end of the resampled audio, samples at 16 kHz."""
-        return self._start + self._num_samples
+        return self._meter.media_time
 
     def accept_waveform(self, samples: Floats) -> None:
         """Queue samples, shape (n,) or (n, channels), at the input's rate."""
@@ -220,15 +215,8 @@ class _Segment:
 
     def _queue(self, samples: Floats) -> None:
         self.scorer.add_event(Waveform(time_s=to_seconds(self.media_time), samples=samples))
-        for piece in slices(samples, self._num_samples):
-            self._num_samples += len(piece)
-            self._slice.append(piece)
-            self.scorer.accept_waveform(piece)
-            if self._num_samples % SLICE == 0:
-                newest = np.concatenate(self._slice)
-                progress = progress_at(self.media_time, newest, self._pitch)
-                self.scorer.add_event(replace(progress, is_laughter=self.scorer.is_laughter))
-                self._slice.clear()
+        for piece, progress in self._meter.accept_waveform(samples):
+            self.scorer.accept_waveform(piece, progress)
 
     def decode(self) -> list[StreamOutput]:
         """Return the new results at the session's times, without lip frames before the audio."""

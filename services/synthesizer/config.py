@@ -40,6 +40,8 @@ class SynthesizerConfig(FaceConfig):
     """Time from a frame's audio until the frame is made, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
+    feeling: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """How strongly the face shows the feeling in the voice. 0 turns it off."""
     max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
     """Seconds that a live face may be behind. If it exceeds this limit for 0.4 s, it skips
     frames."""

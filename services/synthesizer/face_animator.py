@@ -24,13 +24,14 @@ from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
 from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.services.synthesizer.modifiers.feeling import FeelingMotion
 from kouxing.services.synthesizer.modifiers.idle_motion import SpeechIdleMotion
+from kouxing.services.synthesizer.modifiers.laughter import Laughter
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
 from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expression_motion import JAW, mix
-from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import (
     AudioSkipped,
@@ -53,7 +54,7 @@ _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
 _REHEARSAL_S = 1.6
 _MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # of mouth FAPs, of other FAPs
 _BIND_S = 0.04  # after this part of a transition, lips close fully for speech
-_LAUGHTER_HOLD_S = 0.2  # after the last report of laughter
+_VOICE_LEAD_S = 0.06  # feeling and laughter act this long before their frame, if known
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
 _ROUNDING = 0.01  # tolerance of media times, in frames
 
@@ -70,7 +71,8 @@ class FaceAnimator:
     Frame ``k`` is at media time ``k / frame_rate_hz``, with a rate of 10 to 240. It is made
     ``delay_s`` (0 to 1.5) later than its audio; at 1.5 the visemes of a recording are blended as if
     all were known. ``idle_motion_seed`` is for blinks, gaze, brows and head motion; with 0 only the
-    mouth moves. ``expressiveness`` scales the mouth movements, 0.5 to 2.
+    mouth moves. ``expressiveness`` scales the mouth movements, 0.5 to 2. ``feeling`` is how
+    strongly the face shows the feeling in the voice, 0 to 1.
 
     Raises ``UserError`` if a value is out of range.
     """
@@ -83,6 +85,7 @@ class FaceAnimator:
         delay_s: float,
         idle_motion_seed: int = 0,
         expressiveness: float = 1.0,
+        feeling: float = 0.0,
     ) -> None:
         if not 0.0 <= delay_s <= MAX_DELAY_S:
             raise UserError(f"delay_s is {delay_s:g}; give 0 to {MAX_DELAY_S:g} seconds")
@@ -93,7 +96,7 @@ class FaceAnimator:
         self._delay_s = delay_s
         self._expressiveness = Expressiveness(expressiveness)
         self._expression = SpeechExpression()
-        self._laughter = SpeechExpression()
+        self._feeling = FeelingMotion(feeling)
         self._idle_motion = SpeechIdleMotion(idle_motion_seed) if idle_motion_seed else None
         self._num_frames = 0  # including frames at rest
         self._first_shown = 0  # earlier frames are rehearsals
@@ -115,12 +118,19 @@ class FaceAnimator:
         self._changes: deque[SpeechChange] = deque()  # that concern future frames
         self._levels: list[tuple[float, float]] = []  # since the last frame
         self._pitches: list[tuple[float, float]] = []  # since the last frame
+        self._voice: deque[Progress] = deque()  # the current one and later ones
         self._recent: deque[SoundEvent] = deque()
         self._lip_stream = self._lip_model.stream(
             self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s
         )
         # in order of application
-        self._modifiers: list[Modifier] = [Amplitude(), self._expressiveness, self._expression]
+        self._modifiers: list[Modifier] = [
+            Amplitude(),
+            self._expressiveness,
+            self._feeling,
+            self._expression,
+            Laughter(),
+        ]
         if self._idle_motion is not None:
             self._modifiers.append(self._idle_motion)
 
@@ -192,6 +202,7 @@ class FaceAnimator:
         """
         step_s = 1.0 / self._frame_rate_hz
         self._update_speaking(math.inf)
+        self._voice.clear()
         self._withdraw_phones()
         return [self._make_frame(self._lip_stream.relax(step_s)) for _ in range(num_frames)]
 
@@ -207,6 +218,10 @@ class FaceAnimator:
     def set_expressiveness(self, amount: float) -> None:
         """Set the size of mouth movements, 0.5 to 2; 1 leaves the lip model unchanged."""
         self._expressiveness.amount = amount
+
+    def set_feeling(self, amount: float) -> None:
+        """Set the strength of the feeling in the voice on the face, 0 to 1."""
+        self._feeling.amount = amount
 
     def set_lip_model(self, lip_model: LipModel) -> None:
         """Change the lip model with a continuous transition."""
@@ -245,10 +260,7 @@ class FaceAnimator:
             self._changes.append(event)
         elif isinstance(event, Progress):
             self._levels.append((event.time_s, event.level_db))
-            if event.is_laughter:
-                self._laughter.show({ExpressionName.JOY: 1.0}, _LAUGHTER_HOLD_S)
-                if self._laughter not in self._modifiers:
-                    self._modifiers.append(self._laughter)
+            self._voice.append(event)
             if event.pitch_hz > 0.0:
                 self._pitches.append((event.time_s, event.pitch_hz))
 
@@ -334,6 +346,10 @@ class FaceAnimator:
         faps[_MOUTH] = mouth.faps
         soon_s = self._time_s + _SPEECH_LEAD_S
         starts_soon = any(change.active and change.time_s <= soon_s for change in self._changes)
+        until_s = self._time_s + _VOICE_LEAD_S
+        while len(self._voice) > 1 and self._voice[1].time_s <= until_s:
+            self._voice.popleft()
+        voice = self._voice[0] if self._voice else None
         context = FrameContext(
             time_s=self._time_s,
             known_s=self._time_s + self._delay_s,
@@ -343,6 +359,8 @@ class FaceAnimator:
             levels=levels,
             pitches=pitches,
             articulation=mouth.articulation,
+            feeling=(voice.arousal, voice.valence) if voice else (0.0, 0.0),
+            is_laughter=voice is not None and voice.is_laughter,
             amplitude_applies=self._lip_model.amplitude_applies,
         )
         for modifier in self._modifiers:

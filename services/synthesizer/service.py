@@ -124,6 +124,7 @@ class SynthesizerService(Service):
             delay_s=self._config.delay_ms / 1e3,
             idle_motion_seed=self._config.idle_motion_seed,
             expressiveness=settings.expressiveness or self._config.expressiveness,
+            feeling=self._config.feeling if settings.feeling is None else settings.feeling,
         )
         if settings.expressions:
             face.set_expressions(settings.expressions, settings.hold_s)
@@ -156,6 +157,8 @@ class SynthesizerService(Service):
             session.face.set_lip_model(load_lip_model(language, settings.lip_model))
         if settings.expressiveness is not None:
             session.face.set_expressiveness(settings.expressiveness)
+        if settings.feeling is not None:
+            session.face.set_feeling(settings.feeling)
         if settings.expressions is not None:
             session.face.set_expressions(settings.expressions, settings.hold_s)
         session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))

@@ -51,5 +51,12 @@ def check_expressiveness(amount: object) -> float:
     return float(amount)  # type: ignore[arg-type]
 
 
+def check_feeling(amount: object) -> float:
+    """Return the strength of the feeling; ``UserError`` if it is not between 0 and 1."""
+    if not _is_number(amount, 1.0):
+        raise UserError(f"feeling is {amount}; give 0 to 1")
+    return float(amount)  # type: ignore[arg-type]
+
+
 def _is_number(value: object, highest: float, lowest: float = 0.0) -> bool:
     return type(value) in (int, float) and lowest <= value <= highest  # type: ignore[operator]

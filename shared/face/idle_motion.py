@@ -3,9 +3,9 @@
 Blinks: 17 to 20 per minute in conversation, at log-normal intervals. The lid falls in about 80 ms
 and rises half as fast (Bentivoglio et al. 1997; VanderWerf et al. 2003). Gaze: saccades last 21 ms
 plus 2.2 ms per degree (Bahill et al. 1975). Speakers look at the listener during most fixations,
-but less often while they pause to think (Kendon 1967). Head: turns of about one degree, slower than
-1.5 Hz. Breath: 14 times a minute, a third of a degree of head motion. The eyes compensate head
-turns (vestibulo-ocular reflex).
+but less often while they pause to think (Kendon 1967). Head: turns of about a third of a degree,
+slower than 1.5 Hz; larger movements belong to speech. Breath: 14 times a minute, a third of a
+degree of head motion. The eyes compensate head turns (vestibulo-ocular reflex).
 
 The motion depends only on the seed, the time and recent states. A generator that starts late soon
 makes the same motion as one that started with the session.
@@ -42,11 +42,10 @@ _GLANCE_SD_DEG = (5.0, 2.5)  # other fixations
 _GLANCE_LIMIT_DEG = 12.0
 _LID_PER_GAZE = 0.012  # FAP units of the upper lid per unit of downward gaze
 
-_HEAD_SD_DEG = (0.9, 1.1, 0.6)  # pitch, yaw, roll while speaking
+_HEAD_SD_DEG = (0.32, 0.38, 0.21)  # pitch, yaw, roll
 _HEAD_HZ = (0.07, 1.4)
 _NUM_WAVES = 9
-_LISTENING_HEAD = 0.35  # head motion while listening, relative to speaking
-_SPEAKING_S = 0.8  # time constant of the change between them
+_STATE_S = 0.8  # time constant of a change of the head's motion
 _BREATH_HZ, _BREATH_DEG = 0.23, 0.35
 
 
@@ -57,7 +56,7 @@ def span(first: str, last: str) -> slice:
 
 _LIDS_UPPER = span("close_t_l_eyelid", "close_t_r_eyelid")
 _LIDS_LOWER = span("close_b_l_eyelid", "close_b_r_eyelid")
-_EYES_YAW = span("yaw_l_eyeball", "yaw_r_eyeball")
+EYES_YAW = span("yaw_l_eyeball", "yaw_r_eyeball")
 EYES_PITCH = span("pitch_l_eyeball", "pitch_r_eyeball")
 _HEAD = span("head_pitch", "head_roll")
 
@@ -70,6 +69,7 @@ class State(Enum):
     THINKING = "thinking"  # a pause within one's own speech
 
 
+_LIVELINESS = {State.LISTENING: 1.0, State.SPEAKING: 1.0, State.THINKING: 0.3}  # of the head
 # share of the fixations on the listener
 _ON_LISTENER = {State.LISTENING: 0.8, State.SPEAKING: 0.88, State.THINKING: 0.5}
 
@@ -89,7 +89,7 @@ class IdleMotion:
         size = wave_hz**-0.5
         size *= np.sqrt(2.0 / np.sum(size**2, axis=1, keepdims=True))
         self._wave_size = size * np.array(_HEAD_SD_DEG)[:, None] * _DEGREE
-        self._liveliness = _LISTENING_HEAD
+        self._liveliness = 1.0
         self._breath_phase = waves.uniform(0.0, 2.0 * np.pi)
         self._time_s = 0.0
         self._state = State.LISTENING
@@ -109,8 +109,8 @@ class IdleMotion:
             self._reaction_s = min(self._reaction_s, time_s + _REACTION_S)
         elapsed_s = max(time_s - self._time_s, 0.0)
         self._time_s = time_s
-        goal = _LISTENING_HEAD if state is State.LISTENING else 1.0
-        self._liveliness += (goal - self._liveliness) * smoothing_share(elapsed_s, _SPEAKING_S)
+        change = _LIVELINESS[state] - self._liveliness
+        self._liveliness += change * smoothing_share(elapsed_s, _STATE_S)
         angles = self._wave_rate * time_s + self._wave_phase
         head = self._liveliness * (self._wave_size * np.sin(angles)).sum(axis=1)
         breath = math.sin(2.0 * math.pi * _BREATH_HZ * time_s + self._breath_phase)
@@ -120,7 +120,7 @@ class IdleMotion:
         faps[_HEAD] += head.astype(np.float32)
         # the gaze target stays in place while the head turns
         faps[EYES_PITCH] += pitch - head[0]
-        faps[_EYES_YAW] += yaw - head[1]
+        faps[EYES_YAW] += yaw - head[1]
         faps[_LIDS_UPPER] += _LID_PER_GAZE * (pitch - head[0])
         # start from the lid position that an expression has set
         faps[_LIDS_UPPER] += lid * (UPPER_LID - faps[_LIDS_UPPER])

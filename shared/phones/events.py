@@ -65,7 +65,10 @@ class Progress:
     level_db: float  # RMS of the newest 20 ms, full scale = 0
     zero_crossing_rate: float = 0.0  # sign changes per sample in the newest 20 ms, 0 to 1
     pitch_hz: float = 0.0  # in the newest 20 ms; 0: unvoiced
+    arousal: float = 0.0  # relative to the speaker's mean, -1 to 1
+    valence: float = 0.0  # likewise: below 0 is unpleasant
     is_laughter: bool = False  # laughter is not speech
+    is_breath: bool = False  # an audible breath, such as before speech
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -74,7 +74,10 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 level_db=event.level_db,
                 zero_crossing_rate=event.zero_crossing_rate,
                 pitch_hz=event.pitch_hz or None,
+                arousal=event.arousal,
+                valence=event.valence,
                 is_laughter=event.is_laughter,
+                is_breath=event.is_breath,
             )
         case events.AudioSkipped():
             return Progress(media_time=to_samples(event.time_s), state=AudioState.SKIPPED)
@@ -120,5 +123,8 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
                 level_db=message.level_db,
                 zero_crossing_rate=message.zero_crossing_rate,
                 pitch_hz=message.pitch_hz or 0.0,
+                arousal=message.arousal,
+                valence=message.valence,
                 is_laughter=message.is_laughter,
+                is_breath=message.is_breath,
             )

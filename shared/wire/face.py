@@ -31,6 +31,7 @@ class FaceSettings:
     expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (
         None  # scales the mouth's motion; 1: as the lip model moves it
     )
+    feeling: Strength | None = None  # of the voice's feeling on the face; 0: off
     expressions: ExpressionMap | None = None  # strengths by name; {}: fade those shown now
     hold_s: Annotated[float, Meta(ge=0, le=MAX_HOLD_S)] = DEFAULT_HOLD_S  # until they fade
     shapes: ShapeSets | None = None  # also publish these sets of shapes
@@ -43,6 +44,7 @@ class FaceSettings:
             lip_model=change.lip_model or self.lip_model,
             acoustic=change.acoustic or self.acoustic,
             expressiveness=change.expressiveness or self.expressiveness,
+            feeling=self.feeling if change.feeling is None else change.feeling,
             expressions=expressed.expressions,
             hold_s=expressed.hold_s,
             shapes=list(shapes) or None,

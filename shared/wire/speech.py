@@ -19,6 +19,7 @@ from kouxing.shared.wire.message import (
 PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
 MAX_TOGETHER = 8  # messages in one, so that it fits into the limit of the synthesizer's socket
 _TOGETHER = Meta(max_length=MAX_TOGETHER)
+Feeling = Annotated[float, Meta(ge=-1, le=1)]
 LipDelay = Annotated[int, Meta(ge=-16_000, le=16_000)]  # samples at 16 kHz
 
 
@@ -99,7 +100,10 @@ class Progress(Message):
     level_db: Annotated[float, Meta(ge=-200, le=20)] = -200.0  # RMS of the newest 20 ms, dBFS
     zero_crossing_rate: Probability = 0.0  # sign changes per sample in the newest 20 ms
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
+    arousal: Feeling = 0.0  # of the voice, relative to the speaker's mean
+    valence: Feeling = 0.0  # likewise; below 0: unpleasant
     is_laughter: bool = False  # someone laughs, which is not speech
+    is_breath: bool = False  # an audible breath
     # Of the lost synthesizer: the new one continues after it. In the first message of an epoch
     newest_frame: NewestFrame | None = None
 

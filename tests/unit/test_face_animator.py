@@ -117,7 +117,7 @@ def test_idle_motion_has_natural_statistics() -> None:
     assert 12 < np.count_nonzero(closed[1:] & ~closed[:-1]) / minutes < 24  # blinks per minute
     np.testing.assert_array_equal(faps[:, 18], faps[:, 19])
     head_deg = np.rad2deg(faps[:, 47:50] * 1e-5)
-    assert (head_deg.std(axis=0) > 0.4).all()
+    assert (head_deg.std(axis=0) > 0.15).all()
     assert np.abs(head_deg).max() < 6.0
     assert np.abs(np.diff(head_deg, axis=0)).max() * rate_hz < 20.0  # degrees per second
     gaze_deg = np.rad2deg((faps[:, 22] + faps[:, 48]) * 1e-5)  # relative to space: eye and head

@@ -12,8 +12,10 @@ from tests.lips import make_face
 
 FRAME_S = 0.02
 BROW = FAP_NUMBER["raise_l_m_eyebrow"] - 1
-PITCH = FAP_NUMBER["head_pitch"] - 1
-QUIET_DB, SILENT_DB, STRESS_DB = -26.0, -80.0, -14.0
+PITCH, ROLL = FAP_NUMBER["head_pitch"] - 1, FAP_NUMBER["head_roll"] - 1
+QUIET_DB, SILENT_DB, STRESS_DB, STRONG_DB = -26.0, -80.0, -17.0, -8.0
+SEEDS = range(1, 7)
+DEGREE = np.deg2rad(1.0) * 1e5  # FAP units
 
 
 def levels(*parts: tuple[float, float]) -> list[float]:
@@ -21,37 +23,70 @@ def levels(*parts: tuple[float, float]) -> list[float]:
     return [level_db for duration_s, level_db in parts for _ in range(round(duration_s / FRAME_S))]
 
 
-def show(face: FaceAnimator, levels_db: Sequence[float], step: int = 1) -> NDArray[np.float32]:
-    """Return the frames for levels that arrive in chunks of a given size."""
+def show(
+    face: FaceAnimator,
+    levels_db: Sequence[float],
+    step: int = 1,
+    pitches_hz: Sequence[float] | None = None,
+) -> NDArray[np.float32]:
+    """Return the frames for levels and pitches that arrive in chunks of a given size."""
     frames = face.process(SpeechChange(active=True, time_s=0.0))
-    for first in range(0, len(levels_db), step):
-        for number, level_db in enumerate(levels_db[first : first + step], start=first + 1):
-            frames += face.process(Progress(time_s=number * FRAME_S, level_db=level_db))
+    pitches_hz = pitches_hz or [0.0] * len(levels_db)
+    events = [
+        Progress(time_s=number * FRAME_S, level_db=level_db, pitch_hz=pitch_hz)
+        for number, (level_db, pitch_hz) in enumerate(zip(levels_db, pitches_hz, strict=True), 1)
+    ]
+    for first in range(0, len(events), step):
+        for event in events[first : first + step]:
+            frames += face.process(event)
     return np.array([faps for _, faps in frames])
 
 
-def lively(levels_db: Sequence[float], seed: int) -> NDArray[np.float32]:
-    """Return the difference from idle motion without speech."""
-    flat = [QUIET_DB] * len(levels_db)
-    spoken, plain = (show(make_face(idle_motion_seed=seed), curve) for curve in (levels_db, flat))
+def lively(levels_db: Sequence[float], seed: int = 3) -> NDArray[np.float32]:
+    """Return the difference from the motion with an even voice."""
+    even = [QUIET_DB] * len(levels_db)
+    spoken, plain = (show(make_face(idle_motion_seed=seed), curve) for curve in (levels_db, even))
     return spoken - plain
 
 
-STRESSED = levels((1.0, QUIET_DB), (0.2, STRESS_DB), (0.8, QUIET_DB))
+STRESSED, STRONG = (
+    levels((1.0, QUIET_DB), (0.2, level_db), (0.8, QUIET_DB)) for level_db in (STRESS_DB, STRONG_DB)
+)
 
 
-def test_brows_and_head_move_on_stressed_syllables() -> None:
-    added = [lively(STRESSED, seed) for seed in range(1, 21)]
-    raised = [faps[:, BROW] for faps in added]
-    heights = np.array([curve.max() for curve in raised])
-    assert 6 < np.count_nonzero(heights > 10.0) < 18  # not on every stress
-    assert heights.max() < 60.0  # a small movement
-    peaks_s = FRAME_S * np.array([curve.argmax() for curve in raised if curve.max() > 10.0])
-    assert (np.abs(peaks_s - 1.15) < 0.2).all()
-    assert all(np.abs(np.diff(curve, n=2)).max() < 5.0 for curve in raised)  # no corners
-    dips = np.array([faps[:, PITCH].max() for faps in added])
-    assert 8 < np.count_nonzero(dips > 500.0) < 20
-    assert dips.max() < np.deg2rad(2.5) * 1e5
+def test_the_head_nods_on_stressed_syllables_and_brows_rise_on_the_strongest() -> None:
+    stressed, strong = lively(STRESSED), lively(STRONG)
+    np.testing.assert_array_equal(strong, lively(STRONG))
+    assert not stressed[:, BROW].any()
+    assert 20.0 < strong[:, BROW].max() < 60.0
+    assert DEGREE / 2 < stressed[:, PITCH].max() < strong[:, PITCH].max() < 2.5 * DEGREE
+    for curve in (strong[:, BROW], stressed[:, PITCH]):
+        assert abs(FRAME_S * curve.argmax() - 1.15) < 0.2
+    assert np.abs(np.diff(strong[:, BROW], n=2)).max() < 6.0  # no corners
+
+
+def test_the_head_nods_at_the_end_of_a_phrase_and_tilts_after_a_question() -> None:
+    sound = levels((2.0, QUIET_DB), (0.6, SILENT_DB))
+    flat = [200.0] * 100 + [0.0] * 30
+    rising = [200.0] * 85 + [200.0 * 2 ** (k / 15) for k in range(1, 16)] + [0.0] * 30
+    said, asked = (
+        show(make_face(idle_motion_seed=3), sound, pitches_hz=pitches) for pitches in (flat, rising)
+    )
+    difference = asked - said
+    assert np.abs(difference[:105, ROLL]).max() < 1.0
+    assert np.abs(difference[105:, ROLL]).max() > 1.5 * DEGREE
+    assert difference[105:, BROW].max() > 30.0
+    even = show(make_face(idle_motion_seed=3), [QUIET_DB] * len(sound))
+    assert (said - even)[100:, PITCH].max() > DEGREE / 2
+
+
+def test_the_head_holds_still_in_pauses() -> None:
+    pause = levels((1.0, QUIET_DB), (1.4, SILENT_DB), (10.0, SILENT_DB))
+    faps = np.mean(
+        [np.abs(np.diff(show(make_face(idle_motion_seed=seed), pause)[:, ROLL])) for seed in SEEDS],
+        axis=0,
+    )
+    assert faps[110:170].mean() < 0.5 * faps[300:].mean()  # less than while listening later
 
 
 def test_does_not_move_lips_and_is_independent_of_chunks() -> None:

@@ -34,6 +34,8 @@ class FaceSettings(TypedDict, total=False):
     """how long the expressions stay before they fade"""
     expressiveness: float
     """scale of the mouth's motion, 0.5 to 2"""
+    feeling: float
+    """strength of the voice's feeling on the face, 0 to 1"""
     shapes: Sequence[str]
     """sets of blend shapes to publish as well"""
 

@@ -1,10 +1,11 @@
-// The settings panel: head, lips, expressiveness, expressions and language.
+// The settings panel: head, lips, size of movements, expressions and language.
 
 import { element } from "./elements.js";
 import { languageFor, say, setLanguage } from "./language.js";
 import { TEXTS } from "./texts.js";
 
 const STRENGTH = 0.8; // of an expression
+export const AMOUNTS = ["expressiveness", "feeling"];
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
 
 export class Settings {
@@ -14,7 +15,8 @@ export class Settings {
   /**
    * @param preferences Preferences
    * @param offers { heads: names, lips: { name: title by language } } of the gateway
-   * @param handlers { heads(name), lips(name), expressiveness(amount), express(strengths by name) },
+   * @param handlers { heads(name), lips(name), expressiveness(amount), feeling(amount),
+   *   express(strengths by name) },
    *   called when the user changes a setting
    */
   constructor(preferences, offers, handlers) {
@@ -26,13 +28,11 @@ export class Settings {
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);
     this.#bind("lips", handlers.lips);
-    this.#bind("expressiveness", handlers.expressiveness);
+    for (const id of AMOUNTS) this.#bindAmount(id, handlers[id]);
     this.#bind("language", () => this.#applyLanguage());
     element("expressions").onclick = ({ target }) => {
       if (target.value) handlers.express({ [target.value]: STRENGTH });
     };
-    element("expressiveness").addEventListener("input", showAmount);
-    showAmount();
   }
 
   /** Select the lip model that is in use. */
@@ -51,6 +51,13 @@ export class Settings {
       this.#preferences.set(id, value);
       onChange(value);
     });
+  }
+
+  /** Connect a slider as above, and show its value. */
+  #bindAmount(id, onChange) {
+    this.#bind(id, onChange);
+    element(id).addEventListener("input", () => showAmount(id));
+    showAmount(id);
   }
 
   #applyLanguage() {
@@ -96,7 +103,7 @@ function showPictures(names) {
   element("head-pictures").replaceChildren(...buttons);
 }
 
-function showAmount() {
-  const { valueAsNumber: amount } = element("expressiveness");
-  element("expressiveness-shown").value = `${Math.round(100 * amount)} %`;
+function showAmount(id) {
+  const { valueAsNumber: amount } = element(id);
+  element(`${id}-shown`).value = `${Math.round(100 * amount)} %`;
 }

@@ -124,6 +124,7 @@ export const TEXTS = {
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
+  feeling: { en: "Feeling from the voice", zh: "随声音流露的情绪" },
   expression: { en: "Expression", zh: "表情" },
   senders: { en: "Other programs", zh: "其他程序" },
   senderAddress: { en: "Address of a program that shows the face", zh: "显示这张脸的程序的地址" },

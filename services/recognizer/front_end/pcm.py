@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
-from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
+from kouxing.shared.clock import to_seconds
 from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
@@ -74,30 +74,41 @@ def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
     return float(np.count_nonzero(np.diff(np.signbit(samples)))) / len(samples)
 
 
-def progress_at(media_time: int, newest: NDArray[np.float32], pitch: PitchTracker) -> Progress:
-    """Measure the newest slice, shape (320,), which ends at ``media_time``."""
-    return Progress(
-        time_s=to_seconds(media_time),
-        level_db=level_db(newest),
-        zero_crossing_rate=zero_crossing_rate(newest),
-        pitch_hz=pitch.track(newest),
-    )
+class SliceMeter:
+    """Measures the level and pitch of every 20 ms of audio from media time ``start`` on.
 
-
-def progress_of(samples: NDArray[np.float32], silence_s: float = 0.0) -> list[Progress]:
-    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does.
-
-    A silence of ``silence_s`` follows the recording.
+    Times are samples at 16 kHz.
     """
-    pitch = PitchTracker()
-    num_samples = len(samples) + round(silence_s * MEDIA_RATE_HZ)
-    return [
-        progress_at(end, _extended(samples[end - SLICE : end]), pitch)
-        for end in range(SLICE, num_samples + 1, SLICE)
-    ]
+
+    def __init__(self, start: int = 0) -> None:
+        self.media_time = start  # end of the audio so far
+        self._start = start
+        self._pieces: list[NDArray[np.float32]] = []  # of the incomplete slice
+        self._pitch = PitchTracker(start // SLICE)
+
+    def accept_waveform(
+        self, samples: NDArray[np.float32]
+    ) -> Iterator[tuple[NDArray[np.float32], Progress | None]]:
+        """Take samples, (n,); yield pieces, each with the slice that ends there."""
+        for piece in slices(samples, self.media_time - self._start):
+            self.media_time += len(piece)
+            self._pieces.append(piece)
+            if (self.media_time - self._start) % SLICE:
+                yield piece, None
+                continue
+            newest = np.concatenate(self._pieces)
+            self._pieces.clear()
+            yield (
+                piece,
+                Progress(
+                    time_s=to_seconds(self.media_time),
+                    level_db=level_db(newest),
+                    zero_crossing_rate=zero_crossing_rate(newest),
+                    pitch_hz=self._pitch.track(newest),
+                ),
+            )
 
 
-def _extended(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return samples, (n,), with silence up to the length of a slice."""
-    num_missing = SLICE - len(samples)
-    return np.pad(samples, (0, num_missing)) if num_missing else samples
+def progress_of(samples: NDArray[np.float32]) -> list[Progress]:
+    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does."""
+    return [progress for _, progress in SliceMeter().accept_waveform(samples) if progress]

@@ -1,1 +1,1 @@
-"""Modifiers of the face after the lip model: amplitude, expressiveness, expression, idle motion."""
+"""Modifiers of the face after the lip model: amplitude, expressions and motion."""

@@ -1,56 +1,56 @@
-"""Idle motion, and brow, head and eye motion that accompanies speech.
+"""Brow, head and eye motion that accompanies speech, in addition to idle motion.
 
-Speakers raise their brows and dip their heads on stressed syllables, and nod at the end of a phrase
-(Graf et al. 2002; Swerts & Krahmer 2010). Occurrence and size are random. A syllable is stressed if
-its level and pitch stand out from the last seconds:
+The prosody (:mod:`kouxing.services.synthesizer.modifiers.prosody`) starts all movements:
 
-    (level - mean) / spread + (pitch - mean) / spread > 1.2
+=================  ==================================================================
+prosody            movement
+=================  ==================================================================
+stressed syllable  a nod; with the strongest ones the brows rise too
+end of a phrase    a nod
+question           the head tilts and the brows rise
+start of speech    the head turns, and returns within two seconds
+pitch              a high pitch lifts the head
+pause              the head holds still
+=================  ==================================================================
 
-with the pitch in semitones and its term limited to -1 to 1. In pauses the eyes leave the listener
-more often. A two-pole filter smooths each movement. Mouth FAPs are not changed, and the motion
-depends only on the seed and the sound.
+Sources: Graf et al. 2002, "Visual prosody" (nods and brows at pitch accents and ends of phrases);
+Ambrazaitis et al. 2015 (newsreaders nod on 23 % of the words, and raise the brows on 7 %); Swerts &
+Krahmer 2010 (accented words have more of both); Munhall et al. 2004 (the head follows pitch and
+level); Hadar et al. 1984 (wide head movements when speech starts after a pause). A two-pole filter
+smooths each movement. Lips are not moved. The motion depends only on the seed and the sound.
 """
 
-from __future__ import annotations
-
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.idle_motion import EYES_PITCH, IdleMotion, State, span
-from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_share
+from kouxing.services.synthesizer.modifiers.prosody import Prosody, ProsodyTracker
+from kouxing.shared.face.faps import RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.idle_motion import EYES_PITCH, EYES_YAW, IdleMotion, State, span
+from kouxing.shared.face.smoothing import TwoPoleFilter
 
-_LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
-_LEVEL_S = 0.03  # time constant of the level
-_MEAN_S = 3.0  # time constant of means and spreads
-_INITIAL_DB, _INITIAL_SPREAD_DB = -26.0, 5.0  # dBFS
-_PAUSE_DB = 15.0  # levels this far below the mean are not speech
-_STRESS = 1.2  # spreads above the mean
-_INITIAL_SPREAD_ST = 3.0  # semitones
-_MIN_SPREAD_DB, _MIN_SPREAD_ST = 2.0, 1.0
-_MIN_STRESS_INTERVAL_S = 0.8
-_PHRASE_S, _PHRASE_END_S = 0.8, 0.14  # duration of speech before a nod, and of silence
+_NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # prominence of syllables with these movements
+_MAX_EXCESS = 1.2  # prominence above that of the weakest nod, of the largest one
+_MIN_NOD_INTERVAL_S, _MIN_BROW_INTERVAL_S = 1.0, 2.5
+_MIN_SIZE = 0.5  # of the weakest nod, relative to the largest one
 _THINKING_S = (0.7, 2.5)  # duration of silence
-
-_BROW_SHARE, _BEAT_SHARE, _NOD_SHARE = 0.55, 0.7, 0.85  # probabilities of movements
-_MIN_SIZE = 0.5  # minimum of the random size
-_OCCASION_S = 0.2  # period with a single random decision
-_BROW_HOLD_S, _BEAT_HOLD_S, _NOD_HOLD_S = 0.22, 0.12, 0.2
-_FILTER_S = 0.08  # time constant of each filter pole
+_NOD_HOLD_S, _BROW_HOLD_S, _TILT_HOLD_S, _TURN_HOLD_S = 0.14, 0.22, 0.6, 0.7
+_FILTER_S, _SLOW_S = 0.08, 0.2  # time constant of each filter pole
 _BROW = {  # FAP units of a full movement
     f"raise_{side}_{part}_eyebrow": units
     for part, units in (("i", 45.0), ("m", 55.0), ("o", 35.0))
     for side in "lr"
 }
-_BEAT_DEG, _NOD_DEG = 2.4, 3.2  # downwards; the filter halves these sizes
+_NOD_DEG = 3.4  # downwards; the filter halves it
+_LIFT_DEG = 0.6  # upwards, with a pitch one spread above the mean
+_TILT_DEG, _TURN_DEG = 4.0, 2.5
+_TURN_S = 0.5  # start times in the same interval of this length have the same direction
 
 _BROWS = span("raise_l_i_eyebrow", "raise_r_o_eyebrow")
 _BROW_UNITS = np.array([*_BROW.values()], np.float32)
-_HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
+_HEAD = span("head_pitch", "head_roll")
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
@@ -60,97 +60,63 @@ class SpeechIdleMotion:
     def __init__(self, seed: int) -> None:
         self._idle = IdleMotion(seed)
         self._seed = seed
-        self._levels: deque[tuple[float, float]] = deque()
-        self._pitches: deque[tuple[float, float]] = deque()
-        self._level_s = 0.0  # media time of the last level
-        self._level_db = self._mean_db = _INITIAL_DB
-        self._spread_db = _INITIAL_SPREAD_DB
-        self._pitch_s = 0.0  # media time of the last pitch
-        self._mean_st = math.nan  # no pitch is known yet
-        self._spread_st = _INITIAL_SPREAD_ST
-        self._raised = 0.0  # pitch above the mean, in spreads
-        self._is_stressed = False
-        self._phrase_s = 0.0  # duration of speech since the last end of a phrase
-        self._silence_s = math.inf
-        self._stress_s = -math.inf  # time of the last stress, since the first frame
-        self._brow, self._head = _Movement(), _Movement()
+        self._prosody = ProsodyTracker()
+        self._silence_s = math.inf  # at the last frame
+        self._nod_s = self._brow_s = -math.inf  # times of the last movements
+        self._brow, self._nod = _Movement(_FILTER_S), _Movement(_FILTER_S)
+        self._tilt, self._turn = _Movement(_SLOW_S), _Movement(_SLOW_S)
+        self._lift = TwoPoleFilter(0.0)
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the motion to a frame, FAPs (68,), in place."""
         now_s, step_s = context.elapsed_s, context.step_s
-        self._levels += [level for level in context.levels if all(map(math.isfinite, level))]
-        until_s = min(context.known_s, context.time_s + _LEAD_S)
-        before_s = self._silence_s
-        self._silence_s += step_s
-        self._pitches += context.pitches
-        while self._pitches and self._pitches[0][0] <= until_s:
-            self._add_pitch(*self._pitches.popleft())
-        while self._levels and self._levels[0][0] <= until_s:
-            time_s, level_db = self._levels.popleft()
-            if context.is_speaking:  # otherwise it is noise
-                self._add_level(time_s, level_db, now_s)
-        if self._phrase_s > _PHRASE_S and before_s < _PHRASE_END_S <= self._silence_s:
-            self._phrase_s = 0.0
-            self._move(self._head, _NOD_SHARE, _NOD_DEG, now_s, _NOD_HOLD_S)
-        self._idle.apply(faps, now_s, self._state())
+        prosody = self._prosody.update(context)
+        self._start_movements(prosody, now_s)
+        self._idle.apply(faps, now_s, _state_after(prosody.silence_s))
         faps[_BROWS] += np.float32(self._brow.at(now_s, step_s)) * _BROW_UNITS
-        pitch = np.float32(self._head.at(now_s, step_s) * _DEGREE)
-        faps[_HEAD_PITCH] += pitch
-        faps[EYES_PITCH] -= pitch  # the gaze target stays in place
+        is_voiced = prosody.silence_s < step_s
+        lift = self._lift.step(prosody.raised if is_voiced else 0.0, step_s, _SLOW_S)
+        pitch = self._nod.at(now_s, step_s) - _LIFT_DEG * lift
+        yaw, roll = self._turn.at(now_s, step_s), self._tilt.at(now_s, step_s)
+        faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(_DEGREE)
+        # the gaze target stays in place
+        faps[EYES_PITCH] -= np.float32(pitch * _DEGREE)
+        faps[EYES_YAW] -= np.float32(yaw * _DEGREE)
 
-    def _state(self) -> State:
-        if self._silence_s < _THINKING_S[0]:
-            return State.SPEAKING
-        return State.THINKING if self._silence_s < _THINKING_S[1] else State.LISTENING
+    def _start_movements(self, prosody: Prosody, now_s: float) -> None:
+        may_nod = now_s - self._nod_s > _MIN_NOD_INTERVAL_S
+        if may_nod and (prosody.stress > _NOD_STRESS or prosody.has_ended):
+            self._nod_s = now_s
+            excess = min(max(prosody.stress - _NOD_STRESS, 0.0) / _MAX_EXCESS, 1.0)
+            size = _NOD_DEG * (_MIN_SIZE + (1.0 - _MIN_SIZE) * excess)
+            self._nod.start(size, now_s + _NOD_HOLD_S)
+        if prosody.stress > _BROW_STRESS and now_s - self._brow_s > _MIN_BROW_INTERVAL_S:
+            self._brow_s = now_s
+            self._brow.start(1.0, now_s + _BROW_HOLD_S)
+        if prosody.is_question:
+            self._tilt.start(_TILT_DEG * self._side(now_s), now_s + _TILT_HOLD_S)
+            self._brow.start(1.0, now_s + _TILT_HOLD_S)
+        if prosody.silence_s == 0.0 and self._silence_s > _THINKING_S[0]:
+            self._turn.start(_TURN_DEG * self._side(now_s), now_s + _TURN_HOLD_S)
+        self._silence_s = prosody.silence_s
 
-    def _add_pitch(self, time_s: float, pitch_hz: float) -> None:
-        elapsed_s = min(max(time_s - self._pitch_s, 0.0), 1.0)
-        self._pitch_s = time_s
-        pitch_st = 12.0 * math.log2(pitch_hz)
-        if math.isnan(self._mean_st):
-            self._mean_st = pitch_st
-        above_st = pitch_st - self._mean_st
-        self._raised = min(max(above_st / max(self._spread_st, _MIN_SPREAD_ST), -1.0), 1.0)
-        self._mean_st += above_st * smoothing_share(elapsed_s, _MEAN_S)
-        self._spread_st += (abs(above_st) - self._spread_st) * smoothing_share(elapsed_s, _MEAN_S)
+    def _side(self, now_s: float) -> float:
+        """Return the direction of a movement, 1 or -1; it depends only on seed and time."""
+        return float(np.random.default_rng([self._seed, round(now_s / _TURN_S)]).choice([-1, 1]))
 
-    def _add_level(self, time_s: float, level_db: float, now_s: float) -> None:
-        elapsed_s = min(max(time_s - self._level_s, 0.0), 1.0)
-        self._level_s = time_s
-        self._level_db += (level_db - self._level_db) * smoothing_share(elapsed_s, _LEVEL_S)
-        above_db = self._level_db - self._mean_db
-        if above_db < -_PAUSE_DB:
-            self._is_stressed = False
-            return
-        self._silence_s = 0.0
-        self._phrase_s += elapsed_s
-        self._mean_db += above_db * smoothing_share(elapsed_s, _MEAN_S)
-        self._spread_db += (abs(above_db) - self._spread_db) * smoothing_share(elapsed_s, _MEAN_S)
-        was_stressed = self._is_stressed
-        louder = above_db / max(self._spread_db, _MIN_SPREAD_DB)
-        self._is_stressed = louder + self._raised > _STRESS
-        since_stress_s = now_s - self._stress_s
-        if self._is_stressed and not was_stressed and since_stress_s > _MIN_STRESS_INTERVAL_S:
-            self._stress_s = now_s
-            self._move(self._brow, _BROW_SHARE, 1.0, now_s, _BROW_HOLD_S)
-            self._move(self._head, _BEAT_SHARE, _BEAT_DEG, now_s, _BEAT_HOLD_S)
 
-    def _move(
-        self, movement: _Movement, share: float, size: float, now_s: float, hold_s: float
-    ) -> None:
-        """Start a movement at random; the decision depends only on seed and time."""
-        occasion = round(now_s / _OCCASION_S)
-        draw = 2 * occasion + (movement is self._head)
-        chance, scale = np.random.default_rng([self._seed, 1, draw]).random(2)
-        if chance < share:
-            movement.start(size * (_MIN_SIZE + (1.0 - _MIN_SIZE) * float(scale)), now_s + hold_s)
+def _state_after(silence_s: float) -> State:
+    if silence_s < _THINKING_S[0]:
+        return State.SPEAKING
+    return State.THINKING if silence_s < _THINKING_S[1] else State.LISTENING
 
 
 class _Movement:
     """Moves to a size, stays until a time, and returns."""
 
-    def __init__(self) -> None:
+    def __init__(self, filter_s: float) -> None:
         self._size, self._until_s = 0.0, -math.inf
+        self._filter_s = filter_s
         self._value = TwoPoleFilter(0.0)
 
     def start(self, size: float, until_s: float) -> None:
@@ -158,4 +124,4 @@ class _Movement:
 
     def at(self, now_s: float, step_s: float) -> float:
         goal = self._size if now_s < self._until_s else 0.0
-        return self._value.step(goal, step_s, _FILTER_S)
+        return self._value.step(goal, step_s, self._filter_s)

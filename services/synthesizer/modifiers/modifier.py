@@ -22,6 +22,8 @@ class FrameContext:
     levels: Sequence[tuple[float, float]]  # new levels: media time s, level dB
     articulation: Articulation
     pitches: Sequence[tuple[float, float]] = ()  # new pitches: media time s, Hz
+    feeling: tuple[float, float] = (0.0, 0.0)  # arousal and valence of the voice, -1 to 1
+    is_laughter: bool = False
     amplitude_applies: bool = True  # False if the lip model already follows the level
 
 

@@ -1,0 +1,77 @@
+"""Reads recordings of speech that name an emotion.
+
+A folder has a ``manifest.tsv`` with the columns ``path``, ``speaker``, ``licence``, ``seconds`` and
+``note``. The note of such a recording contains ``emotion NAME``, for example *emotion anger*.
+"""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import read_text, split_lines
+
+# Arousal and valence, placed by hand on the circumplex of Russell 1980
+FEELINGS = {
+    "anger": (0.6, -0.5),
+    "fear": (0.6, -0.6),
+    "happiness": (0.5, 0.8),
+    "disgust": (0.3, -0.6),
+    "neutral": (0.0, 0.0),
+    "sadness": (-0.3, -0.6),
+    "boredom": (-0.6, -0.4),
+}
+_EMOTION = re.compile(r"emotion (\w+)")
+_MAX_BYTES = 16 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class SpokenEmotion:
+    """A recording, with its emotion if the manifest names one."""
+
+    path: Path
+    speaker: str
+    license: str
+    minutes: float
+    emotion: str | None
+
+
+def read_emotions(folder: Path, *, shipping: bool = False) -> list[SpokenEmotion]:
+    """Read the list of a folder; ``UserError`` if it is missing or names no known emotion.
+
+    ``shipping`` excludes recordings whose license does not allow distributing a model.
+    """
+    manifest = folder / "manifest.tsv"
+    lines = split_lines(manifest, read_text(manifest, _MAX_BYTES))
+    rows = csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE)
+    recordings = []
+    try:
+        for row in rows:
+            match = _EMOTION.search(row["note"])
+            emotion = match[1] if match and match[1] in FEELINGS else None
+            recording = SpokenEmotion(
+                folder / row["path"],
+                row["speaker"],
+                row["licence"],
+                float(row["seconds"]) / 60,
+                emotion,
+            )
+            if may_ship(recording.license) or not shipping:
+                recordings.append(recording)
+    except KeyError as error:
+        raise UserError(
+            f"{manifest} lacks the column {error}; add path, speaker, licence, seconds and note"
+        ) from error
+    except ValueError as error:
+        raise UserError(f"{manifest}: {error}; give the seconds as a number") from error
+    if not any(recording.emotion for recording in recordings):
+        raise UserError(f"{manifest} names no emotion; add notes such as 'emotion anger'")
+    return recordings
+
+
+def speakers_of(recordings: Sequence[SpokenEmotion]) -> list[str]:
+    """Return the speakers in alphabetical order."""
+    return sorted({recording.speaker for recording in recordings})

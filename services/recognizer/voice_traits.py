@@ -1,0 +1,125 @@
+"""What a voice shows apart from its words: arousal, valence, laughter and breath.
+
+A linear readout of the small ear's hidden layers, every 20 ms:
+
+======== ============================================================= ==============
+symbol   meaning                                                       shape, unit
+======== ============================================================= ==============
+h        state of the ear's recurrent layers                           (state width,)
+W, b     weights of the readout                                        (state width, 4), (4,)
+y        arousal and valence (-1 to 1), evidence of laughter and       (4,)
+         of breath (0 to 1)
+m        mean of arousal and valence over the session's voice          (2,)
+======== ============================================================= ==============
+
+    y = W^T h + b
+
+Arousal and valence are averaged over two seconds of voice. Voices and microphones differ more than
+feelings do, so the reported values are relative to ``m``. Arousal and valence are the axes of
+Russell 1980, "A circumplex model of affect". :mod:`kouxing.training.traits` trains the readout.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats
+from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
+from kouxing.services.recognizer.ear import HeardPosition, Voice, load_ear
+from kouxing.shared.errors import UserError
+
+TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
+FORMAT = "traits 1"
+NUM_TRAITS = 4  # arousal, valence, laughter, breath
+MIN_VOICE = 0.5  # probability of a voice above which arousal and valence count
+
+_FEELING = slice(0, 2)
+_MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # of the averages of arousal and valence; at the start
+_PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # of voice: weight of the prior mean, memory of m
+_DIGITS = 2  # feelings change slowly, so that equal messages compress well
+_EVIDENCE_SHARE = 0.1  # of a new position
+_START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
+
+
+class VoiceTraits(NamedTuple):
+    """What the voice shows; fields as those of ``Progress``."""
+
+    arousal: float = 0.0
+    valence: float = 0.0
+    is_laughter: bool = False
+    is_breath: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class VoiceReadout:
+    """The trained readout, shared by any number of streams."""
+
+    weights: Floats  # W
+    bias: Floats  # b
+    mean: Floats  # (2,) arousal and valence of the training speakers
+
+    def create_stream(self) -> VoiceTraitsStream:
+        """Create the stream of one session."""
+        return VoiceTraitsStream(self)
+
+    def save(self, path: Path) -> None:
+        """Write the model as an npz file (arrays only, no pickle)."""
+        arrays = {name: getattr(self, name) for name in ("weights", "bias", "mean")}
+        write_archive(path, {"format": np.array(FORMAT), **arrays})
+
+
+class VoiceTraitsStream:
+    """The traits of one session's voice."""
+
+    def __init__(self, readout: VoiceReadout) -> None:
+        self.newest = VoiceTraits()
+        self._readout = readout
+        self._feeling = self._mean = readout.mean.astype(np.float64)
+        self._num_voiced = 0  # positions with a voice
+        self._evidence = np.zeros(NUM_TRAITS - 2)  # of laughter, of breath
+
+    def accept_position(self, position: HeardPosition) -> None:
+        """Take the next position of the ear."""
+        outputs = position.state @ self._readout.weights + self._readout.bias
+        if position.voice[Voice.SPEECH] + position.voice[Voice.SUNG] > MIN_VOICE:
+            self._num_voiced += 1
+            feeling = outputs[_FEELING]
+            num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)
+            self._mean = self._mean + (feeling - self._mean) / num_known
+            share = 1.0 / min(self._num_voiced + _PRIOR_FEELING, _MEAN_POSITIONS)
+            self._feeling = self._feeling + share * (feeling - self._feeling)
+        self._evidence += _EVIDENCE_SHARE * (outputs[2:] - self._evidence)
+        arousal, valence = np.clip(self._feeling - self._mean, -1.0, 1.0)
+        laughter, breath = (
+            bool(evidence > (_STOP if was_on else _START))
+            for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
+        )
+        self.newest = VoiceTraits(
+            round(float(arousal), _DIGITS), round(float(valence), _DIGITS), laughter, breath
+        )
+
+
+@cache
+def load_voice_readout(path: Path = TRAITS_PATH) -> VoiceReadout:
+    """Read a model file; ``UserError`` if it is missing, broken or of another format."""
+    archive = read_archive(path)
+    try:
+        return _readout_from(archive)
+    except ValueError as error:
+        raise UserError(f"voice traits {path}: {error}; train them again") from error
+
+
+def _readout_from(archive: Archive) -> VoiceReadout:
+    form = str(archive.array("format", ()))
+    if form != FORMAT:
+        raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
+    return VoiceReadout(
+        weights=archive.floats("weights", load_ear().state_width, NUM_TRAITS),
+        bias=archive.floats("bias", NUM_TRAITS),
+        mean=archive.floats("mean", 2),
+    )

@@ -1,0 +1,83 @@
+"""The face follows the arousal and valence of the voice.
+
+Aroused voices raise the brows, open the lids, lift the head and enlarge the mouth's movements.
+Tired voices do the opposite. Pleasant voices raise the corners of the mouth and the lower lids;
+unpleasant ones draw the brows together (Ekman & Friesen 1978, "Facial action coding system": action
+units 1, 2, 4, 5, 6, 12 and 15). Closures stay closed, as in
+:mod:`kouxing.services.synthesizer.modifiers.expressiveness`.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.smoothing import TwoPoleFilter
+
+_GAIN = 2.5  # usual voices differ from their mean by up to 0.4
+_FILTER_S = 0.4  # time constant of each filter pole
+_SIZE = 0.25  # of the mouth's movements, at full arousal
+_DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
+
+
+def _faps(**units: float) -> NDArray[np.float32]:
+    """Return FAPs (68,) from units by name; ``S`` in a name means both sides."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    for name, value in units.items():
+        for side in ("l", "r"):
+            faps[FAP_NUMBER[name.replace("S", side)] - 1] = value
+    return faps
+
+
+# FAP units at full arousal and valence, upwards and downwards
+_AROUSED = _faps(
+    raise_S_i_eyebrow=30.0,
+    raise_S_m_eyebrow=50.0,
+    raise_S_o_eyebrow=45.0,
+    close_t_S_eyelid=-110.0,
+    head_pitch=-1.5 * _DEGREE,
+)
+_TIRED = _faps(
+    raise_S_m_eyebrow=-15.0,
+    raise_S_o_eyebrow=-25.0,
+    close_t_S_eyelid=170.0,
+    head_pitch=2.0 * _DEGREE,
+)
+_PLEASANT = _faps(
+    raise_S_cornerlip=110.0,
+    raise_S_cornerlip_o=110.0,
+    close_b_S_eyelid=90.0,
+    lift_S_cheek=40.0,
+)
+_UNPLEASANT = _faps(
+    raise_S_cornerlip=-60.0,
+    raise_S_cornerlip_o=-60.0,
+    raise_S_i_eyebrow=25.0,
+    squeeze_S_eyebrow=45.0,
+    raise_S_o_eyebrow=-20.0,
+)
+
+
+class FeelingMotion:
+    """Shows the feeling in the voice with a strength of ``amount``, 0 to 1; 0 turns it off."""
+
+    def __init__(self, amount: float) -> None:
+        self.amount = amount
+        self._feeling = TwoPoleFilter(np.zeros(2, np.float32))
+        self._size = Expressiveness(1.0)
+
+    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+        """Add the feeling to a frame, FAPs (68,), in place."""
+        goal = np.zeros(2, np.float32)
+        if context.is_speaking:
+            goal += np.clip(_GAIN * np.array(context.feeling), -1.0, 1.0)
+        arousal, valence = self._feeling.step(
+            np.float32(self.amount) * goal, context.step_s, _FILTER_S
+        )
+        self._size.amount = 1.0 + _SIZE * float(arousal)
+        self._size.apply(faps)
+        faps += abs(arousal) * (_AROUSED if arousal > 0.0 else _TIRED)
+        faps += abs(valence) * (_PLEASANT if valence > 0.0 else _UNPLEASANT)

@@ -1,0 +1,78 @@
+"""Arousal, valence, laughter and breath of a voice, from the state of the ear."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kouxing.services.recognizer.acoustic.model_file import write_archive
+from kouxing.services.recognizer.ear import HeardPosition, Voice, load_ear
+from kouxing.services.recognizer.voice_traits import (
+    NUM_TRAITS,
+    VoiceReadout,
+    VoiceTraits,
+    load_voice_readout,
+)
+from kouxing.shared.errors import UserError
+
+PER_S = 50  # positions
+# the first states are the traits themselves
+READOUT = VoiceReadout(
+    np.eye(NUM_TRAITS, dtype=np.float32), np.zeros(NUM_TRAITS, np.float32), np.zeros(2, np.float32)
+)
+
+
+def traits_of(*parts: tuple[float, Voice, Sequence[float]]) -> list[VoiceTraits]:
+    """Return the traits after each position of parts: duration in s, kind of voice, state."""
+    stream = READOUT.create_stream()
+    none = np.zeros(0, np.float32)
+    seen = []
+    for duration_s, kind, state in parts:
+        voice = np.eye(len(Voice), dtype=np.float32)[kind]
+        position = HeardPosition(none, none, none, voice, np.array(state, np.float32))
+        for _ in range(round(duration_s * PER_S)):
+            stream.accept_position(position)
+            seen.append(stream.newest)
+    return seen
+
+
+def test_feelings_are_relative_to_the_voice_so_far() -> None:
+    excited, calm = [0.6, 0.3, 0, 0], [-0.2, 0.3, 0, 0]
+    seen = traits_of((60.0, Voice.SPEECH, calm), (3.0, Voice.SPEECH, excited))
+    before, after = seen[60 * PER_S - 1], seen[-1]
+    assert abs(before.arousal) < 0.05  # a calm voice is this speaker's usual voice
+    assert after.arousal > 0.5
+    assert abs(after.valence) < 0.1
+    assert max(trait.arousal for trait in seen) <= 1.0
+
+
+def test_silence_does_not_change_the_feeling() -> None:
+    voiced = (2.0, Voice.SPEECH, [0.6, -0.3, 0, 0])
+    seen = traits_of(voiced, (5.0, Voice.NONE, [-1.0, 1.0, 0, 0]))
+    assert seen[2 * PER_S - 1][:2] == seen[-1][:2]
+    assert seen[-1].arousal > 0.2
+
+
+def test_laughter_and_breath_need_evidence_and_do_not_flicker() -> None:
+    laughs, breathes, nothing = [0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 0]
+    bursts = [(0.1, Voice.LAUGHTER, laughs), (0.06, Voice.NONE, nothing)] * 6
+    seen = traits_of((1.0, Voice.NONE, nothing), *bursts, (1.0, Voice.NONE, nothing))
+    laughter = np.array([trait.is_laughter for trait in seen])
+    assert not laughter[: PER_S + 2].any()
+    assert np.count_nonzero(np.diff(laughter)) == 2  # it starts once and ends once
+    assert not laughter[-PER_S // 2 :].any()
+    assert not any(trait.is_breath for trait in seen)
+    breath = traits_of((0.5, Voice.NONE, breathes))
+    assert breath[-1].is_breath
+    assert not breath[-1].is_laughter
+
+
+def test_the_shipped_readout_fits_the_ear_and_others_are_rejected(tmp_path: Path) -> None:
+    assert load_voice_readout().weights.shape == (load_ear().state_width, NUM_TRAITS)
+    READOUT.save(tmp_path / "small.npz")
+    with pytest.raises(UserError, match="weights has shape"):
+        load_voice_readout(tmp_path / "small.npz")
+    write_archive(tmp_path / "other.npz", {"format": np.array("ear 1")})
+    with pytest.raises(UserError, match="format 'ear 1'"):
+        load_voice_readout(tmp_path / "other.npz")
