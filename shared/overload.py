@@ -1,5 +1,9 @@
 """The overload policy: what a live session gives up on a busy machine to stay live.
 
+First, the block network runs less often for all sessions, so that phones are emitted and corrected
+later (:class:`NetworkPace`). Then a session uses the light acoustic model, and last it skips audio
+(:class:`Overload`).
+
 A session is *behind* if late audio is queued. If it is slightly behind, it uses the light acoustic
 model until it has been on time for a while. A session that stays too far behind skips the queued
 audio in one cut and continues with the newest audio. An unpaced session gives up nothing and takes
@@ -10,14 +14,87 @@ would have sent it. Audio that waited in a socket while this process was stopped
 although it was just received. Audio that a client sends ahead of the clock is not late.
 """
 
-import math
+from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
+SLOW_FROM = 0.5  # fraction of the limit above which the block network runs less often
 LIGHT_FROM = 0.75  # fraction of the limit above which a session uses the light model
 LIGHT_FOR_S = 2.0  # time for which a session that is on time still uses it
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
 REPORT_INTERVAL_S = 1.0  # between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
 ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is just as late
+
+MAX_HOP = 4  # between runs of the block network, in its shortest hops
+MAX_LOAD = 0.6  # cores of the loop and the network; above it, the network runs less often
+RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
+RESTORE_AFTER_S = 5.0  # time for which the expected load must be that low
+PACE_PERIOD_S = 0.5  # over which the load is measured
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Processor time spent on sessions, in seconds."""
+
+    loop_s: float = 0.0  # in the service's loop
+    network_s: float = 0.0  # in the block network, on another thread
+
+    def __add__(self, other: Work) -> Work:
+        return Work(self.loop_s + other.loop_s, self.network_s + other.network_s)
+
+    def __sub__(self, other: Work) -> Work:
+        return Work(self.loop_s - other.loop_s, self.network_s - other.network_s)
+
+
+class NetworkPace:
+    """Chooses the hop of the block network, from the load of a recognizer.
+
+    The network's time is proportional to 1 / hop. The hop is the shortest one whose expected load
+    is low enough. It also rises while a session is behind, because other programs use the
+    processor. It rises after one period, and falls after several.
+
+    Parameters
+    ----------
+    work
+        The work so far, which does not count.
+    now_s
+        The time, in seconds, on any monotonic clock.
+    """
+
+    def __init__(self, work: Work, now_s: float) -> None:
+        self.hop = 1  # in shortest hops
+        self._since_s = self._restored_s = now_s
+        self._before = work
+        self._needed = 1  # the longest hop needed since ``_restored_s``
+        self._is_behind = False  # whether a session was behind since ``_since_s``
+
+    def update(self, work: Work, now_s: float, *, is_behind: bool) -> int:
+        """Return the hop, given the work on live sessions so far, and if a session is behind."""
+        self._is_behind |= is_behind
+        passed_s = now_s - self._since_s
+        if passed_s < PACE_PERIOD_S:
+            return self.hop
+        newest = work - self._before
+        self._since_s, self._before = now_s, work
+        loop, network = newest.loop_s / passed_s, self.hop * newest.network_s / passed_s
+        hop = min(self.hop + self._is_behind, MAX_HOP)
+        self.hop = max(hop, _shortest_hop(loop, network, MAX_LOAD))
+        needed = self.hop if self._is_behind else _shortest_hop(loop, network, RESTORE_LOAD)
+        self._is_behind = False
+        self._needed = max(self._needed, needed)
+        if needed >= self.hop:
+            self._restored_s, self._needed = now_s, 1
+        elif now_s - self._restored_s >= RESTORE_AFTER_S:
+            self.hop, self._restored_s, self._needed = self._needed, now_s, 1
+        return self.hop
+
+
+def _shortest_hop(loop: float, network: float, max_load: float) -> int:
+    """Return the shortest hop with at most this load; ``network`` is the network's at hop 1."""
+    hops = range(1, MAX_HOP)
+    return next((hop for hop in hops if loop + network / hop <= max_load), MAX_HOP)
 
 
 class Overload:
@@ -37,6 +114,7 @@ class Overload:
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: on arrival
         self._late_since_s = math.inf  # when the session exceeded its limit
+        self.is_behind = False  # so that the block network should run less often
         self._light_until_s = -math.inf  # when it has been on time for a while
         self._reported_s, self._report_due_s = 0.0, -math.inf  # part of skipped_s; next report
 
@@ -69,10 +147,12 @@ class Overload:
 
         ``waiting_s`` is the duration of the audio that is queued after the oldest piece.
         """
+        self.is_behind = False
         if now_s < self._start_s:
             return False
         late_s = self._late_s(waiting_s, now_s)
         behind_s = min(waiting_s, late_s)
+        self.is_behind = behind_s > SLOW_FROM * self._max_behind_s
         if behind_s > LIGHT_FROM * self._max_behind_s:
             self._light_until_s = now_s + LIGHT_FOR_S
         if behind_s <= self._max_behind_s:

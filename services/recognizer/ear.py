@@ -20,6 +20,7 @@ v        probabilities of the kinds of voice (:class:`Voice`),    (4,)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
@@ -82,15 +83,21 @@ class Ear:
         for width in (self.state_width, self.num_features, self.num_phones):
             if not (isinstance(width, int) and 1 <= width <= _MAX_WIDTH):
                 raise ValueError(f"its network has the widths {widths}")
-        state = np.zeros(self.state_width, np.float32)
-        values = self.run(np.zeros((FRAMES_PER_POSITION, NUM_MELS), np.float32), state)
+        values = self.run(
+            np.zeros((1, FRAMES_PER_POSITION, NUM_MELS), np.float32),
+            np.zeros((1, self.state_width), np.float32),
+        )
         sizes = (self.num_features, self.num_phones, len(Voice), self.state_width)
-        check_outputs(values, [(size,) for size in sizes])
+        check_outputs(values, [(1, size) for size in sizes])
 
-    def run(self, frames: Floats, state: Floats) -> list[Floats]:
-        """Compute f, q, v and the new state from x as (2, 80) and h."""
-        inputs = {"frames": frames.reshape(1, -1), "state": state[np.newaxis]}
-        return [output[0] for output in run_session(self._session, _OUTPUTS, inputs)]
+    def run(self, frames: Floats, states: Floats) -> list[Floats]:
+        """Compute f, q, v and the new state of n positions from x as (n, 2, 80) and h as (n, -).
+
+        Other positions do not affect a position's results.
+        """
+        inputs = {"frames": frames.reshape(len(frames), -1), "state": states}
+        outputs: list[Floats] = run_session(self._session, _OUTPUTS, inputs)
+        return outputs
 
     def create_stream(self) -> EarStream:
         """Create the stream of one session."""
@@ -101,13 +108,24 @@ class EarStream:
     """The positions of one session's audio."""
 
     def __init__(self, ear: Ear) -> None:
-        self._ear = ear
-        self._state = np.zeros(ear.state_width, np.float32)
+        self.ear = ear
+        self.state = np.zeros(ear.state_width, np.float32)
 
     def accept_position(self, frames: Floats) -> HeardPosition:
         """Take the next position's frames, (2, 80)."""
-        features, phones, voice, self._state = self._ear.run(frames, self._state)
-        return HeardPosition(frames, features, phones, voice, self._state)
+        return hear_positions([self], [frames])[0]
+
+
+def hear_positions(streams: Sequence[EarStream], frames: Sequence[Floats]) -> list[HeardPosition]:
+    """Take the next position's frames, (2, 80), of several streams of one ear, in one run."""
+    states = np.stack([stream.state for stream in streams])
+    outputs = streams[0].ear.run(np.stack(frames), states)
+    positions = []
+    for stream, of_stream, *rows in zip(streams, frames, *outputs, strict=True):
+        features, phones, voice, state = (row.copy() for row in rows)  # a view keeps all rows
+        stream.state = state
+        positions.append(HeardPosition(of_stream, features, phones, voice, state))
+    return positions
 
 
 @cache

@@ -9,13 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import score_streams
+from kouxing.services.recognizer.speech_scorer import hear_streams, score_streams
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
@@ -74,9 +75,22 @@ class Recognizer:
             speech_time=speech_time,
         )
 
+    @property
+    def network_s(self) -> float:
+        """Processor time spent in the block network so far, seconds."""
+        return self.model.session.run_s if isinstance(self.model, BlockModel) else 0.0
+
     def is_ready(self, stream: SpeechStream) -> bool:
         """Return whether a stream has audio to score."""
         return any(scorer.is_ready for scorer in stream.scorers)
+
+    def hear_streams(self, streams: Sequence[SpeechStream]) -> None:
+        """Find the speech in the audio that the streams have accepted, in batches."""
+        hear_streams([scorer for stream in streams for scorer in stream.scorers])
+
+    def needs_network(self, stream: SpeechStream) -> bool:
+        """Return whether the block network runs to decode the speech in a stream's audio."""
+        return any(scorer.needs_network for scorer in stream.scorers)
 
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:
         """Decode all audio that the streams have accepted; the model scores it in batches."""

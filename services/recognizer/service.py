@@ -19,6 +19,7 @@ from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.load_numba import load_numba
+from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
@@ -27,6 +28,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
+from kouxing.shared.overload import NetworkPace, Work
 from kouxing.shared.phones.events import Progress, SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
@@ -61,6 +63,7 @@ class RecognizerService(Service):
         self._unpaced = UnpacedAudio()
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
         self._max_behind_s = config.max_behind_s
+        self._unpaced_work = Work()  # so far, in the same thread
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
         self._stalls_checked_s = time.monotonic()
@@ -83,6 +86,8 @@ class RecognizerService(Service):
         self.facts = SessionFacts(language=model.inventory.language)
         self._lip_predictor = lip_predictor or load_lip_predictor()
         self._recognizer.warm_up()
+        self._network = NetworkThread(self._recognizer, self.waker.wake)
+        self._pace = NetworkPace(self._work(), time.monotonic())
         for socket in (self._audio, self._unpaced_audio):
             self.register(socket, {AudioChunk: partial(self._on_audio, socket)})
         self.register(self._phones, {})
@@ -159,8 +164,7 @@ class RecognizerService(Service):
         """Drop the current speech; the next audio starts again."""
         flushed = self._sessions.get(session)
         if flushed is not None:
-            while flushed.audio:
-                self._decode_live([flushed])
+            self._decode_all_live([flushed])
             self._unpaced.drop(flushed, keep_end=True)
             flushed.link.forget()
             flushed.without_audio_s = 0.0  # so that the face learns of a stalled client again
@@ -205,8 +209,7 @@ class RecognizerService(Service):
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
         sessions = self._sessions.values()
-        while self._has_live_audio:
-            self._decode_live([*sessions])
+        self._decode_all_live([*sessions])
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
         while self._unpaced:
@@ -234,6 +237,7 @@ class RecognizerService(Service):
         return {
             "queued_audio_seconds": self._live_audio_s + self._unpaced.duration_s,
             "unacknowledged_messages": max(backlogs, default=0),
+            "network_hop": self._pace.hop,
             "light_sessions": sum(session.stream.is_light for session in self._sessions.values()),
         }
 
@@ -281,7 +285,7 @@ class RecognizerService(Service):
                 session.end = message
                 if not session.start.paced:
                     self._unpaced.append(session, None)
-                elif not session.audio:
+                elif not session.is_decoding:
                     self._finish(session)
 
     def _accept_chunk(self, session: RecognizerSession, message: AudioChunk, sender: Peer) -> None:
@@ -304,7 +308,8 @@ class RecognizerService(Service):
 
     @property
     def _has_live_audio(self) -> bool:
-        return any(session.audio for session in self._sessions.values())
+        sessions = self._sessions.values()
+        return any(session.audio and not session.is_scoring for session in sessions)
 
     @property
     def _live_audio_s(self) -> float:
@@ -324,26 +329,46 @@ class RecognizerService(Service):
                 return
             self.handle_messages(self._audio)
 
+    def _decode_all_live(self, sessions: Sequence[RecognizerSession]) -> None:
+        """Decode all queued audio of live sessions."""
+        while any(session.is_decoding for session in sessions):
+            self._network.wait()
+            self._decode_live(sessions)
+
     def _decode_live(self, sessions: Sequence[RecognizerSession]) -> None:
-        """Decode a part of the queued audio of live sessions; skip audio that is too old."""
-        sessions = [session for session in sessions if session.audio]
+        """Decode a part of the queued audio of live sessions; skip audio that is too old.
+
+        The thread of the block network continues with sessions that need the network. Until then,
+        their further audio waits.
+        """
+        if decoded := self._network.take_decoded():
+            self._send_decoded(decoded)
+        sessions = [session for session in sessions if session.audio and not session.is_scoring]
         if not sessions:
             return
         now_s = time.monotonic()
         part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / len(sessions)))
+        is_behind = any(session.audio.overload.is_behind for session in sessions)
+        work = self._work() - self._unpaced_work
+        hop = self._pace.update(work, now_s, is_behind=is_behind)
         for session in sessions:
-            session.accept_waveform(part_s, now_s)
-        self._decode(sessions)
-        for session in sessions:
-            has_moved = self._sessions.get(session.name) is not session
-            if session.end is not None and not session.audio and not has_moved:
-                self._finish(session)
+            session.accept_waveform(part_s, now_s, hop)
+        self._recognizer.hear_streams([session.stream for session in sessions])
+        due = [one for one in sessions if self._recognizer.needs_network(one.stream)]
+        self._network.add(due)
+        self._decode([session for session in sessions if not session.is_scoring])
         self.send_heartbeat_if_due()
 
+    def _work(self) -> Work:
+        return Work(time.thread_time(), self._recognizer.network_s)
+
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
-        """Decode the accepted audio of some sessions; the network scores it together."""
-        started_s = time.perf_counter()
+        """Decode the accepted audio of some sessions."""
         self._recognizer.decode_streams([session.stream for session in sessions])
+        self._send_decoded(sessions)
+
+    def _send_decoded(self, sessions: Sequence[RecognizerSession]) -> None:
+        """Send the results of decoded sessions; finish those whose audio ends."""
         self.resync_with_control()  # after a stall, other recognizers may serve the sessions
         for session in sessions:
             if self._sessions.get(session.name) is not session:
@@ -351,7 +376,11 @@ class RecognizerService(Service):
             self._send_results(session)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps_counted)
             session.num_gaps_counted = session.stream.num_gaps
-        self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
+            if not session.start.paced:
+                continue
+            self.metrics.observe("chunk_ms", 1e3 * (time.monotonic() - session.accepted_s))
+            if session.end is not None and not session.is_decoding:
+                self._finish(session)
 
     @property
     def _max_unpaced_s(self) -> float:
@@ -369,6 +398,7 @@ class RecognizerService(Service):
 
     def _decode_unpaced(self) -> None:
         """Decode some unpaced audio, and finish the sessions whose audio ends."""
+        before = self._work()
         batch: dict[str, RecognizerSession] = {}
         for session, chunk in self._unpaced.take(self._max_unpaced_s):
             if chunk is not None:
@@ -382,6 +412,7 @@ class RecognizerService(Service):
         if batch:
             self._decode([*batch.values()])
         self._limit_unpaced()
+        self._unpaced_work += self._work() - before
 
     def _finish(self, session: RecognizerSession) -> None:
         if not session.is_finished:

@@ -86,6 +86,8 @@ class RecognizerSession:
             self.resumption = Resumption(to_seconds(start.media_time), silence)
         overload = Overload(max_behind_s, now_s + CATCH_UP_S if start.epoch > 1 else now_s)
         self.audio = LiveAudio(start.sample_rate_hz, overload)  # not decoded yet
+        self.is_scoring = False  # on the block network's thread
+        self.accepted_s = now_s  # when the stream last took audio
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.order = AudioOrder()
@@ -108,6 +110,11 @@ class RecognizerSession:
     def name(self) -> str:
         """The session's name."""
         return self.start.session
+
+    @property
+    def is_decoding(self) -> bool:
+        """Whether received live audio is not decoded yet."""
+        return bool(self.audio) or self.is_scoring
 
     @property
     def received_sequence(self) -> int:
@@ -161,8 +168,13 @@ class RecognizerSession:
         aligned = self.resumption.align((media_time, samples), rate_hz)
         return aligned if len(aligned[1]) else None
 
-    def accept_waveform(self, max_s: float, now_s: float) -> None:
-        """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old."""
+    def accept_waveform(self, max_s: float, now_s: float, hop: int) -> None:
+        """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old.
+
+        ``hop`` is that of the block network, in blocks.
+        """
+        self.accepted_s = now_s
+        self.stream.set_hop(hop)
         has_skipped = self.audio.skip_old(now_s)
         is_light = self.face.settings.acoustic == AcousticModel.LIGHT
         self.stream.set_light(is_light or self.audio.overload.needs_light_model(now_s))

@@ -16,10 +16,12 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Floats,
     Work,
 )
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
+from kouxing.services.recognizer.ear import EarStream, HeardPosition, hear_positions
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.speech_segmenter import (
+    Position,
     SpeechEnd,
     SpeechFrames,
     SpeechSegmenter,
@@ -54,11 +56,19 @@ ScoreEvent: TypeAlias = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class _Slice:
+    """The end of a slice of 20 ms."""
+
+    progress: Progress  # its measurement, without the traits of the voice
+
+
 class SpeechScorer:
     """Scores the speech of one session.
 
-    ``accept_waveform`` queues the audio, ``score_streams`` scores it together with other sessions'
-    audio, and ``get_events`` returns the results in order.
+    ``accept_waveform`` queues the audio. ``hear_streams`` finds the speech in it and
+    ``score_streams`` scores the speech, together with other sessions' audio. ``get_events`` returns
+    the results in order.
 
     The parameters besides the model are those of :class:`SpeechSegmenter`.
     """
@@ -71,10 +81,13 @@ class SpeechScorer:
     ) -> None:
         self._own: AcousticStream = model.create_stream()
         self._stream = self._own  # the one in use
+        self._blocks = self._own if isinstance(self._own, BlockStream) else None
         light = model.light if isinstance(model, BlockModel) else None
         self._light = light.create_stream() if light else None
         front_end = WhisperMel() if self._own.uses_ear else model.create_front_end()
         self._segmenter = SpeechSegmenter(front_end, lip_stream, start_frame)
+        # Audio that the ear has not heard, and events in order; None: the end of the audio
+        self._unheard: deque[Position | _Slice | ScoreEvent | None] = deque()
         self._needs_light = False  # whether the light model scores the next speech
         # Frames to score, and events in order. The first item is to be scored; SpeechEnd is too.
         self._queue: deque[SpeechFrames | ScoreEvent] = deque()
@@ -98,26 +111,65 @@ class SpeechScorer:
         self._light.start(self._num_unscored - len(provisional))
         self._stream = self._light
 
+    @property
+    def needs_network(self) -> bool:
+        """Whether the block network runs to score the queued audio."""
+        if self._blocks is None or self._stream is not self._blocks:
+            return False
+        frames = (item.features for item in self._queue if isinstance(item, SpeechFrames))
+        has_end = any(isinstance(item, SpeechEnd) for item in self._queue)
+        return has_end or self._blocks.is_due_after(sum(map(len, frames)))
+
+    def set_hop(self, num_blocks: int) -> None:
+        """Set the hop of the block network, if the session uses it."""
+        if self._blocks is not None:
+            self._blocks.set_hop(num_blocks)
+
     def accept_waveform(self, samples: Floats, progress: Progress | None = None) -> None:
         """Queue samples, 16 kHz mono, shape (n,), and the measurement of the slice they end."""
-        self._queue.extend(self._segmenter.accept_waveform(samples))
+        self._unheard.extend(self._segmenter.positions(samples))
         if progress is not None:
-            self._queue.append(replace(progress, **self._segmenter.traits._asdict()))
-        self._release_events()
+            self._unheard.append(_Slice(progress))
 
     def input_finished(self) -> None:
         """End the audio."""
-        self._queue.extend(self._segmenter.input_finished())
+        self._unheard.append(None)
 
     def add_event(self, event: ScoreEvent) -> None:
         """Queue an event, to be returned after the results of the audio so far."""
-        self._queue.append(event)
+        self._unheard.append(event)
+
+    def next_position(self) -> Position | None:
+        """Return the next position that the ear must process; None if there is no other."""
+        while self._unheard:
+            item = self._unheard[0]
+            if isinstance(item, Position):
+                return item
+            self._unheard.popleft()
+            if item is None:
+                self._queue.extend(self._segmenter.input_finished())
+            elif isinstance(item, _Slice):
+                traits = self._segmenter.traits._asdict()
+                self._queue.append(replace(item.progress, **traits))
+            else:
+                self._queue.append(item)
         self._release_events()
+        return None
+
+    @property
+    def ear(self) -> EarStream:
+        """The stream that processes the positions."""
+        return self._segmenter.ear
+
+    def add_heard(self, position: Position, heard: HeardPosition) -> None:
+        """Add what the ear has computed at ``next_position``."""
+        self._unheard.popleft()
+        self._queue.extend(self._segmenter.process(position, heard))
 
     @property
     def is_ready(self) -> bool:
         """Whether there is audio to score."""
-        return bool(self._queue)
+        return bool(self._queue or self._unheard)
 
     @property
     def model(self) -> AcousticModel:
@@ -158,8 +210,18 @@ class SpeechScorer:
         self._release_events()
 
 
+def hear_streams(scorers: Sequence[SpeechScorer]) -> None:
+    """Find the speech in the queued audio of several sessions, in batches."""
+    while waiting := [(one, position) for one in scorers if (position := one.next_position())]:
+        streams = [scorer.ear for scorer, _ in waiting]
+        heard = hear_positions(streams, [position.mels for _, position in waiting])
+        for (scorer, position), of_scorer in zip(waiting, heard, strict=True):
+            scorer.add_heard(position, of_scorer)
+
+
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Score the queued audio of several sessions, in one batch for each model."""
+    hear_streams(scorers)
     while ready := [scorer for scorer in scorers if scorer.is_ready]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]

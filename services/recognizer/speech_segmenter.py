@@ -56,6 +56,14 @@ class SpeechFrames:
     phones: Floats  # (n, phones), the ear's log posteriors after each frame
 
 
+@dataclass(frozen=True, slots=True)
+class Position:
+    """The input of the small ear at a position, and the front end's features."""
+
+    features: Floats  # (2, k)
+    mels: Floats  # (2, 80)
+
+
 SpeechItem: TypeAlias = SpeechStart | SpeechEnd | SpeechFrames | LipPositions
 
 
@@ -84,7 +92,7 @@ class SpeechSegmenter:
         self._mel = None if isinstance(front_end, WhisperMel) else WhisperMel()
         self._lip_stream = lip_stream
         self._start_frame = start_frame
-        self._ear = load_ear().create_stream()
+        self.ear = load_ear().create_stream()
         self._detector = VoiceActivityDetector()
         self._traits = load_voice_readout().create_stream()
         self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
@@ -101,14 +109,18 @@ class SpeechSegmenter:
 
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
         """Take samples, 16 kHz mono, shape (n,); yield what follows from them."""
+        for position in self.positions(samples):
+            yield from self.process(position, self.ear.accept_position(position.mels))
+
+    def positions(self, samples: Floats) -> Iterator[Position]:
+        """Take samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
         features = self._front_end.accept_waveform(samples)
         mels = features if self._mel is None else self._mel.accept_waveform(samples)
         self._mels = np.concatenate([self._mels, mels])
         if self._features is not None:
             features = np.concatenate([self._features, features])
         while len(self._mels) >= FRAMES_PER_POSITION:
-            position = self._ear.accept_position(self._mels[:FRAMES_PER_POSITION])
-            yield from self._process(features[:FRAMES_PER_POSITION], position)
+            yield Position(features[:FRAMES_PER_POSITION], self._mels[:FRAMES_PER_POSITION])
             self._mels = self._mels[FRAMES_PER_POSITION:]
             features = features[FRAMES_PER_POSITION:]
         self._features = features
@@ -118,8 +130,9 @@ class SpeechSegmenter:
         if self._is_speaking:
             yield self._end_speech()
 
-    def _process(self, features: Floats, position: HeardPosition) -> Iterator[SpeechItem]:
-        """Process a position: start or end speech, predict lips."""
+    def process(self, heard: Position, position: HeardPosition) -> Iterator[SpeechItem]:
+        """Start or end speech and predict lips after a position, given what the ear computed."""
+        features = heard.features
         self._num_frames += len(features)
         if self._is_speaking:
             yield _frames_of([(features, position)])

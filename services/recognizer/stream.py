@@ -54,6 +54,7 @@ class SpeechStream:
     ) -> None:
         self.num_gaps = 0  # so far
         self._needs_light_model = False
+        self._hop = 1  # of the block network, in blocks
         self._model = model
         self._rule = rule
         self._rate_hz = sample_rate_hz
@@ -80,6 +81,11 @@ class SpeechStream:
         """
         self._needs_light_model = is_light
         self._segments[-1].scorer.set_light(is_light)
+
+    def set_hop(self, num_blocks: int) -> None:
+        """Set the hop of the block network, as a number of blocks."""
+        self._hop = num_blocks
+        self._segments[-1].scorer.set_hop(num_blocks)
 
     @property
     def media_time(self) -> int:
@@ -177,6 +183,7 @@ class SpeechStream:
             self._speech_time = 0
         scorer = SpeechScorer(self._model, lip_stream, start_frame)
         scorer.set_light(self._needs_light_model)
+        scorer.set_hop(self._hop)
         return _Segment(
             media_time,
             Resampler(self._rate_hz, self._num_channels),

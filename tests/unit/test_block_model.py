@@ -61,11 +61,11 @@ def scores_of(model: BlockModel, frames: np.ndarray) -> np.ndarray:
     return np.concatenate([stream.score(frames), stream.score(None)])
 
 
-def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
+def torch_scores(frames: np.ndarray, block_length: int, right_context: int = RIGHT) -> np.ndarray:
     """Return the scores of a recording's blocks, (blocks, 2 (B + R), states)."""
     encoder, readout = networks()
     num_positions = (len(frames) + 1) // 2
-    laid = layout(num_positions, block_length)
+    laid = layout(num_positions, block_length, right_context)
     repeated = np.repeat(frames[-1:], 2 * num_positions + 1 - len(frames), axis=0)
     with torch.no_grad():
         features = encoder(torch.from_numpy(np.concatenate([frames, repeated]))[None], laid)
@@ -149,3 +149,32 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
         write_archive(path, {**arrays, **change})
         with pytest.raises(UserError, match=message):
             load_model(path)
+
+
+def test_a_longer_hop_settles_more_positions_per_run() -> None:
+    hop, right = 2 * BLOCK, LENGTH - 2 * BLOCK
+    expected = torch_scores(FRAMES, hop, right)
+    stream = blocks().create_stream()
+    stream.set_hop(2)
+    start = 0
+    for number, scores in enumerate(expected[:-2]):
+        end = 2 * (hop * number + LENGTH) + 1
+        settled = stream.score(FRAMES[start:end])
+        assert len(stream.provisional) == 2 * right
+        np.testing.assert_allclose(settled, scores[: 2 * hop], atol=0.05)
+        start = end
+
+
+def test_the_hop_may_change_at_any_time() -> None:
+    stream = blocks().create_stream()
+    rng = np.random.default_rng(0)
+    rows = []
+    for frame in FRAMES:
+        stream.set_hop(int(rng.integers(1, 4)))
+        rows.append(stream.score(frame[None]))
+    rows.append(stream.score(None))
+    assert max(map(len, rows)) == 2 * LENGTH
+    np.testing.assert_allclose(
+        np.concatenate(rows)[: 2 * BLOCK], torch_scores(FRAMES, BLOCK)[0][: 2 * BLOCK], atol=0.3
+    )
+    assert len(np.concatenate(rows)) == len(FRAMES)

@@ -103,7 +103,7 @@ def test_reports_the_acoustic_model_in_use() -> None:
         light = AcousticModel.LIGHT if number >= 8 else AcousticModel.FULL
         session.face.change(FaceSettings(acoustic=light), 0.0)
         session.audio.append((start, samples[start : start + 1600]), start / 16_000)
-        session.accept_waveform(1.0, start / 16_000)
+        session.accept_waveform(1.0, start / 16_000, hop=1)
         RECOGNIZER.decode_streams([session.stream])
         message = session.acoustic_message(session.new_results(RECOGNIZER))
         models.append(message.model if message else None)

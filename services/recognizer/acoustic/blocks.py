@@ -25,7 +25,7 @@ acoustic_scale weight of the log scores, chosen on development data   1
 Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1``. It sees the frames from
 ``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``H`` more positions are complete,
 the network runs on up to ``B + R`` positions, the newest ones. It settles the scores of the first
-positions, so that there is room for ``H`` more in the next run, and keeps their keys and values.
+positions, to make room for ``H`` more in the next run, and keeps their keys and values.
 The scores of the other positions, the right context, are provisional. ``H`` is ``B``, and on a
 busy machine a multiple of ``B``: there are fewer runs, and right contexts are shorter. When speech
 starts, the first runs have fewer positions and settle none. The last run repeats the segment's last
@@ -43,6 +43,7 @@ order. They take 1.5 MB per speaking session, in 16 bits.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
@@ -172,6 +173,7 @@ class BlockRunner:
     """A network that is ready to run; ``ValueError`` if the file has another kind."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
+        self.run_s = 0.0  # processor time spent in the network so far
         self._session = open_session(file, _KEPT)
         self.sizes = _sizes_of(self._session)
         self._names = _cache_names(self.sizes.layers)
@@ -202,7 +204,9 @@ class BlockRunner:
         for ring, name in enumerate(self._names):
             of_sessions = [block.past.rings[ring] for block in blocks]
             inputs[name] = of_sessions[0][np.newaxis] if len(blocks) == 1 else np.stack(of_sessions)
+        start_s = time.thread_time()
         log_posteriors, state, new = run_session(self._session, _OUTPUTS, inputs)
+        self.run_s += time.thread_time() - start_s
         return log_posteriors, state, new
 
 
@@ -260,10 +264,17 @@ class BlockStream(AcousticStream):
         num_positions = self._num_positions
         return num_positions >= self._num_due or (self._ended and num_positions > 0)
 
+    def is_due_after(self, num_frames: int) -> bool:
+        """Return whether the network must run after this number of further frames."""
+        return self._num_positions_after(num_frames) >= self._num_due
+
     @property
     def _num_positions(self) -> int:
         """Number of complete positions, from the next block's first on."""
-        return max(0, (len(self._frames) - 1 - _SEEN_AFTER) // FRAMES_PER_POSITION)
+        return self._num_positions_after(0)
+
+    def _num_positions_after(self, num_frames: int) -> int:
+        return max(0, (len(self._frames) + num_frames - 1 - _SEEN_AFTER) // FRAMES_PER_POSITION)
 
     def block(self) -> Block:
         """Return the block that the network must compute next."""

@@ -44,7 +44,7 @@ class NetworkModel(AcousticModel):
 
 
 def integer_inputs(num_axes: Mapping[str, int]) -> bytes:
-    """Return bytes that make integer constants of an ONNX file inputs, if they are appended to it.
+    """Return bytes to append to an ONNX file. They make integer constants inputs of the graph.
 
     ``num_axes`` has the axes of each constant, by name; each axis has length 1. Concatenated
     messages of Protocol Buffers are merged, so the bytes add inputs to the file's graph. An input

@@ -17,9 +17,10 @@ _SLICE_MS = 20.0
 _FULL_SCALE = 32768.0  # Kaldi's samples are 16-bit integers
 # Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalized cross-correlation is over 0.8
 _VOICED = -0.43
-# Kaldi's tracker keeps all its input, 250 kB a second. So there are two, and the younger one
-# replaces the older one after this number of slices.
-_REPLACE_AFTER = 40
+# Kaldi's tracker keeps all its input, 250 kB a second. So a younger one replaces it after this
+# number of slices. The younger one starts earlier, to agree with the older one.
+_REPLACE_AFTER = 80
+_START_BEFORE = 20
 
 
 class PitchTracker:
@@ -40,7 +41,7 @@ class PitchTracker:
         self._outputs.add_raw_log_pitch = True
         self._outputs.add_normalized_log_pitch = self._outputs.add_delta_pitch = False
         self._outputs.normalization_right_context = 0
-        self._trackers = [self._new_tracker() for _ in range(2)]  # the older one first
+        self._trackers = [self._new_tracker()]  # the older one first
         self._num_slices = num_before
 
     def _new_tracker(self) -> Any:
@@ -52,12 +53,14 @@ class PitchTracker:
         The pitch is that of about 10 ms before the end.
         """
         scaled = (samples * _FULL_SCALE).tolist()
+        if self._num_slices % _REPLACE_AFTER == _REPLACE_AFTER - _START_BEFORE:
+            self._trackers.append(self._new_tracker())
         for tracker in self._trackers:
             tracker.accept_waveform(MEDIA_RATE_HZ, scaled)
-        older, younger = self._trackers
         self._num_slices += 1
+        older = self._trackers[0]
         if self._num_slices % _REPLACE_AFTER == 0:
-            self._trackers = [younger, self._new_tracker()]
+            self._trackers = self._trackers[-1:]
         if older.num_frames_ready == 0:
             return 0.0
         voicing, log_pitch = older.get_frame(older.num_frames_ready - 1)
