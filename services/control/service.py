@@ -332,6 +332,13 @@ class ControlService(Service):
         record.speaking = speech.active
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
         self._lifecycle.publish(name, record.name, media_time=speech.media_time)
+        for listener in self._sessions.listeners_of(record.name):
+            listening = SetFace(
+                session=listener.name,
+                epoch=listener.epoch,
+                face=FaceSettings(listening=speech.active),
+            )
+            self._lifecycle.send_to_participants(listener, listening)
 
     def _on_service_event(self, event: Event, instance: str) -> None:
         if event.name in SERVICE_EVENTS:

@@ -55,6 +55,12 @@ class Sessions:
             raise Refusal(ErrorCode.UNKNOWN_SESSION, text)
         return record
 
+    def listeners_of(self, name: str) -> list[SessionRecord]:
+        """Return the sessions whose faces listen to a session."""
+        return [
+            record for record in self._records.values() if record.face.settings.listen_to == name
+        ]
+
     def find_owned(self, name: str, token: str) -> SessionRecord:
         """Return a session whose token is given.
 

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import math
-import re
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -25,7 +24,6 @@ MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
 PAUSE_S = 0.2  # time without a frame after which a viewer gets the face at rest
-_SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 @dataclass(slots=True)
@@ -175,7 +173,7 @@ class Viewers:
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one viewer until it disconnects."""
         chosen = request.query.get("session", "")
-        if chosen and not _SESSION_NAME.fullmatch(chosen):
+        if chosen and not wire.SESSION_NAME.fullmatch(chosen):
             raise web.HTTPBadRequest(
                 text="session must be a name of up to 64 letters, digits, '-' and '_'\n"
             )
@@ -231,12 +229,13 @@ class Viewers:
                 if viewer.shown is None and settings.expressions is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
                 self._set_face(viewer.shown[0] if viewer.shown else "", settings)
-            elif isinstance(session, str) and (not session or _SESSION_NAME.fullmatch(session)):
+            elif isinstance(session, str) and (not session or wire.SESSION_NAME.fullmatch(session)):
                 viewer.chosen = session
             else:
                 raise UserError(
                     "expected 'follow' with a session's name, 'play', 'lips', 'acoustic', "
-                    "'express', 'expressiveness' or 'feeling'"
+                    "'express', 'expressiveness', 'feeling', 'still', 'eye_contact', "
+                    "'listen_to' or 'listening'"
                 )
         except UserError as error:
             self._put(viewer, MessageKind.TEXT, wire.error_text(str(error)))

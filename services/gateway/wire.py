@@ -6,6 +6,7 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 
 import base64
 import json
+import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ REST_TYPE = 3  # payload as for FAP_TYPE: the face while no session moves it
 SHAPES_TYPE = 4  # payload: float32 weights of a shape set, for a frame
 REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at rest
 
+SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 
 
@@ -145,6 +147,15 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
         settings["expressiveness"] = check_expressiveness(amount)
     if (amount := fields.get("feeling")) is not None:
         settings["feeling"] = check_feeling(amount)
+    for name in ("still", "eye_contact", "listening"):
+        if (value := fields.get(name)) is not None:
+            if not isinstance(value, bool):
+                raise UserError(f"{name} must be true or false")
+            settings[name] = value
+    if (listen_to := fields.get("listen_to")) is not None:
+        if not isinstance(listen_to, str) or (listen_to and not SESSION_NAME.fullmatch(listen_to)):
+            raise UserError("listen_to must be the name of a session, or empty")
+        settings["listen_to"] = listen_to
     return FaceSettings(**settings) if settings else None
 
 

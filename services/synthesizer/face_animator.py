@@ -25,7 +25,7 @@ from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.services.synthesizer.modifiers.feeling import FeelingMotion
-from kouxing.services.synthesizer.modifiers.idle_motion import SpeechIdleMotion
+from kouxing.services.synthesizer.modifiers.idle_motion import Manner, SpeechIdleMotion
 from kouxing.services.synthesizer.modifiers.laughter import Laughter
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
 from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
@@ -222,6 +222,11 @@ class FaceAnimator:
     def set_feeling(self, amount: float) -> None:
         """Set the strength of the feeling in the voice on the face, 0 to 1."""
         self._feeling.amount = amount
+
+    def set_manner(self, change: Manner) -> None:
+        """Change how the face behaves while it speaks and listens; None changes nothing."""
+        if self._idle_motion is not None:
+            self._idle_motion.set_manner(change)
 
     def set_lip_model(self, lip_model: LipModel) -> None:
         """Change the lip model with a continuous transition."""

@@ -32,6 +32,8 @@ _BLINK_MEDIAN_S = 3.0
 _BLINK_LOG_SD = 0.5
 _BLINK_MIN_S = 0.6
 _LID_FALL_S, _LID_CLOSED_S, _LID_RISE_S = 0.08, 0.03, 0.16
+_BLINK_S = _LID_FALL_S + _LID_CLOSED_S + _LID_RISE_S
+_SLOW_BLINK = 1.6  # duration of a slow blink, relative to _BLINK_S
 UPPER_LID, LOWER_LID = 900.0, 150.0  # the sum slightly exceeds the open eye's 1024
 
 _FIXATION_MEAN_S = 1.4
@@ -64,20 +66,33 @@ _HEAD = span("head_pitch", "head_roll")
 class State(Enum):
     """Conversational state; it controls gaze and head motion."""
 
-    LISTENING = "listening"
+    LISTENING = "listening"  # or alone
+    ATTENDING = "attending"  # listening to someone who speaks
+    STARTING = "starting"  # the first second of one's own speech
     SPEAKING = "speaking"
+    ENDING = "ending"  # the first moment after one's own speech
     THINKING = "thinking"  # a pause within one's own speech
 
 
-_LIVELINESS = {State.LISTENING: 1.0, State.SPEAKING: 1.0, State.THINKING: 0.3}  # of the head
+_PAUSES = (State.ENDING, State.THINKING)
+_LIVELINESS_IN_PAUSES = 0.3  # of the head
 # share of the fixations on the listener
-_ON_LISTENER = {State.LISTENING: 0.8, State.SPEAKING: 0.88, State.THINKING: 0.5}
+_ON_LISTENER = {
+    State.LISTENING: 0.8,
+    State.ATTENDING: 0.95,
+    State.STARTING: 0.3,
+    State.SPEAKING: 0.88,
+    State.ENDING: 1.0,
+    State.THINKING: 0.5,
+}
 
 
 class IdleMotion:
     """Motion of eyes and head; the same seed gives the same motion. Times must not decrease."""
 
     def __init__(self, seed: int = 0) -> None:
+        self.is_still = False  # the head does not turn
+        self.has_eye_contact = False  # the eyes do not leave the viewer
         self._seed = seed
         waves, self._blink_rng, self._fixation_rng = (
             np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
@@ -94,6 +109,7 @@ class IdleMotion:
         self._time_s = 0.0
         self._state = State.LISTENING
         self._blink_s = self._draw_blink(0.0)
+        self._blink_slowness = 1.0  # relative to the usual duration
         self._gaze_from = self._gaze_to = np.zeros(2)
         self._saccade_s, self._saccade_length_s = 0.0, 0.03
         self._fixation = 0  # its number
@@ -109,7 +125,8 @@ class IdleMotion:
             self._reaction_s = min(self._reaction_s, time_s + _REACTION_S)
         elapsed_s = max(time_s - self._time_s, 0.0)
         self._time_s = time_s
-        change = _LIVELINESS[state] - self._liveliness
+        goal = _LIVELINESS_IN_PAUSES if state in _PAUSES else 1.0
+        change = (0.0 if self.is_still else goal) - self._liveliness
         self._liveliness += change * smoothing_share(elapsed_s, _STATE_S)
         angles = self._wave_rate * time_s + self._wave_phase
         head = self._liveliness * (self._wave_size * np.sin(angles)).sum(axis=1)
@@ -126,6 +143,11 @@ class IdleMotion:
         faps[_LIDS_UPPER] += lid * (UPPER_LID - faps[_LIDS_UPPER])
         faps[_LIDS_LOWER] += lid * (LOWER_LID - faps[_LIDS_LOWER])
 
+    def blink_slowly(self, time_s: float) -> None:
+        """Start a slow blink, unless the lids are moving."""
+        if time_s < self._blink_s:
+            self._blink_s, self._blink_slowness = time_s, _SLOW_BLINK
+
     def _draw_blink(self, after_s: float) -> float:
         interval_s = _BLINK_MEDIAN_S * math.exp(_BLINK_LOG_SD * self._blink_rng.standard_normal())
         return after_s + max(interval_s, _BLINK_MIN_S)
@@ -135,9 +157,9 @@ class IdleMotion:
 
     def _lid(self, time_s: float) -> float:
         """Return how far the lids are closed, 0 to 1."""
-        while time_s > self._blink_s + _LID_FALL_S + _LID_CLOSED_S + _LID_RISE_S:
-            self._blink_s = self._draw_blink(self._blink_s)
-        since_s = time_s - self._blink_s
+        while time_s > self._blink_s + self._blink_slowness * _BLINK_S:
+            self._blink_s, self._blink_slowness = self._draw_blink(self._blink_s), 1.0
+        since_s = (time_s - self._blink_s) / self._blink_slowness
         if since_s < _LID_FALL_S + _LID_CLOSED_S:
             return smooth_step(since_s / _LID_FALL_S)
         return 1.0 - smooth_step((since_s - _LID_FALL_S - _LID_CLOSED_S) / _LID_RISE_S)
@@ -167,7 +189,8 @@ class IdleMotion:
     def _target(self) -> NDArray[np.float64]:
         """Return the target of the current fixation in the current state."""
         rng = np.random.default_rng([self._seed, self._fixation])
-        is_on_listener = rng.random() < _ON_LISTENER[self._state]
+        share = 1.0 if self.has_eye_contact else _ON_LISTENER[self._state]
+        is_on_listener = rng.random() < share
         sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
         return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * _DEGREE
 

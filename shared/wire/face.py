@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, ClassVar
 
 from msgspec import Meta
@@ -14,7 +14,7 @@ from kouxing.shared.face.expressions import (
     MIN_EXPRESSIVENESS,
 )
 from kouxing.shared.face.shape_names import MAX_SHAPES
-from kouxing.shared.wire.message import FapMask, FapValues, Message, Name
+from kouxing.shared.wire.message import FapMask, FapValues, Message, Name, SessionName
 
 Strength = Annotated[float, Meta(ge=0, le=1)]
 ExpressionMap = Annotated[dict[Name, Strength], Meta(max_length=32)]
@@ -32,6 +32,10 @@ class FaceSettings:
         None  # scales the mouth's motion; 1: as the lip model moves it
     )
     feeling: Strength | None = None  # of the voice's feeling on the face; 0: off
+    still: bool | None = None  # the head and the brows do not move
+    eye_contact: bool | None = None  # the eyes do not leave the viewer
+    listen_to: SessionName | None = None  # whose speech the face listens to; "": nobody's
+    listening: bool | None = None  # someone else speaks; control sets it with listen_to
     expressions: ExpressionMap | None = None  # strengths by name; {}: fade those shown now
     hold_s: Annotated[float, Meta(ge=0, le=MAX_HOLD_S)] = DEFAULT_HOLD_S  # until they fade
     shapes: ShapeSets | None = None  # also publish these sets of shapes
@@ -40,14 +44,19 @@ class FaceSettings:
         """Return these settings after a change."""
         shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])
         expressed = self if change.expressions is None else change
-        return FaceSettings(
-            lip_model=change.lip_model or self.lip_model,
-            acoustic=change.acoustic or self.acoustic,
-            expressiveness=change.expressiveness or self.expressiveness,
-            feeling=self.feeling if change.feeling is None else change.feeling,
-            expressions=expressed.expressions,
-            hold_s=expressed.hold_s,
-            shapes=list(shapes) or None,
+        changed = {
+            name: value
+            for field in fields(change)
+            if (value := getattr(change, name := field.name)) is not None
+        }
+        return replace(
+            self,
+            **changed
+            | {
+                "expressions": expressed.expressions,
+                "hold_s": expressed.hold_s,
+                "shapes": list(shapes) or None,
+            },
         )
 
     def after(self, elapsed_s: float) -> FaceSettings:

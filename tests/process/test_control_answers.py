@@ -14,7 +14,9 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.keys import add_key, read_key, revoke_key, user_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
+from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage
 
 
@@ -157,3 +159,25 @@ def test_a_connection_with_a_stolen_routing_id_gets_no_old_answer(stage: Stage) 
     assert isinstance(stage.open(stage.stranger(key), "mine"), SessionOpened)
     stolen = stage.open(stage.stranger(key), "mine")
     assert getattr(stolen, "code", "") == "session-exists"
+
+
+@pytest.mark.parametrize("stage", [True], indirect=True)
+def test_a_face_learns_when_the_session_that_it_listens_to_speaks(stage: Stage) -> None:
+    client = stage.stranger(stage.control.key and user_key())
+    stage.open(client, "speaker")
+    stage.open(client, "listener", "2")
+    client.send_multipart(
+        encode(SetFace(session="listener", face=FaceSettings(listen_to="speaker"), request="3"))
+    )
+    stage.step_until(lambda: client.poll(0))
+    recognizer, synthesizer = stage.services
+    for active in (True, False):
+        recognizer.send(Speech(session="speaker", epoch=1, sequence=1, active=active))
+    heard: list[bool | None] = []
+    for _ in range(1000):
+        stage.control.step(0.01)
+        received = [each.message for each in synthesizer.receive()]
+        heard += [message.face.listening for message in received if isinstance(message, SetFace)]
+        if len(heard) == 2:
+            break
+    assert heard == [True, False]

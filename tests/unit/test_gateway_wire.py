@@ -1,6 +1,7 @@
 """The messages of browsers are checked field by field."""
 
 import json
+from typing import Any
 
 import pytest
 
@@ -62,6 +63,8 @@ def test_parses_face_settings() -> None:
     assert wire.parse_face_settings({"follow": "one"}) is None
     settings = wire.parse_face_settings({"express": {"joy": 1}, "hold_s": 7, "expressiveness": 2})
     assert settings == FaceSettings(expressions={"joy": 1}, hold_s=7, expressiveness=2)
+    manner: dict[str, Any] = {"feeling": 0, "still": True, "eye_contact": False, "listen_to": "bob"}
+    assert wire.parse_face_settings(manner) == FaceSettings(**manner)
     assert wire.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
     assert wire.parse_face_settings({"lips": "learnt"}) == FaceSettings(lip_model="learnt")
     assert wire.parse_face_settings({"acoustic": "light"}) == FaceSettings(acoustic="light")
@@ -75,6 +78,9 @@ def test_parses_face_settings() -> None:
         ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
         ({"express": "joy"}, "names to strengths"),
         ({"expressiveness": 3}, "expressiveness is 3"),
+        ({"feeling": -1}, "feeling is -1; give 0 to 1"),
+        ({"still": "yes"}, "still must be true or false"),
+        ({"listen_to": "a b"}, "listen_to must be the name of a session"),
         ({"acoustic": "heavy"}, "acoustic must be full or light"),
     ],
 )

@@ -6,12 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.modifiers.idle_motion import Manner
 from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
 from kouxing.shared.phones.events import Progress, SpeechChange
 from tests.lips import make_face
 
 FRAME_S = 0.02
 BROW = FAP_NUMBER["raise_l_m_eyebrow"] - 1
+LID, GAZE = (FAP_NUMBER[name] - 1 for name in ("close_t_l_eyelid", "yaw_l_eyeball"))
+YAW = FAP_NUMBER["head_yaw"] - 1
 PITCH, ROLL = FAP_NUMBER["head_pitch"] - 1, FAP_NUMBER["head_roll"] - 1
 QUIET_DB, SILENT_DB, STRESS_DB, STRONG_DB = -26.0, -80.0, -17.0, -8.0
 SEEDS = range(1, 7)
@@ -96,3 +99,56 @@ def test_does_not_move_lips_and_is_independent_of_chunks() -> None:
     assert one[:, BROW].any() or one[:, PITCH].any()
     assert not one[:, np.array(MOUTH_FAPS) - 1].any()
     assert not show(make_face(), sound).any()  # seed 0: off
+
+
+def gaze_deg(faps: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the horizontal gaze in space."""
+    gaze: NDArray[np.float32] = (faps[:, GAZE] + faps[:, YAW]) / DEGREE
+    return gaze
+
+
+def test_the_gaze_leaves_the_viewer_when_speech_starts_and_returns_at_its_end() -> None:
+    speech = levels((3.0, QUIET_DB), (0.8, SILENT_DB))
+    away = np.mean(
+        [np.abs(gaze_deg(show(make_face(idle_motion_seed=s), speech))) > 1.5 for s in range(1, 31)],
+        axis=0,
+    )
+    start, end = away[20:45].mean(), away[165:185].mean()
+    assert start > 0.3
+    assert end < 0.1
+
+
+def test_a_listener_looks_at_the_viewer_and_nods_and_blinks_slowly_in_pauses() -> None:
+    faps = []
+    for seed in SEEDS:
+        face = make_face(idle_motion_seed=seed)
+        face.set_manner(Manner(listening=True))
+        heard = face.relax(500)
+        face.set_manner(Manner(listening=False))
+        faps.append(np.array([values for _, values in heard + face.relax(50)]))
+    away = np.abs([gaze_deg(run[:500]) for run in faps]) > 1.5
+    assert away.mean() < 0.15
+    for run in faps:
+        assert run[500:, PITCH].max() - run[500, PITCH] > DEGREE / 2  # a nod
+        assert np.count_nonzero(run[500:525, LID] > 450.0) >= 8  # a slow blink
+
+
+def test_a_still_face_with_eye_contact_only_breathes_and_blinks() -> None:
+    face = make_face(idle_motion_seed=3)
+    face.set_manner(Manner(still=True, eye_contact=True))
+    faps = show(face, STRONG * 5)[150:]
+    assert not faps[:, BROW].any()
+    assert np.abs(faps[:, [YAW, ROLL]]).max() < 0.15 * DEGREE
+    assert 0.2 * DEGREE < np.ptp(faps[:, PITCH]) < DEGREE  # breath
+    assert np.abs(gaze_deg(faps)).max() < 2.0
+    assert faps[:, LID].max() > 800.0
+
+
+def test_no_loop_can_be_seen_in_the_motion_of_a_minute() -> None:
+    face = make_face(idle_motion_seed=3)
+    faps = np.array([values for _, values in face.relax(3000)])
+    for motion in (faps[:, YAW], faps[:, LID], gaze_deg(faps)):
+        centered = motion - motion.mean()
+        for lag in range(250, 1500, 25):
+            assert np.corrcoef(centered[:-lag], centered[lag:])[0, 1] < 0.8
+        assert np.ptp(motion[-250:]) > 0.0  # never frozen

@@ -36,6 +36,14 @@ class FaceSettings(TypedDict, total=False):
     """scale of the mouth's motion, 0.5 to 2"""
     feeling: float
     """strength of the voice's feeling on the face, 0 to 1"""
+    still: bool
+    """whether head and brows stay still"""
+    eye_contact: bool
+    """whether the eyes stay on the viewer"""
+    listen_to: str
+    """session to listen to: the face looks at the viewer and nods in pauses; ``""``: none"""
+    listening: bool
+    """whether someone else speaks, if no session carries that voice"""
     shapes: Sequence[str]
     """sets of blend shapes to publish as well"""
 

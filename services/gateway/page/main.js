@@ -8,7 +8,7 @@ import { MouthLesson } from "./learn-mouth.js";
 import { LevelMeter } from "./level.js";
 import { Player } from "./player.js";
 import { SendersPanel } from "./senders-panel.js";
-import { AMOUNTS, Settings } from "./settings.js";
+import { MOTIONS, Settings } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
@@ -28,8 +28,7 @@ const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {
   heads: (name) => stage.load(name),
   lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLipModel(name)),
-  expressiveness: sendAmounts,
-  feeling: sendAmounts,
+  motion: sendMotions,
   express: (strengths) => socket.send({ express: strengths }),
 });
 const caption = new Caption(preferences);
@@ -47,7 +46,7 @@ const speech = new SpeechControls(sound, {
   session(name) {
     if (name !== null) {
       showLipModel();
-      if (name === gateway.session) sendAmounts(); // the viewer was notified first
+      if (name === gateway.session) sendMotions(); // the viewer was notified first
     }
     socket.follow(name ?? "");
   },
@@ -117,7 +116,7 @@ function showSession(message) {
     caption.reset();
     meter.reset();
   }
-  if (isOwnSession()) sendAmounts();
+  if (isOwnSession()) sendMotions();
   showLipModel();
   statusBar.show();
 }
@@ -149,8 +148,8 @@ function chooseAcousticModel(acoustic) {
   element("full-model").hidden = acoustic === "full";
 }
 
-function sendAmounts() {
-  const chosen = AMOUNTS.filter((id) => preferences.get(id) !== null);
+function sendMotions() {
+  const chosen = MOTIONS.filter((id) => preferences.get(id) !== null);
   if (!chosen.length || gateway.session === null) return;
   socket.send(Object.fromEntries(chosen.map((id) => [id, preferences.get(id)])));
 }

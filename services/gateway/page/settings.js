@@ -5,7 +5,8 @@ import { languageFor, say, setLanguage } from "./language.js";
 import { TEXTS } from "./texts.js";
 
 const STRENGTH = 0.8; // of an expression
-export const AMOUNTS = ["expressiveness", "feeling"];
+const AMOUNTS = ["expressiveness", "feeling"];
+export const MOTIONS = [...AMOUNTS, "still", "eye_contact"]; // names of face settings
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
 
 export class Settings {
@@ -15,8 +16,7 @@ export class Settings {
   /**
    * @param preferences Preferences
    * @param offers { heads: names, lips: { name: title by language } } of the gateway
-   * @param handlers { heads(name), lips(name), expressiveness(amount), feeling(amount),
-   *   express(strengths by name) },
+   * @param handlers { heads(name), lips(name), motion(), express(strengths by name) },
    *   called when the user changes a setting
    */
   constructor(preferences, offers, handlers) {
@@ -28,7 +28,11 @@ export class Settings {
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);
     this.#bind("lips", handlers.lips);
-    for (const id of AMOUNTS) this.#bindAmount(id, handlers[id]);
+    for (const id of MOTIONS) this.#bind(id, handlers.motion);
+    for (const id of AMOUNTS) {
+      element(id).addEventListener("input", () => showAmount(id));
+      showAmount(id);
+    }
     this.#bind("language", () => this.#applyLanguage());
     element("expressions").onclick = ({ target }) => {
       if (target.value) handlers.express({ [target.value]: STRENGTH });
@@ -44,20 +48,13 @@ export class Settings {
   #bind(id, onChange) {
     const input = element(id);
     const [initial, stored] = [input.value, this.#preferences.get(id)];
-    if (stored !== null) input.value = stored;
+    if (stored !== null) input[input.type === "checkbox" ? "checked" : "value"] = stored;
     if (input.selectedIndex === -1) input.value = initial;
     input.addEventListener("input", () => {
-      const value = input.type === "range" ? input.valueAsNumber : input.value;
+      const value = { range: input.valueAsNumber, checkbox: input.checked }[input.type] ?? input.value;
       this.#preferences.set(id, value);
       onChange(value);
     });
-  }
-
-  /** Connect a slider as above, and show its value. */
-  #bindAmount(id, onChange) {
-    this.#bind(id, onChange);
-    element(id).addEventListener("input", () => showAmount(id));
-    showAmount(id);
   }
 
   #applyLanguage() {

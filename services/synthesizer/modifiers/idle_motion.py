@@ -13,6 +13,10 @@ pitch              a high pitch lifts the head
 pause              the head holds still
 =================  ==================================================================
 
+The gaze leaves the viewer when the speech starts, and returns at its end (Kendon 1967). A face that
+listens to someone else looks at the viewer. When the other speaker pauses, it nods and blinks for
+0.4 s (Hömke et al. 2018, "Eye blinks are perceived as communicative signals").
+
 Sources: Graf et al. 2002, "Visual prosody" (nods and brows at pitch accents and ends of phrases);
 Ambrazaitis et al. 2015 (newsreaders nod on 23 % of the words, and raise the brows on 7 %); Swerts &
 Krahmer 2010 (accented words have more of both); Munhall et al. 2004 (the head follows pitch and
@@ -21,6 +25,7 @@ smooths each movement. Lips are not moved. The motion depends only on the seed a
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +40,8 @@ _NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # prominence of syllables with these movem
 _MAX_EXCESS = 1.2  # prominence above that of the weakest nod, of the largest one
 _MIN_NOD_INTERVAL_S, _MIN_BROW_INTERVAL_S = 1.0, 2.5
 _MIN_SIZE = 0.5  # of the weakest nod, relative to the largest one
-_THINKING_S = (0.7, 2.5)  # duration of silence
+_STARTING_S = 0.9  # duration of speech after a pause
+_ENDING_S, _THINKING_S, _LISTENING_S = 0.2, 0.9, 2.5  # duration of silence
 _NOD_HOLD_S, _BROW_HOLD_S, _TILT_HOLD_S, _TURN_HOLD_S = 0.14, 0.22, 0.6, 0.7
 _FILTER_S, _SLOW_S = 0.08, 0.2  # time constant of each filter pole
 _BROW = {  # FAP units of a full movement
@@ -54,6 +60,15 @@ _HEAD = span("head_pitch", "head_roll")
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manner:
+    """How a face behaves while it speaks and listens. None changes nothing."""
+
+    still: bool | None = None  # the head and the brows do not move
+    eye_contact: bool | None = None  # the eyes do not leave the viewer
+    listening: bool | None = None  # someone else speaks
+
+
 class SpeechIdleMotion:
     """Idle motion with movements that accompany speech; seed and sound define the motion."""
 
@@ -62,20 +77,41 @@ class SpeechIdleMotion:
         self._seed = seed
         self._prosody = ProsodyTracker()
         self._silence_s = math.inf  # at the last frame
+        self._start_s = -math.inf  # of the speech
         self._nod_s = self._brow_s = -math.inf  # times of the last movements
+        self._is_still = self._is_listening = self._has_heard_pause = False
         self._brow, self._nod = _Movement(_FILTER_S), _Movement(_FILTER_S)
         self._tilt, self._turn = _Movement(_SLOW_S), _Movement(_SLOW_S)
         self._lift = TwoPoleFilter(0.0)
+
+    def set_manner(self, change: Manner) -> None:
+        """Change the behavior."""
+        if change.still is not None:
+            self._is_still = self._idle.is_still = change.still
+        if change.eye_contact is not None:
+            self._idle.has_eye_contact = change.eye_contact
+        if change.listening is not None:
+            self._has_heard_pause |= self._is_listening and not change.listening
+            self._is_listening = change.listening
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the motion to a frame, FAPs (68,), in place."""
         now_s, step_s = context.elapsed_s, context.step_s
         prosody = self._prosody.update(context)
-        self._start_movements(prosody, now_s)
-        self._idle.apply(faps, now_s, _state_after(prosody.silence_s))
+        starts = prosody.silence_s == 0.0 and self._silence_s > _THINKING_S
+        self._silence_s = prosody.silence_s
+        if starts:
+            self._start_s = now_s
+        if not self._is_still:
+            self._start_movements(prosody, now_s, starts=starts)
+        if self._has_heard_pause:
+            self._has_heard_pause = False
+            self._idle.blink_slowly(now_s)
+        self._idle.apply(faps, now_s, self._state(prosody.silence_s, now_s))
         faps[_BROWS] += np.float32(self._brow.at(now_s, step_s)) * _BROW_UNITS
         is_voiced = prosody.silence_s < step_s
-        lift = self._lift.step(prosody.raised if is_voiced else 0.0, step_s, _SLOW_S)
+        is_lifted = is_voiced and not self._is_still
+        lift = self._lift.step(prosody.raised if is_lifted else 0.0, step_s, _SLOW_S)
         pitch = self._nod.at(now_s, step_s) - _LIFT_DEG * lift
         yaw, roll = self._turn.at(now_s, step_s), self._tilt.at(now_s, step_s)
         faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(_DEGREE)
@@ -83,9 +119,10 @@ class SpeechIdleMotion:
         faps[EYES_PITCH] -= np.float32(pitch * _DEGREE)
         faps[EYES_YAW] -= np.float32(yaw * _DEGREE)
 
-    def _start_movements(self, prosody: Prosody, now_s: float) -> None:
+    def _start_movements(self, prosody: Prosody, now_s: float, *, starts: bool) -> None:
         may_nod = now_s - self._nod_s > _MIN_NOD_INTERVAL_S
-        if may_nod and (prosody.stress > _NOD_STRESS or prosody.has_ended):
+        is_accent = prosody.stress > _NOD_STRESS
+        if may_nod and (is_accent or prosody.has_ended or self._has_heard_pause):
             self._nod_s = now_s
             excess = min(max(prosody.stress - _NOD_STRESS, 0.0) / _MAX_EXCESS, 1.0)
             size = _NOD_DEG * (_MIN_SIZE + (1.0 - _MIN_SIZE) * excess)
@@ -96,19 +133,21 @@ class SpeechIdleMotion:
         if prosody.is_question:
             self._tilt.start(_TILT_DEG * self._side(now_s), now_s + _TILT_HOLD_S)
             self._brow.start(1.0, now_s + _TILT_HOLD_S)
-        if prosody.silence_s == 0.0 and self._silence_s > _THINKING_S[0]:
+        if starts:
             self._turn.start(_TURN_DEG * self._side(now_s), now_s + _TURN_HOLD_S)
-        self._silence_s = prosody.silence_s
+
+    def _state(self, silence_s: float, now_s: float) -> State:
+        if silence_s < _ENDING_S:
+            return State.STARTING if now_s - self._start_s < _STARTING_S else State.SPEAKING
+        if silence_s < _THINKING_S:
+            return State.ENDING
+        if self._is_listening:
+            return State.ATTENDING
+        return State.THINKING if silence_s < _LISTENING_S else State.LISTENING
 
     def _side(self, now_s: float) -> float:
         """Return the direction of a movement, 1 or -1; it depends only on seed and time."""
         return float(np.random.default_rng([self._seed, round(now_s / _TURN_S)]).choice([-1, 1]))
-
-
-def _state_after(silence_s: float) -> State:
-    if silence_s < _THINKING_S[0]:
-        return State.SPEAKING
-    return State.THINKING if silence_s < _THINKING_S[1] else State.LISTENING
 
 
 class _Movement:
