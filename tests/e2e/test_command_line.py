@@ -1,6 +1,5 @@
 """The command line with good and bad files, with and without running services."""
 
-import csv
 import json
 import os
 import re
@@ -23,7 +22,7 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.following import Stream, samples_of_file
 from tests.receivers import read_osc
-from tests.system import DEMO, LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
+from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
 
 SENTENCE = VOWELS_FILE
 
@@ -115,44 +114,6 @@ def test_listen_without_a_name_follows_the_newest_session(system: System) -> Non
         listener = listening(system.control, "--show", "phones", says="following session newer")
         newer.close()
         assert output_of(listener)[1] == "session newer ended: 0 phones\n"
-
-
-def num_phones(result: tuple[object, str, str]) -> int:
-    match = re.search(r"(\d+) phones", result[2])
-    assert match, result
-    return int(match[1])
-
-
-def test_all_outputs_have_the_same_phones(system: System, command: Command, tmp_path: Path) -> None:
-    path, table = DEMO / "fast-female.wav", tmp_path / "phones.csv"
-    with (
-        Client(system.control) as client,
-        client.open_session(encoding="f32le", paced=False) as session,
-    ):
-        options, says = (session.name, "--show", "phones"), f"following session {session.name}"
-        listener = listening(system.control, *options, says=says)
-        sent = Stream(session)
-        sent.send(samples_of_file(path))
-        sent.finish()
-    spoken = [phone for phone in sent.phones if phone.is_spoken]
-    printed = [line.split()[-1] for line in output_of(listener)[0].splitlines()]
-    assert printed == [phone.symbol for phone in spoken]
-    assert all(phone.duration > 0 for phone in spoken)
-    starts = [phone.media_time for phone in spoken]
-    assert starts == sorted(starts)
-    options, says = ("awaited", "--show", "phones"), "waiting for session awaited"
-    listener = listening(system.control, *options, says=says)
-    said = command("speak", path, "--fast", "--session", "awaited")
-    assert len(output_of(listener)[0].splitlines()) == len(spoken), "it was there in time"
-    live = command("render", path, tmp_path / "live.csv", "--live")
-    assert num_phones(said) == num_phones(live) == len(spoken)
-
-    command("phones", path, "-o", table)
-    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
-    assert num_phones(command("render", path, tmp_path / "whole.csv")) == len(rows)
-    assert all(float(row["duration_s"]) > 0 for row in rows)
-    onsets_s = [float(row["onset_s"]) for row in rows]
-    assert onsets_s == sorted(onsets_s)
 
 
 def test_send_sends_the_face_at_rest_and_every_session_of_a_name(

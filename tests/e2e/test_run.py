@@ -126,11 +126,19 @@ def interrupt(arguments: list[str], folder: Path, is_due: Callable[[], object]) 
     return process.returncode, log
 
 
-def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stage", ["start", "sample"])
+def test_ctrl_c_stops_run_at_any_stage(tmp_path: Path, stage: str) -> None:
+    def is_due() -> bool:
+        out = tmp_path / "out"
+        if stage == "start":
+            control = out / "logs/control.log"
+            return control.exists() and bool(control.read_text())
+        return any(path.is_file() for path in out.glob("*"))  # the video of the sample
+
     arguments = ["run", "--no-browser", "--port", "0", "--play", str(SENTENCE)]
-    control = tmp_path / "out/logs/control.log"
-    status, log = interrupt(arguments, tmp_path, lambda: control.exists() and control.read_text())
-    assert (status, "stopping" in log) == (0, True)
+    status, log = interrupt(arguments, tmp_path, is_due)
+    assert status == 0
+    assert "stopping" in log or "the video ends early" in log
 
 
 def test_an_interrupted_render_leaves_no_file(tmp_path: Path) -> None:

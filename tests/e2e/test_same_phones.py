@@ -70,6 +70,8 @@ def test_phones_and_render_return_them(
             assert row[1] == phone.symbol
             times = (phone.onset_s, phone.duration_s, phone.confidence)
             np.testing.assert_allclose([*map(float, row[2:5])], times, atol=5.1e-4)
+    live = kouxing("render", recordings[0], tmp_path / "live.csv", "--live")
+    assert f", {len(spoken(expected[recordings[0].name]))} phones" in live.stderr
     options = ("--size", "64x64", "--rate", "1", "-o", tmp_path)
     rendered = kouxing("render", *recordings, *options)
     for path in recordings:
