@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
+from kouxing.services.senders.camera import CameraInput, open_camera
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 
@@ -47,13 +48,23 @@ class DatagramConnection(Connection):
         super().__init__(target)
         self._socket: socket.socket | None = None
         self._refused_s = -_REFUSED_S
+        self._newest: FaceFrame | None = None
+        self._camera: tuple[asyncio.DatagramTransport, CameraInput] | None = None
 
     @abstractmethod
     def encode(self, frame: FaceFrame) -> Iterable[bytes]:
         """Return the datagrams of a frame."""
 
+    def with_mouth(self, packet: bytes, frame: FaceFrame) -> tuple[Iterable[bytes], bool]:
+        """Replace the mouth in a tracker's packet, for protocols with ``camera``.
+
+        Returns the new packets, and whether they contain the mouth. Raises ``ValueError`` if the
+        packet is malformed.
+        """
+        raise NotImplementedError
+
     async def run(self) -> None:
-        """Resolve the host and open a socket; repeat after a network change."""
+        """Resolve the host and open sockets; repeat after a network change."""
         try:
             while True:
                 if self._socket is None:
@@ -62,17 +73,41 @@ class DatagramConnection(Connection):
                         self.problem = ""
                     except OSError as error:
                         self.problem = f"cannot reach {self.target.host}: {error.strerror}"
+                if self._camera is None and self.target.camera is not None:
+                    await self._open_camera(*self.target.camera)
                 await asyncio.sleep(RETRY_S)
         finally:
             self._close()
+            if self._camera is not None:
+                self._camera[0].close()
+
+    async def _open_camera(self, host: str, port: int) -> None:
+        try:
+            self._camera = await open_camera(host, port, self._forward)
+        except OSError as error:
+            self.problem = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
+
+    def _forward(self, packet: bytes) -> bool:
+        if self._newest is None:
+            return False
+        packets, has_mouth = self.with_mouth(packet, self._newest)
+        self._send(packets)
+        return has_mouth
 
     def send(self, frame: FaceFrame) -> bool:
-        """Send the datagrams of a frame; drop those that the system does not accept."""
+        """Send the datagrams of a frame, unless a tracker's packets contain its mouth."""
+        self._newest = frame
+        if self._camera is not None and self._camera[1].is_live:
+            return True
+        return self._send(self.encode(frame))
+
+    def _send(self, datagrams: Iterable[bytes]) -> bool:
+        """Send datagrams; drop those that the system does not accept."""
         if self._socket is None:
             return False
         now_s = time.monotonic()
         try:
-            for datagram in self.encode(frame):
+            for datagram in datagrams:
                 self._socket.send(datagram)
         except BlockingIOError:
             return False

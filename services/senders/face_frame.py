@@ -17,6 +17,12 @@ _LIPS = [FAP_NUMBER[name] - 1 for name in ("lower_t_midlip", "raise_b_midlip")]
 _OPEN_LIPS = 880.0  # FAP units between the lips in a wide "a"
 _NO_MOUTH = ("brow", "eye", "blink", "look", "cheekSquint", "nose")  # prefixes of shape names
 
+
+def mouth_names(shapes: str) -> list[str]:
+    """Return the names of the mouth's shapes in one of ``SHAPE_SETS``."""
+    return [name for name in SHAPE_SETS[shapes].names if not name.startswith(_NO_MOUTH)]
+
+
 Angles = tuple[float, float, float]
 
 
@@ -39,7 +45,7 @@ class FaceFrame:
             self._weights[shapes] = dict(zip(shape_set.names, values, strict=True))
         weights = self._weights[shapes]
         if is_mouth_only:
-            return {name: weights[name] for name in weights if not name.startswith(_NO_MOUTH)}
+            return {name: weights[name] for name in mouth_names(shapes)}
         return weights
 
     @property

@@ -43,7 +43,7 @@ class LiveLinkConnection(DatagramConnection):
     """Sends to Unreal Engine."""
 
     default_port = 11111
-    options: ClassVar[Options] = {**COMMON_OPTIONS, "name": ()}
+    options: ClassVar[Options] = {**COMMON_OPTIONS, "name": (), "camera": ()}
 
     def encode(self, frame: FaceFrame) -> Iterable[bytes]:
         """Return the datagram of a frame, with the time of day as its time code."""
@@ -62,3 +62,33 @@ class LiveLinkConnection(DatagramConnection):
         time_code = (int(number), sub_frame, FRAME_RATE_HZ, 1)
         ids = (len(_DEVICE), _DEVICE, len(name), name)
         return struct.pack(layout, VERSION, *ids, *time_code, len(values), *values)
+
+    def with_mouth(self, packet: bytes, frame: FaceFrame) -> tuple[Iterable[bytes], bool]:
+        """Replace the mouth's values; rotations and names stay. Raises ``ValueError``."""
+        start = _first_value(packet)
+        changed = bytearray(packet)
+        for name, value in frame.weights("arkit", is_mouth_only=True).items():
+            struct.pack_into(">f", changed, start + 4 * ORDER.index(name), value)
+        return [bytes(changed)], True
+
+
+def _first_value(packet: bytes) -> int:
+    """Return where the values of a packet start.
+
+    Raises ``ValueError`` if the packet is malformed.
+    """
+    try:
+        start = 1
+        for _ in ("device", "subject"):
+            (length,) = struct.unpack_from(">i", packet, start)
+            if not 0 <= length <= len(packet):
+                raise ValueError("a name is longer than its packet")
+            start += 4 + length
+        start += struct.calcsize(">ifii")
+        num_values = packet[start]
+    except (struct.error, IndexError):
+        raise ValueError("the packet is too short") from None
+    is_complete = len(packet) == start + 1 + 4 * num_values
+    if packet[0] != VERSION or num_values < len(ORDER) or not is_complete:
+        raise ValueError("not a packet of Live Link Face")
+    return start + 1

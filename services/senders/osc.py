@@ -23,6 +23,7 @@ from pythonosc.osc_message_builder import build_msg
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
 from kouxing.services.senders.face_frame import FaceFrame
 
+_MAX_DEPTH = 4  # of bundles in received packets
 MAX_BYTES = 1500 - 28  # payload of an Ethernet frame without the IP and UDP headers
 _HEADER = b"#bundle\0" + struct.pack(">Q", 1)  # 1: immediately
 
@@ -60,6 +61,47 @@ def _message_start(address: str, texts: tuple[str, ...], kinds: str) -> bytes:
     numbers = [0 if kind == "i" else 0.0 for kind in kinds]
     whole = build_msg(address, [*texts, *numbers]).dgram
     return whole[: len(whole) - 4 * len(numbers)]
+
+
+def split(packet: bytes, depth: int = 0) -> Iterator[bytes]:
+    """Yield the messages of a packet, also of nested bundles, as bytes.
+
+    Raises ``ValueError`` if the packet is malformed.
+    """
+    if not packet.startswith(b"#bundle\0"):
+        if not packet.startswith(b"/") or len(packet) % 4:
+            raise ValueError("not an OSC message")
+        yield packet
+        return
+    if depth > _MAX_DEPTH:
+        raise ValueError("bundles are nested too deeply")
+    start = len(_HEADER)
+    while start < len(packet):
+        end = start + 4 + int.from_bytes(packet[start : start + 4], "big")
+        if not start + 4 < end <= len(packet):
+            raise ValueError("an element is longer than its bundle")
+        yield from split(packet[start + 4 : end], depth + 1)
+        start = end
+
+
+def address_of(content: bytes) -> str:
+    """Return the address of a message; ``ValueError`` if it is malformed."""
+    return _text_at(content, 0)[0]
+
+
+def first_text(content: bytes) -> str:
+    """Return the first argument of a message, a text; ``ValueError`` if it is not one."""
+    _, start = _text_at(content, 0)
+    kinds, start = _text_at(content, start)
+    if not kinds.startswith(",s"):
+        raise ValueError("the first argument is not a text")
+    return _text_at(content, start)[0]
+
+
+def _text_at(content: bytes, start: int) -> tuple[str, int]:
+    """Return a text, and where the next value is: texts are padded to multiples of 4 bytes."""
+    end = content.index(b"\0", start)
+    return content[start:end].decode(), end // 4 * 4 + 4
 
 
 def bundles(messages: Iterable[bytes]) -> Iterator[bytes]:

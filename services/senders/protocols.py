@@ -5,7 +5,7 @@ from urllib.parse import parse_qsl, urlsplit
 from kouxing.services.senders.connection import Connection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
-from kouxing.services.senders.target import Target, parse_delay_s
+from kouxing.services.senders.target import Target, parse_camera, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
@@ -44,6 +44,8 @@ def parse_target(url: str) -> Target:
     options = _parse_options(url, parts.query, protocol)
     try:
         delay_s = parse_delay_s(options["delay"])
+        if camera := options.get("camera"):
+            parse_camera(camera)
     except UserError as error:
         raise UserError(f"{url}: {error}") from None
     return Target(

@@ -43,8 +43,25 @@ class Target:
 
     @property
     def is_local(self) -> bool:
-        """Whether the target is certainly on this machine."""
-        return is_loopback(self.host)
+        """Whether the target, and the tracker if any, are certainly on this machine."""
+        return is_loopback(self.host) and (self.camera is None or is_loopback(self.camera[0]))
+
+    @property
+    def camera(self) -> tuple[str, int] | None:
+        """Address and port on which a tracker's packets arrive, if any."""
+        option = self.options.get("camera", "")
+        return parse_camera(option) if option else None
+
+
+def parse_camera(option: str) -> tuple[str, int]:
+    """Return the address and port of ``PORT`` (this machine only) or ``ADDRESS:PORT``.
+
+    Raises ``UserError`` if the port is not a number from 1 to 65535.
+    """
+    host, _, port = option.rpartition(":")
+    if not (port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16):
+        raise UserError(f"camera must be a port such as 39541, or ADDRESS:PORT, not {option!r}")
+    return host or "127.0.0.1", int(port)
 
 
 def parse_delay_s(delay_ms: str | float) -> float:

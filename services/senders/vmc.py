@@ -10,20 +10,29 @@ name these as Apple (jawOpen) or as Unity does (JawOpen), and case may matter, s
 
 Unity's axes are x to the model's right, y up, z to the front, left-handed. A bone message also
 contains a position that is unknown here. It is sent as 0, and only some receivers ignore it.
-Therefore head rotation is off unless ``head=on``.
+Therefore head rotation is off unless ``head=on``. ``camera=`` receives a tracker's messages
+(:mod:`kouxing.services.senders.camera`).
 """
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import ClassVar
 
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
-from kouxing.services.senders.face_frame import Angles, FaceFrame
-from kouxing.services.senders.osc import bundles, message
+from kouxing.services.senders.face_frame import Angles, FaceFrame, mouth_names
+from kouxing.services.senders.osc import address_of, bundles, first_text, message, split
 
 _VRM_0 = {  # where it is not only the capital of VRM 1
     "aa": "A", "ih": "I", "ou": "U", "ee": "E", "oh": "O",
     "blinkLeft": "Blink_L", "blinkRight": "Blink_R",
 }  # fmt: skip
+_MAX_MESSAGES = 200  # in a received packet
+_MOUTH = {
+    name.lower()
+    for shapes in ("vrm", "arkit")
+    for mouth in mouth_names(shapes)
+    for name in (mouth, _VRM_0.get(mouth, mouth))
+}
 
 
 class VmcConnection(DatagramConnection):
@@ -34,24 +43,44 @@ class VmcConnection(DatagramConnection):
         **COMMON_OPTIONS,
         "shapes": ("vrm", "arkit"),
         "head": ("off", "on"),
+        "camera": (),
     }
 
     def encode(self, frame: FaceFrame) -> Iterator[bytes]:
         """Yield the datagrams of a frame; the last message applies the shapes."""
-        weights = frame.weights(self.target.shapes, is_mouth_only=self.target.is_mouth_only)
-        alternatives = {
-            _VRM_0.get(name) or name[0].upper() + name[1:]: value for name, value in weights.items()
-        }
         messages = [message("/VMC/Ext/OK", 1), message("/VMC/Ext/T", frame.time_s)]
         if self.target.options["head"] == "on":
             rotation = _quaternion(frame.head)
             messages.append(message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0, *rotation))
-        messages += [
+        messages += self._shape_messages(frame, is_mouth_only=self.target.is_mouth_only)
+        messages.append(message("/VMC/Ext/Blend/Apply"))
+        return bundles(messages)
+
+    def with_mouth(self, packet: bytes, frame: FaceFrame) -> tuple[Iterator[bytes], bool]:
+        """Insert the frame's mouth where the packet applies shapes; raises ``ValueError``."""
+        received = list(islice(split(packet), _MAX_MESSAGES + 1))
+        if len(received) > _MAX_MESSAGES:
+            raise ValueError("the packet has too many messages")
+        messages: list[bytes] = []
+        has_mouth = False
+        for part in received:
+            address = address_of(part)
+            if address == "/VMC/Ext/Blend/Apply":
+                messages += self._shape_messages(frame, is_mouth_only=True)
+                has_mouth = True
+            if address != "/VMC/Ext/Blend/Val" or first_text(part).lower() not in _MOUTH:
+                messages.append(part)
+        return bundles(messages), has_mouth
+
+    def _shape_messages(self, frame: FaceFrame, *, is_mouth_only: bool) -> list[bytes]:
+        weights = frame.weights(self.target.shapes, is_mouth_only=is_mouth_only)
+        alternatives = {
+            _VRM_0.get(name) or name[0].upper() + name[1:]: value for name, value in weights.items()
+        }
+        return [
             message("/VMC/Ext/Blend/Val", name, value)
             for name, value in {**alternatives, **weights}.items()
         ]
-        messages.append(message("/VMC/Ext/Blend/Apply"))
-        return bundles(messages)
 
 
 def _quaternion(angles: Angles) -> tuple[float, float, float, float]:

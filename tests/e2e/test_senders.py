@@ -13,11 +13,14 @@ from pythonosc.dispatcher import Dispatcher
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_server import BlockingOSCUDPServer
 
+from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.senders import MAX_SENDERS, Senders
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.face.shapes import SHAPE_SETS
+from tests.receivers import LIVE_LINK_ORDER, read_live_link
 from tests.system import LIMIT_S, wait_until
 from tests.vtube_studio import VTubeStudioStub
 
@@ -190,3 +193,25 @@ def test_two_senders_share_one_permission(senders: Senders) -> None:
         shown = len(stub.frames)
         wait_until(lambda: len(stub.frames) > shown + 5)
         assert "EyeOpenLeft" not in stub.frames[-1]
+
+
+def test_a_tracker_passes_through_with_the_mouth_of_the_session(
+    senders: Senders, receiver: socket.socket
+) -> None:
+    port, camera = receiver.getsockname()[1], free_port()
+    target = parse_target(f"livelink://127.0.0.1:{port}?camera={camera}")
+    senders.start(target)
+    wait_until(lambda: senders.states()[0].rate_hz > 0)  # both sockets are open
+    senders.show(1.0, open_mouth())
+    tracked = FaceFrame(SHAPE_SETS["arkit"].faps(np.eye(52, dtype=np.float32)[0]), 0.0)
+    packet = LiveLinkConnection(parse_target("livelink://?name=Phone")).encode_at(tracked, 0.0)
+    names = set()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as tracker:
+        while "Phone" not in names:
+            for sent in (b"", b"bad", packet):
+                tracker.sendto(sent, ("127.0.0.1", camera))
+            fields = read_live_link(receiver.recv(2048))
+            names.add(fields["name"])
+    assert fields["values"][LIVE_LINK_ORDER.index("jawOpen")] > 0.3
+    blink = SHAPE_SETS["arkit"].names[0]
+    assert fields["values"][LIVE_LINK_ORDER.index(blink)] == pytest.approx(1.0, abs=0.05)

@@ -1,0 +1,56 @@
+"""Input from a camera tracker: its packets pass through, with the mouth of the sound.
+
+A tracker such as VSeeFace, or Live Link Face on an iPhone, sends its packets to a port of this
+machine instead of the program with the avatar. Each packet is forwarded on arrival. Its mouth is
+replaced by the newest frame of the session; everything else stays. Frames of the session are not
+sent by themselves while the tracker sends. Packets that are malformed are dropped.
+"""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Callable
+
+_LIVE_S = 1.0  # without a packet for this time, the tracker has stopped
+_MAX_RATE_HZ = 600  # packets above this rate are dropped unread
+
+
+class CameraInput(asyncio.DatagramProtocol):
+    """Passes the packets of a tracker to ``forward``.
+
+    ``forward`` returns whether the packet contained a mouth, and raises ``ValueError`` if the
+    packet is malformed.
+    """
+
+    def __init__(self, forward: Callable[[bytes], bool]) -> None:
+        self._forward = forward
+        self._loop = asyncio.get_running_loop()
+        self._received_s = -math.inf
+        self._window_s, self._num_in_window = -math.inf, 0
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the tracker sends faces."""
+        return self._loop.time() - self._received_s < _LIVE_S
+
+    def datagram_received(self, data: bytes, _address: object) -> None:
+        """Forward a packet."""
+        now_s = self._loop.time()
+        if now_s - self._window_s >= 1.0:
+            self._window_s, self._num_in_window = now_s, 0
+        self._num_in_window += 1
+        if self._num_in_window > _MAX_RATE_HZ:
+            return
+        with contextlib.suppress(ValueError):
+            if self._forward(data):
+                self._received_s = now_s
+
+
+async def open_camera(
+    host: str, port: int, forward: Callable[[bytes], bool]
+) -> tuple[asyncio.DatagramTransport, CameraInput]:
+    """Receive the packets of a tracker; ``OSError`` if the port is not free."""
+    loop = asyncio.get_running_loop()
+    return await loop.create_datagram_endpoint(
+        lambda: CameraInput(forward), local_addr=(host, port)
+    )

@@ -1,0 +1,149 @@
+"""A tracker's packets with the mouth of the sound."""
+
+import asyncio
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kouxing.services.senders.camera import CameraInput
+from kouxing.services.senders.connection import DatagramConnection
+from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.services.senders.live_link import LiveLinkConnection
+from kouxing.services.senders.osc import bundles, message
+from kouxing.services.senders.protocols import connect, parse_target
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.shapes import SHAPE_SETS
+from tests.receivers import LIVE_LINK_ORDER, read_live_link, read_osc
+
+
+def frame_of(**weights: float) -> FaceFrame:
+    shapes = SHAPE_SETS["arkit"]
+    row = np.array([weights.get(name, 0.0) for name in shapes.names], np.float32)
+    return FaceFrame(shapes.faps(row), 0.0)
+
+
+def connection_to(url: str) -> DatagramConnection:
+    connection = connect(parse_target(url))
+    assert isinstance(connection, DatagramConnection)
+    return connection
+
+
+SPOKEN = frame_of(jawOpen=0.6)
+VMC = connection_to("vmc://?shapes=arkit&camera=39541")
+LIVE_LINK = LiveLinkConnection(parse_target("livelink://?camera=11112"))
+
+
+def test_vmc_keeps_everything_but_the_mouth() -> None:
+    bone = ("Head", 0.0, 1.5, 0.0, 0.0, 0.1, 0.0, 0.99)
+    sent = [
+        message("/VMC/Ext/T", 3.5),
+        message("/VMC/Ext/Bone/Pos", *bone),
+        message("/VMC/Ext/Blend/Val", "A", 0.9),
+        message("/VMC/Ext/Blend/Val", "JawOpen", 0.9),
+        message("/VMC/Ext/Blend/Val", "Blink_L", 0.25),
+        message("/VMC/Ext/Blend/Val", "browInnerUp", 0.5),
+        message("/VMC/Ext/Blend/Apply"),
+        message("/VMC/Ext/OK", 1),
+    ]
+    for packets in (list(bundles(sent)), sent):  # in bundles, or one by one
+        answers = [VMC.with_mouth(packet, SPOKEN) for packet in packets]
+        messages = [parsed for passed, _ in answers for parsed in read_osc(list(passed)) if passed]
+        assert any(has_mouth for _, has_mouth in answers)
+        values = {args[0]: args[1] for address, args in messages if address.endswith("/Val")}
+        assert values["jawOpen"] == values["JawOpen"] == pytest.approx(0.6, abs=0.05)
+        assert "A" not in values  # a model with both would open its mouth twice
+        assert (values["Blink_L"], values["browInnerUp"]) == (0.25, 0.5)
+        others = [item for item in messages if not item[0].startswith("/VMC/Ext/Blend")]
+        assert others[0] == ("/VMC/Ext/T", [3.5])
+        assert others[1][1] == pytest.approx([*bone])
+        assert [address for address, _ in messages][-2:] == ["/VMC/Ext/Blend/Apply", "/VMC/Ext/OK"]
+
+
+def test_a_tracker_without_shapes_does_not_replace_the_session() -> None:
+    (packet,) = bundles([message("/VMC/Ext/Bone/Pos", "Hips", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)])
+    packets, has_mouth = VMC.with_mouth(packet, SPOKEN)
+    assert list(packets) == [packet]
+    assert not has_mouth
+
+
+def test_live_link_keeps_everything_but_the_mouth() -> None:
+    tracked = frame_of(jawOpen=0.1, eyeBlinkLeft=0.4, mouthSmileLeft=0.8)
+    tracked.faps[48] = 0.2e5  # the head's yaw
+    packet = LiveLinkConnection(parse_target("livelink://?name=Phone")).encode_at(tracked, 12.0)
+    (changed,), has_mouth = LIVE_LINK.with_mouth(packet, SPOKEN)
+    before, after = read_live_link(packet), read_live_link(changed)
+    assert has_mouth
+    assert {**before, "values": ()} == {**after, "values": ()}
+    spoken = SPOKEN.weights("arkit")
+    for name, old, new in zip(LIVE_LINK_ORDER, before["values"], after["values"], strict=False):
+        is_mouth = name.startswith(("jaw", "mouth", "tongue", "cheekPuff"))
+        assert new == pytest.approx(spoken[name] if is_mouth else old)
+    assert after["values"][52:] == before["values"][52:]
+
+
+PACKETS = (
+    next(bundles([message("/VMC/Ext/Blend/Val", "A", 0.5), message("/VMC/Ext/Blend/Apply")])),
+    LIVE_LINK.encode_at(SPOKEN, 0.0),
+)
+
+
+@given(
+    st.binary(max_size=300)
+    | st.tuples(st.sampled_from(PACKETS), st.integers(0, 400), st.binary(max_size=8)).map(
+        lambda parts: parts[0][: parts[1]] + parts[2] + parts[0][parts[1] + len(parts[2]) :]
+    )
+)
+def test_malformed_packets_are_dropped(packet: bytes) -> None:
+    for connection in (VMC, LIVE_LINK):
+        try:
+            packets, _ = connection.with_mouth(packet, SPOKEN)
+        except ValueError:
+            continue
+        assert sum(map(len, packets)) < len(packet) + 20_000
+
+
+def test_packets_that_cost_too_much_are_dropped() -> None:
+    element = struct.pack(">i", 8) + b"/a\0\0,\0\0\0"
+    header = b"#bundle\0" + bytes(8)
+    with pytest.raises(ValueError, match="too many messages"):
+        VMC.with_mouth(header + 5000 * element, SPOKEN)
+    nested = b"/a\0\0,\0\0\0"
+    for _ in range(1000):
+        nested = header + struct.pack(">i", len(nested)) + nested
+    with pytest.raises(ValueError, match="nested too deeply"):
+        VMC.with_mouth(nested, SPOKEN)
+
+
+def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
+    forwarded: list[bytes] = []
+
+    def forward(packet: bytes) -> bool:
+        forwarded.append(packet)
+        if packet == b"bad":
+            raise ValueError("malformed")
+        return True
+
+    async def receive() -> None:
+        camera = CameraInput(forward)
+        camera.datagram_received(b"bad", None)
+        assert not camera.is_live
+        for _ in range(2000):
+            camera.datagram_received(b"good", None)
+        assert camera.is_live
+
+    asyncio.run(receive())
+    assert len(forwarded) == 600
+
+
+@pytest.mark.parametrize("camera", ["0", "65536", "phone", "1.2.3.4:", "-1"])
+def test_rejects_a_port_that_is_none(camera: str) -> None:
+    with pytest.raises(UserError, match="camera must be a port"):
+        parse_target(f"vmc://?camera={camera}")
+
+
+def test_only_local_trackers_may_be_started_from_a_page() -> None:
+    assert parse_target("vmc://?camera=39541").is_local
+    assert not parse_target("vmc://?camera=0.0.0.0:39541").is_local
