@@ -1,8 +1,8 @@
-"""Measures the recognizer's voice activity: the share of time with activity, by kind of audio.
+"""Measures voice activity, laughter and breath: the share of time with each, by kind of audio.
 
 The audio passes through a live recognizer in slices of 20 ms. The state of a slice is the newest
-state that the recognizer has reported (``SpeechChange``) after processing the slice. The share
-therefore includes the delays of the detector, such as the half second before speech ends.
+state that the recognizer has reported (``SpeechChange``, ``Progress``) after processing the slice.
+The share therefore includes the delays of the detector, such as the half second before speech ends.
 
 - Speech: the recordings of a corpus, with 2 s of silence before and after each, clean and with
   music or babble. Forced alignment of the text finds the phones. Only phones count as a voice.
@@ -30,7 +30,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.pcm import SLICE, slices
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.shared.phones.events import Phone, SpeechChange
+from kouxing.shared.phones.events import Phone, Progress, SpeechChange
 from kouxing.shared.terminal import CONSOLE, print_table
 
 Mask = NDArray[np.bool_]  # (slices,)
@@ -102,29 +102,36 @@ def evaluate_voice(
     """Measure voice activity; return figures for a JSON file, by model and kind of audio.
 
     The figures contain the seconds with and without a voice, and the share of each with voice
-    activity. Without such audio, the share is missing: None.
+    activity. Without such audio, the share is missing: None. The shares with laughter and with
+    breath are those of the whole time.
     """
     results: dict[str, dict[str, Any]] = {name: {} for name in models}
     for material in track(materials, "voice activity", console=CONSOLE, transient=True):
         voiced = np.concatenate([mask for _, mask in material.recordings])
         for name, model in models.items():
-            states = [voice_activity(model, samples) for samples, _ in material.recordings]
-            is_on = np.concatenate(states)
+            states = [voice_states(model, samples) for samples, _ in material.recordings]
+            is_on, laughter, breath = np.concatenate(states).T
+            parts = {"voice": voiced, "no_voice": ~voiced}
             results[name][material.kind] = {
-                part: {
-                    "seconds": float(mask.sum()) * _SLICE_S,
-                    "on": float(is_on[mask].mean()) if mask.any() else None,
-                }
-                for part, mask in (("voice", voiced), ("no_voice", ~voiced))
+                "seconds": {part: float(mask.sum()) * _SLICE_S for part, mask in parts.items()},
+                "on": {
+                    part: float(is_on[mask].mean()) if mask.any() else None
+                    for part, mask in parts.items()
+                },
+                "laughter": float(laughter.mean()),
+                "breath": float(breath.mean()),
             }
     return results
 
 
-def voice_activity(model: AcousticModel, samples: Samples) -> Mask:
-    """Return the voice activity that the live recognizer reports after each slice, (n,)."""
+def voice_states(model: AcousticModel, samples: Samples) -> Mask:
+    """Return the states that the live recognizer reports after each slice, (n, 3).
+
+    The states are voice activity, laughter and breath.
+    """
     recognizer = Recognizer(model)
     stream = recognizer.create_stream()
-    is_active = False
+    is_active = is_laughter = is_breath = False
     states = []
     for piece in slices(samples, 0):
         stream.accept_waveform(piece)
@@ -132,7 +139,9 @@ def voice_activity(model: AcousticModel, samples: Samples) -> Mask:
         for event in recognizer.get_result(stream):
             if isinstance(event, SpeechChange):
                 is_active = event.active
-        states.append(is_active)
+            elif isinstance(event, Progress):
+                is_laughter, is_breath = event.is_laughter, event.is_breath
+        states.append((is_active, is_laughter, is_breath))
     return np.array(states)
 
 
@@ -141,8 +150,9 @@ def print_voice(results: Mapping[str, Figures], title: str, console: Console) ->
     letters, legend = letters_of(list(results))
     print_table(
         console,
-        f"{title}. {legend}\nvoice activity on, % of the time with and without a voice",
-        ("audio", "", "s", "voice", "no voice"),
+        f"{title}. {legend}\n"
+        "% of the time: voice activity with and without a voice, laughter, breath",
+        ("audio", "", "s", "voice", "no voice", "laughter", "breath"),
         _rows(results, letters),
     )
 
@@ -151,12 +161,13 @@ def _rows(results: Mapping[str, Figures], letters: Mapping[str, str]) -> Iterato
     for kind in next(iter(results.values())):
         label = kind
         for name, figures in results.items():
-            shares = figures[kind].values()
-            seconds = sum(share["seconds"] for share in shares)
+            shares = figures[kind]
             yield [
                 label,
                 letters[name],
-                f"{seconds:.0f}",
-                *(percent(share["on"]) for share in shares),
+                f"{sum(shares['seconds'].values()):.0f}",
+                *map(percent, shares["on"].values()),
+                percent(shares["laughter"]),
+                percent(shares["breath"]),
             ]
             label = ""

@@ -26,8 +26,8 @@ from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.services.synthesizer.modifiers.feeling import FeelingMotion
 from kouxing.services.synthesizer.modifiers.idle_motion import Manner, SpeechIdleMotion
-from kouxing.services.synthesizer.modifiers.laughter import Laughter
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
+from kouxing.services.synthesizer.modifiers.nonverbal import NonverbalSounds
 from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
@@ -129,7 +129,7 @@ class FaceAnimator:
             self._expressiveness,
             self._feeling,
             self._expression,
-            Laughter(),
+            NonverbalSounds(),
         ]
         if self._idle_motion is not None:
             self._modifiers.append(self._idle_motion)
@@ -366,6 +366,7 @@ class FaceAnimator:
             articulation=mouth.articulation,
             feeling=(voice.arousal, voice.valence) if voice else (0.0, 0.0),
             is_laughter=voice is not None and voice.is_laughter,
+            is_breath=voice is not None and voice.is_breath,
             amplitude_applies=self._lip_model.amplitude_applies,
         )
         for modifier in self._modifiers:

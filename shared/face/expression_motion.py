@@ -69,11 +69,15 @@ class ExpressionMotion:
 
         Unknown names are ignored.
         """
-        self._goal = np.zeros(NUM_FAPS, np.float32)
+        goal = np.zeros(NUM_FAPS, np.float32)
         for name, strength in strengths.items():
             if name in EXPRESSION_FAPS:
-                self._goal += np.float32(strength) * EXPRESSION_FAPS[name]
-        self._remaining_s = hold_s if strengths else 0.0
+                goal += np.float32(strength) * EXPRESSION_FAPS[name]
+        self.show_faps(goal, hold_s if strengths else 0.0)
+
+    def show_faps(self, goal: NDArray[np.float32], hold_s: float) -> None:
+        """Replace the current expressions by FAPs, (68,), for a time."""
+        self._goal, self._remaining_s = goal, hold_s
 
     @property
     def free(self) -> float:

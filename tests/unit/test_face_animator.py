@@ -65,7 +65,26 @@ def test_skips_to_newer_audio_without_a_jump() -> None:
     assert np.abs(np.diff(faps[:, JAW])).max() < faps[0, JAW] / 3
 
 
-def test_smiles_while_someone_laughs() -> None:
+def test_a_breath_parts_the_lips_only_without_speech() -> None:
+    faces = []
+    for is_speaking in (False, True):
+        face = make_face()
+        if is_speaking:
+            face.process(SpeechChange(active=True, time_s=0.0))
+        faps = [
+            values
+            for number in range(80)
+            for _, values in face.process(
+                Progress(time_s=number * FRAME_S, level_db=-40.0, is_breath=number > 40)
+            )
+        ]
+        faces.append(np.array(faps)[:, JAW].max())
+    breathing, speaking = faces
+    assert breathing > 60.0
+    assert speaking == 0.0
+
+
+def test_laughs_while_someone_laughs() -> None:
     face = make_face()
     faps = []
     for number in range(250):
@@ -76,6 +95,7 @@ def test_smiles_while_someone_laughs() -> None:
     shown = round((0.5 - DELAY_S) / FRAME_S)  # the first frame of the laughter
     assert not corners[: shown - 1].any()
     assert corners[shown : shown + 25].max() > 100.0
+    assert np.array(faps)[shown : shown + 25, JAW].max() > 150.0
     assert abs(corners[-1]) < 1.0
 
 

@@ -20,7 +20,7 @@ from kouxing.evaluation.recognizer.voice import (
     evaluate_voice,
     materials_of,
     print_voice,
-    voice_activity,
+    voice_states,
 )
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
@@ -48,8 +48,9 @@ def test_voice_activity_follows_the_speech_of_the_live_recognizer() -> None:
     vowels, _ = soundfile.read(VOWELS_FILE, dtype="float32")
     silence = np.zeros(RATE_HZ, np.float32)
     speech = vowels[7_000:][:RATE_HZ]  # the first vowel starts here
-    is_on = voice_activity(model, np.concatenate([silence, speech, silence]))
-    before, during, after = is_on.reshape(3, PER_S)
+    states = voice_states(model, np.concatenate([silence, speech, silence]))
+    before, during, after = states[:, 0].reshape(3, PER_S)
+    assert not states[:, 1:].any()  # no laughter or breath
     assert not before.any()
     assert during.mean() > 0.5
     assert not after[-PER_S // 4 :].any()
@@ -57,22 +58,24 @@ def test_voice_activity_follows_the_speech_of_the_live_recognizer() -> None:
 
 def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch) -> None:
     def first_half(_: object, samples: NDArray[np.float32]) -> NDArray[np.bool_]:
-        return np.arange(len(samples)) < len(samples) / 2
+        first = np.arange(len(samples)) < len(samples) / 2
+        return np.stack([first, ~first, first & ~first], axis=1)
 
-    monkeypatch.setattr(voice, "voice_activity", first_half)
+    monkeypatch.setattr(voice, "voice_states", first_half)
     masks = np.array([[True, True, True, False], [True, False, False, False]])
     pieces = [(np.zeros(4, np.float32), mask) for mask in masks]
     voiced = (np.zeros(2, np.float32), np.full(2, True))
     materials = [Material("mixed", pieces), Material("voice", [voiced])]
     results = evaluate_voice({"one": load_model("gmm")}, materials)
     shares = results["one"]["mixed"]
-    assert shares["voice"] == {"seconds": pytest.approx(0.08), "on": 0.75}
-    assert shares["no_voice"] == {"seconds": pytest.approx(0.08), "on": 0.25}
-    assert results["one"]["voice"]["no_voice"] == {"seconds": 0.0, "on": None}
+    assert shares["seconds"] == {"voice": pytest.approx(0.08), "no_voice": pytest.approx(0.08)}
+    assert shares["on"] == {"voice": 0.75, "no_voice": 0.25}
+    assert (shares["laughter"], shares["breath"]) == (0.5, 0.0)
+    assert results["one"]["voice"]["on"]["no_voice"] is None
     output = io.StringIO()
     print_voice(results | {"two": results["one"]}, "dev", Console(file=output, width=80))
     assert "dev. A: one, B: two" in output.getvalue()
-    assert output.getvalue().splitlines()[-1].split() == ["B", "0", "50.0", "-"]
+    assert output.getvalue().splitlines()[-1].split() == ["B", "0", "50.0", "-", "50.0", "0.0"]
 
 
 def test_materials_have_a_voice_where_the_text_has_phones(

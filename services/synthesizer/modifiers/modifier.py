@@ -24,6 +24,7 @@ class FrameContext:
     pitches: Sequence[tuple[float, float]] = ()  # new pitches: media time s, Hz
     feeling: tuple[float, float] = (0.0, 0.0)  # arousal and valence of the voice, -1 to 1
     is_laughter: bool = False
+    is_breath: bool = False
     amplitude_applies: bool = True  # False if the lip model already follows the level
 
 
