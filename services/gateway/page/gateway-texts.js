@@ -71,6 +71,9 @@ const CHINESE = {
   "{contents} of the mouth": "嘴部的{contents}",
   "{contents} and head": "{contents}和头部",
   "no program listens on {address}: turn its receiver on": "{address} 没有程序接收，请在该程序中打开接收",
+  "cannot receive from a tracker on {host}:{port}: {reason}": "无法在 {host}:{port} 接收面部追踪数据：{reason}",
+  "camera must be a port such as 39541, or ADDRESS:PORT, not {text}":
+    "camera 应为端口（例如 39541）或 地址:端口，而不是 {text}",
   "cannot reach {address}: {reason}": "无法连接 {address}",
   "VTube Studio asks whether kouxing may move the model: press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
   "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings":
