@@ -128,6 +128,10 @@ class LoadMeter:
         self._busy_s = self._busy_at(now_s)
         self._changed_s, self._works = now_s, False
 
+    def exclude(self, duration_s: float) -> None:
+        """Do not count some work, because it would take less time if there was more other work."""
+        self._busy_s -= duration_s
+
     def share(self, now_s: float) -> float:
         """Return the share of time, 0 to 1, since an earlier call. Call this regularly."""
         busy_s = self._busy_at(now_s)
@@ -135,7 +139,7 @@ class LoadMeter:
         while len(self._marks) > 2 and self._marks[1][0] <= now_s - self._period_s:
             self._marks.popleft()
         then_s, busy_then_s = self._marks[0]
-        return min(1.0, (busy_s - busy_then_s) / max(1e-3, now_s - then_s))
+        return min(1.0, max(0.0, busy_s - busy_then_s) / max(1e-3, now_s - then_s))
 
     def _busy_at(self, now_s: float) -> float:
         return self._busy_s + (now_s - self._changed_s if self._works else 0.0)

@@ -28,7 +28,7 @@ CATCH_UP_S = 1.5  # time for which a moved session skips nothing
 ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is just as late
 
 MAX_HOP = 4  # between runs of the block network, in its shortest hops
-MAX_LOAD = 0.6  # cores of the loop and the network; above it, the network runs less often
+MAX_LOAD = 0.6  # cores of a recognizer; above it, the network runs less often
 RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
 RESTORE_AFTER_S = 5.0  # time for which the expected load must be that low
 PACE_PERIOD_S = 0.5  # over which the load is measured
@@ -38,14 +38,14 @@ PACE_PERIOD_S = 0.5  # over which the load is measured
 class Work:
     """Processor time spent on sessions, in seconds."""
 
-    loop_s: float = 0.0  # in the service's loop
-    network_s: float = 0.0  # in the block network, on another thread
+    network_s: float = 0.0  # in the block network
+    others_s: float = 0.0  # in the rest of the recognizer
 
     def __add__(self, other: Work) -> Work:
-        return Work(self.loop_s + other.loop_s, self.network_s + other.network_s)
+        return Work(self.network_s + other.network_s, self.others_s + other.others_s)
 
     def __sub__(self, other: Work) -> Work:
-        return Work(self.loop_s - other.loop_s, self.network_s - other.network_s)
+        return Work(self.network_s - other.network_s, self.others_s - other.others_s)
 
 
 class NetworkPace:
@@ -78,10 +78,10 @@ class NetworkPace:
             return self.hop
         newest = work - self._before
         self._since_s, self._before = now_s, work
-        loop, network = newest.loop_s / passed_s, self.hop * newest.network_s / passed_s
+        network, others = self.hop * newest.network_s / passed_s, newest.others_s / passed_s
         hop = min(self.hop + self._is_behind, MAX_HOP)
-        self.hop = max(hop, _shortest_hop(loop, network, MAX_LOAD))
-        needed = self.hop if self._is_behind else _shortest_hop(loop, network, RESTORE_LOAD)
+        self.hop = max(hop, _shortest_hop(network, others, MAX_LOAD))
+        needed = self.hop if self._is_behind else _shortest_hop(network, others, RESTORE_LOAD)
         self._is_behind = False
         self._needed = max(self._needed, needed)
         if needed >= self.hop:
@@ -91,10 +91,10 @@ class NetworkPace:
         return self.hop
 
 
-def _shortest_hop(loop: float, network: float, max_load: float) -> int:
+def _shortest_hop(network: float, others: float, max_load: float) -> int:
     """Return the shortest hop with at most this load; ``network`` is the network's at hop 1."""
     hops = range(1, MAX_HOP)
-    return next((hop for hop in hops if loop + network / hop <= max_load), MAX_HOP)
+    return next((hop for hop in hops if network / hop + others <= max_load), MAX_HOP)
 
 
 class Overload:

@@ -102,7 +102,7 @@ class Service(MessageLoop):
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
         self._reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S
         self._control_instance = ""
-        self._busy = LoadMeter(LOAD_PERIOD_S, time.monotonic())
+        self.busy = LoadMeter(LOAD_PERIOD_S, time.monotonic())
         self._metrics_server: MetricsServer | None = None
         self.control = self._connect_to_control() if has_control else None
 
@@ -255,11 +255,11 @@ class Service(MessageLoop):
         start_s = time.monotonic()
         due_s = min(self._tick_due_s, self._heartbeat_due_s)
         timeout_s = max(0.0, min(timeout_s, due_s - start_s))
-        self._busy.start_waiting(start_s)
+        self.busy.start_waiting(start_s)
         self.stall.restart(start_s)
         sockets = self.wait(timeout_s)
         now_s = time.monotonic()
-        self._busy.start_working(now_s)
+        self.busy.start_working(now_s)
         self.stall.check(now_s, expected_s=timeout_s)
         self.resync_with_control()
         for socket in sockets:
@@ -353,7 +353,7 @@ class Service(MessageLoop):
     def _send_heartbeat(self, *, all_sessions: bool = False) -> None:
         now_s = time.monotonic()
         self._sent_ns = now_ns()
-        sessions, load = self.session_inputs(), self._busy.share(now_s)
+        sessions, load = self.session_inputs(), self.busy.share(now_s)
         self._heartbeat_due_s = now_s + (HEARTBEAT_S if sessions else IDLE_HEARTBEAT_S)
         _pulse_supervisor(is_idle=not sessions)
         for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():

@@ -4,7 +4,8 @@ A heartbeat states the share of the last two seconds in which a worker's loop wa
 that were placed or ended since then count with the cost of one session: the highest cost measured
 recently. Every session is expected to take that much, since a silent client may start to speak at
 any moment. A worker processes the audio of all sessions together, so each of many sessions costs
-less. The cost therefore falls quickly to the load divided by the number of speaking sessions.
+less. While most sessions speak, the cost falls quickly to the load divided by their number. While
+they are silent, it does not fall below that.
 """
 
 from collections import deque
@@ -29,6 +30,7 @@ class WorkerLoad:
         self._measured_s = 0.0
         self._idle: float | None = None  # lowest load without sessions
         self._cost: float | None = None
+        self._speaking_cost = 0.0  # of a session, when most of them last spoke
         self._placed_s: deque[float] = deque()  # times of recent placements
         self._ended_s: deque[float] = deque()  # times of recent ends
 
@@ -62,10 +64,13 @@ class WorkerLoad:
             self._idle = load if self._idle is None else min(load, self._idle)
         else:
             of_sessions = max(0.0, load - (self._idle or 0.0))
+            mean = of_sessions / num_measured
+            if 2 * num_speaking >= num_measured:
+                self._speaking_cost = mean
             is_cheaper = self.cost * num_speaking > of_sessions
             half_life_s = SPEAKING_HALF_LIFE_S if is_cheaper else COST_HALF_LIFE_S
             decayed = (self._cost or 0.0) * 0.5 ** (passed_s / half_life_s)
-            self._cost = max(of_sessions / num_measured, decayed)
+            self._cost = max(mean, decayed, self._speaking_cost)
 
     def expected(self, now_s: float) -> float:
         """Return the load when all sessions speak."""

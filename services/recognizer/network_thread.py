@@ -1,10 +1,12 @@
 """The thread of the block network, so that other sessions do not wait for its runs."""
 
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.stream import SpeechStream
 
 MAX_SESSIONS = 4  # decoded together; the results of all of them are sent at the end
 
@@ -24,6 +26,7 @@ class NetworkThread:
     """
 
     def __init__(self, recognizer: Recognizer, on_decoded: Callable[[], None]) -> None:
+        self.work_s = 0.0  # processor time of the batches so far
         self._recognizer = recognizer
         self._on_decoded = on_decoded
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="network")
@@ -58,5 +61,10 @@ class NetworkThread:
         if self._job is None and self._due:
             self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
             streams = [session.stream for session in self._batch]
-            self._job = self._executor.submit(self._recognizer.decode_streams, streams)
+            self._job = self._executor.submit(self._decode, streams)
             self._job.add_done_callback(lambda _: self._on_decoded())
+
+    def _decode(self, streams: Sequence[SpeechStream]) -> None:
+        start_s = time.thread_time()
+        self._recognizer.decode_streams(streams)
+        self.work_s += time.thread_time() - start_s

@@ -47,6 +47,7 @@ READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, an
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # between ticks while a session is open
+STEP_S, MIN_TOGETHER = 0.004, 4  # between steps, to process audio of this many sessions together
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
@@ -63,9 +64,10 @@ class RecognizerService(Service):
         self._unpaced = UnpacedAudio()
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
         self._max_behind_s = config.max_behind_s
-        self._unpaced_work = Work()  # so far, in the same thread
+        self._unpaced_work = Work()  # so far
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
+        self._stepped_s = 0.0
         self._stalls_checked_s = time.monotonic()
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio", role="client")
@@ -107,6 +109,16 @@ class RecognizerService(Service):
         )
         if not self._is_unpaced_blocked and not is_live_waiting:
             self._decode_unpaced()
+
+    def wait(self, timeout_s: float) -> list[Socket]:
+        """Wait for messages; with several sessions, also for those that arrive soon after."""
+        sockets = super().wait(timeout_s)
+        early_s = self._stepped_s + STEP_S - time.monotonic()
+        if sockets and early_s > 0.0 and len(self._sessions) >= MIN_TOGETHER:
+            time.sleep(early_s)
+            sockets = super().wait(0.0)
+        self._stepped_s = time.monotonic()
+        return sockets
 
     # --- sessions --------------------------------------------------------------------------------
 
@@ -338,8 +350,8 @@ class RecognizerService(Service):
     def _decode_live(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode a part of the queued audio of live sessions; skip audio that is too old.
 
-        The thread of the block network continues with sessions that need the network. Until then,
-        their further audio waits.
+        The thread of the block network continues with sessions that need the network. Their further
+        audio waits for it. Under load, their lips do not.
         """
         if decoded := self._network.take_decoded():
             self._send_decoded(decoded)
@@ -354,13 +366,27 @@ class RecognizerService(Service):
         for session in sessions:
             session.accept_waveform(part_s, now_s, hop)
         self._recognizer.hear_streams([session.stream for session in sessions])
-        due = [one for one in sessions if self._recognizer.needs_network(one.stream)]
-        self._network.add(due)
-        self._decode([session for session in sessions if not session.is_scoring])
+        if len(self._sessions) > 1:
+            self._start_network(sessions, hop)
+            self._decode([session for session in sessions if not session.is_scoring])
+        else:  # no other session waits; the network runs less often if there are more
+            network_s = self._recognizer.network_s
+            self._decode(sessions)
+            self.busy.exclude(self._recognizer.network_s - network_s)
         self.send_heartbeat_if_due()
 
+    def _start_network(self, sessions: Sequence[RecognizerSession], hop: int) -> None:
+        """Let the other thread continue with sessions that need the block network."""
+        due = [one for one in sessions if self._recognizer.needs_network(one.stream)]
+        if hop > 1:
+            for session in due:
+                session.stream.decode_early()
+                self._send_results(session)
+        self._network.add(due)
+
     def _work(self) -> Work:
-        return Work(time.thread_time(), self._recognizer.network_s)
+        network_s = self._recognizer.network_s
+        return Work(network_s, time.thread_time() + self._network.work_s - network_s)
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode the accepted audio of some sessions."""

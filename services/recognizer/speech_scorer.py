@@ -56,6 +56,9 @@ ScoreEvent: TypeAlias = (
 )
 
 
+EarlyEvent: TypeAlias = LipPositions | Progress | Waveform
+
+
 @dataclass(frozen=True, slots=True)
 class _Slice:
     """The end of a slice of 20 ms."""
@@ -189,6 +192,17 @@ class SpeechScorer:
             if isinstance(event, SpeechStart):
                 self._stream = (self._needs_light and self._light) or self._own
                 self._num_unscored = 0
+
+    def release_early(self) -> None:
+        """Make the lip frames and levels of unscored speech available before its phones."""
+        unscored: list[SpeechFrames] = []
+        while self._queue and isinstance(item := self._queue[0], SpeechFrames | EarlyEvent):
+            self._queue.popleft()
+            if isinstance(item, SpeechFrames):
+                unscored.append(item)
+            else:
+                self._events.append(item)
+        self._queue.extendleft(reversed(unscored))
 
     def next_work(self) -> Work:
         """Return the audio to score next."""

@@ -153,6 +153,12 @@ class SpeechStream:
                 self._results.append(result)
         self._segments = self._segments[-1:]
 
+    def decode_early(self) -> None:
+        """Return the lip frames and levels of unscored speech before its phones."""
+        if len(self._segments) == 1:
+            self._segments[0].scorer.release_early()
+            self.decode()
+
     def take_results(self) -> list[StreamOutput]:
         """Return the results since the last call."""
         results, self._results = self._results, []

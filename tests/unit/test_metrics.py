@@ -45,3 +45,11 @@ def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None
     assert last == 0.0
     busy.start_working(7.0)
     assert busy.share(9.0) == 1.0
+
+
+def test_excluded_work_does_not_count() -> None:
+    busy = LoadMeter(2.0, 0.0)
+    busy.start_working(0.0)
+    busy.start_waiting(0.6)
+    busy.exclude(0.4)
+    assert busy.share(1.0) == pytest.approx(0.2)

@@ -54,6 +54,18 @@ def test_many_speaking_sessions_show_that_each_costs_less() -> None:
     assert num_admitted(load, 50.0) >= 5
 
 
+def test_silent_sessions_do_not_hide_what_they_cost_when_they_speak() -> None:
+    load = loaded(1, 0.2)
+    for _ in range(7):
+        load.add_session(10.0, paced=True)
+    for second in range(11, 71):
+        load.measure(0.4, float(second), num_speaking=8)
+    for second in range(71, 3600):
+        load.measure(0.04, float(second), num_speaking=0)
+    assert load.cost == pytest.approx(0.4 / 8, abs=0.01)
+    assert num_admitted(load, 3600.0) == 8
+
+
 @pytest.fixture
 def system() -> System:
     made = System(max_sessions=100, max_load=MAX_LOAD)

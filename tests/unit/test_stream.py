@@ -10,6 +10,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import MAX_JITTER
 from kouxing.shared.phones.events import (
     AudioSkipped,
@@ -158,3 +159,44 @@ def test_other_sessions_do_not_affect_results() -> None:
     together = recognize_together(MODEL, recordings, **FACE)
     for samples, outputs in zip(recordings, together, strict=True):
         assert messages_of(outputs) == messages_of(recognize_live(MODEL, samples, **FACE))
+
+
+def test_lips_may_be_early_and_phones_are_the_same() -> None:
+    expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
+    recognizer = Recognizer(MODEL)
+    stream = recognizer.create_stream(**FACE)
+    outputs: list[StreamOutput] = []
+    num_early = 0
+    for begin in range(0, len(SAMPLES), 320):
+        stream.accept_waveform(SAMPLES[begin : begin + 320])
+        recognizer.hear_streams([stream])
+        if recognizer.needs_network(stream):
+            stream.decode_early()
+            early = recognizer.get_result(stream)
+            assert not of_kind(Phone, early)
+            num_early += len(of_kind(LipPositions, early))
+            outputs += early
+        recognizer.decode_streams([stream])
+        outputs += recognizer.get_result(stream)
+    stream.input_finished()
+    recognizer.decode_streams([stream])
+    outputs += recognizer.get_result(stream)
+    assert num_early > 20
+    for kind in (Phone, LipPositions, Progress, SpeechChange):
+        same = [messages_of(of_kind(kind, results)) for results in (outputs, expected)]
+        assert same[0] == same[1]
+
+
+def test_a_longer_hop_changes_only_the_phones() -> None:
+    expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
+    stream = LiveStream(MODEL, **FACE)
+    stream.stream.set_hop(4)
+    outputs = [*stream.feed(SAMPLES, chunk=320), *stream.finish()]
+    for kind in (LipPositions, Progress, SpeechChange):
+        same = [messages_of(of_kind(kind, results)) for results in (outputs, expected)]
+        assert same[0] == same[1]
+    said = [
+        [phone.symbol for phone in of_kind(Phone, results) if phone.final and phone.is_spoken]
+        for results in (outputs, expected)
+    ]
+    assert said[0] == said[1]
