@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.options import AudioTrack, CurveForm, ListenOutput, MouthFile
+from kouxing.services.cli.options import (
+    AudioTrack,
+    CurveForm,
+    ListenOutput,
+    MouthFile,
+    PhoneAlphabet,
+)
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
@@ -158,6 +164,7 @@ def listen(
             " rhubarb when they change. Default: the first of the format.",
         ),
     ] = None,
+    alphabet: PhoneAlphabet = None,
     force: Force = False,
     control: Control = "",
 ) -> None:
@@ -165,7 +172,7 @@ def listen(
     from kouxing.services.cli.follow import follow
 
     check_output(output, force=force)
-    follow(_session_name(session), output, show, form, control_address(control))
+    follow(_session_name(session), output, show, form, control_address(control), alphabet)
 
 
 def send(

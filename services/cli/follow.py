@@ -18,6 +18,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
 from kouxing.shared.phones import events
+from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.terminal import CONSOLE, plural, print_message
@@ -30,13 +31,21 @@ T = TypeVar("T", FapFrame, Phone)
 
 
 def follow(
-    session: str, output: Path | None, shown: ListenOutput, form: CurveForm | None, control: str
+    session: str,
+    output: Path | None,
+    shown: ListenOutput,
+    form: CurveForm | None,
+    control: str,
+    alphabet: Alphabet | None = None,
 ) -> None:
     """Follow a session until it ends; without a name, the newest one, or else the next one.
 
-    The frames go to ``output``. Without it, what ``shown`` selects is printed. Raises ``UserError``
-    if control does not answer, or the file cannot be written.
+    The frames go to ``output``. Without it, what ``shown`` selects is printed, phones in an
+    ``alphabet``. Raises ``UserError`` if control does not answer, the file cannot be written, or
+    the options do not fit each other.
     """
+    if alphabet is not None and shown is not ListenOutput.PHONES:
+        raise UserError("--alphabet applies to phones; add --show phones")
     if shown is not ListenOutput.FAPS and (output is not None or form is not None):
         raise UserError(f"--show {shown} cannot be combined with --output or --as")
     if form is CurveForm.LIVELINK and output is None:
@@ -47,11 +56,13 @@ def follow(
         shows_faps = shown is ListenOutput.FAPS
         results = followed.results(FapFrame if shows_faps else Phone, keep_all=True)
         arriving = _iter_until_interrupt(results, followed.name)
-        if shown is ListenOutput.SYLLABLES:
-            language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
-            count = _print(_syllable_lines(arriving, load_inventory(language)))
-        elif shown is ListenOutput.PHONES:
-            count = _print(_phone_lines(arriving))
+        if not shows_faps:
+            inventory = load_inventory(followed.info["facts"]["language"] or DEFAULT_LANGUAGE)
+            phones = map(_event_of, arriving)
+            if shown is ListenOutput.SYLLABLES:
+                count = _print(_syllable_lines(phones, inventory))
+            else:
+                count = _print(_phone_lines(respell(phones, inventory, alphabet)))
         else:
             rows = map(_row, arriving)
             count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
@@ -100,28 +111,27 @@ def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
         yield from results
 
 
-def _phone_lines(phones: Iterable[Phone]) -> Iterator[str]:
-    """Yield a line for each spoken phone."""
-    for phone in phones:
-        if phone.is_spoken:
-            yield _line(phone.time_s, to_seconds(phone.duration), phone.symbol)
+def _event_of(phone: Phone) -> events.Phone:
+    return events.Phone(
+        index=phone.index,
+        symbol=phone.symbol,
+        onset_s=phone.time_s,
+        duration_s=to_seconds(phone.duration),
+        confidence=phone.confidence,
+        final=phone.final,
+    )
 
 
-def _syllable_lines(phones: Iterable[Phone], inventory: PhoneInventory) -> Iterator[str]:
+def _phone_lines(phones: Iterable[events.Phone]) -> Iterator[str]:
+    """Yield a line for each phone."""
+    return (_line(phone.onset_s, phone.duration_s, phone.symbol) for phone in phones)
+
+
+def _syllable_lines(phones: Iterable[events.Phone], inventory: PhoneInventory) -> Iterator[str]:
     """Yield a line for each syllable when it is final. Pauses have no line."""
     track = SyllableTrack(inventory)
     for phone in phones:
-        changed = track.update(
-            events.Phone(
-                index=phone.index,
-                symbol=phone.symbol,
-                onset_s=phone.time_s,
-                duration_s=to_seconds(phone.duration),
-                confidence=phone.confidence,
-                final=phone.final,
-            )
-        )
-        for syllable in changed:
+        for syllable in track.update(phone):
             if syllable.final and syllable.duration_s > 0 and syllable.text != inventory.silence:
                 yield _line(syllable.onset_s, syllable.duration_s, syllable.text)
 

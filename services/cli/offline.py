@@ -18,6 +18,7 @@ from kouxing.services.cli.options import (
     HeadName,
     MouthFile,
     Output,
+    PhoneAlphabet,
     Timing,
 )
 from kouxing.services.driver.config import Framing
@@ -207,6 +208,7 @@ def phones(
         list[Path], typer.Argument(help="Audio or video files; '-' is standard input.")
     ],
     acoustic: Acoustic = "blocks",
+    alphabet: PhoneAlphabet = None,
     form: Form = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="File to write; a folder for many files.")
@@ -219,6 +221,7 @@ def phones(
     from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.services.recognizer.offline import recognize
     from kouxing.shared.clock import MEDIA_RATE_HZ
+    from kouxing.shared.phones.alphabets import respell
     from kouxing.shared.phones.phone_files import format_phones
 
     if len(audio) > 1 and output is None:
@@ -239,7 +242,8 @@ def phones(
             recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
         if not recognized:
             print_message(f"{source}: no speech was found")
-        write_output(format_phones(recognized, style, duration_s), target)
+        written = [*respell(recognized, model.inventory, alphabet)]
+        write_output(format_phones(written, style, duration_s), target)
 
     process_all(pairs, recognize_file)
 
@@ -250,6 +254,7 @@ def align(
         str, typer.Argument(help="Spoken text or a text file, in Chinese characters or pinyin.")
     ],
     acoustic: Acoustic = "blocks",
+    alphabet: PhoneAlphabet = None,
     form: Form = None,
     output: Output = None,
     track: AudioTrack = None,
@@ -261,6 +266,7 @@ def align(
     from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ
+    from kouxing.shared.phones.alphabets import respell
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
@@ -273,7 +279,8 @@ def align(
         alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     duration_s = len(samples) / MEDIA_RATE_HZ
     syllables = timed_syllables(alignment.phones, transcript, model.inventory)
-    write_output(format_phones(alignment.phones, style, duration_s, syllables), output)
+    written = [*respell(alignment.phones, model.inventory, alphabet)]
+    write_output(format_phones(written, style, duration_s, syllables), output)
     report_mismatch(audio, alignment)
     if not alignment.fits:
         raise typer.Exit(1)

@@ -10,6 +10,7 @@ import typer
 from kouxing.services.driver.config import HEAD_NAMES, DriverConfig, Framing
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
+from kouxing.shared.phones.alphabets import Alphabet
 
 DEFAULT_HEAD = DriverConfig().head
 HeadName = Annotated[
@@ -21,6 +22,14 @@ HeadName = Annotated[
 AudioTrack = Annotated[
     int | None,
     typer.Option("--track", metavar="N", help="Audio track of the file. Default: the first."),
+]
+PhoneAlphabet = Annotated[
+    Alphabet | None,
+    typer.Option(
+        "--alphabet",
+        help="own (symbols of the language), ipa, or arpabet (English). Default: own, but ipa for"
+        " universal phones.",
+    ),
 ]
 Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]
 MouthFile = Annotated[

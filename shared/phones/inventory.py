@@ -46,7 +46,7 @@ from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
-_NAMES = "english french german italian mandarin portuguese russian spanish universal"
+_NAMES = "english french german italian japanese mandarin portuguese russian spanish universal"
 BUILT_IN = {name: f"kouxing.shared.phones.{name}" for name in _NAMES.split()}
 DEFAULT_LANGUAGE = "mandarin"
 UNIVERSAL = "universal"  # the phones of all languages

@@ -33,6 +33,7 @@ def test_phones_are_universal(language: str) -> None:
         ("spanish", "¡Los niños!", [("Los", "los"), ("niños", "niɲos")]),
         ("italian", "gli gnocchi", [("gli", "ʎi"), ("gnocchi", "ɲoki")]),
         ("portuguese", "manhã", [("manhã", "mɐ̃ɲɐ̃")]),
+        ("japanese", "さんぽ きょう", [("さんぽ", "sampo"), ("きょう", "kjoɯ")]),
         ("russian", "щука ты", [("щука", "ɕuka"), ("ты", "tɨ")]),
     ],
 )
@@ -73,6 +74,9 @@ def test_reads_mixed_sentences() -> None:
     assert [word for word, _ in words] == ["我", "很", "happy", "买", "了", "两", "个"]
     assert dict(words)["happy"] == "hæpi"
     assert UNIVERSAL.pronounce("我 ok") == [("w", "o"), ("o", "uh", "kasp", "e", "ih")]
+    japanese = UNIVERSAL.read("これは 私")
+    assert [word.text for word in japanese.syllables] == ["これは"]
+    assert japanese.dropped == ("私",)
     with pytest.raises(UserError, match="cannot read '한국'"):
         UNIVERSAL.pronounce("我 한국")
 

@@ -1,7 +1,8 @@
 """Texts of several languages: Mandarin with English words, as people speak.
 
 Each script is read in one language. A text in another language needs the language to be chosen.
-Numbers are read in the language of the words before them.
+Numbers are read in the language of the words before them. In a text with kana, Chinese characters
+are Japanese.
 """
 
 import unicodedata
@@ -11,9 +12,9 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
 # by the first word of the letters' Unicode names
 _LANGUAGES = {
-    "CJK": "mandarin",
-    "IDEOGRAPHIC": "mandarin",
     "CYRILLIC": "russian",
+    "HIRAGANA": "japanese",
+    "KATAKANA": "japanese",
     "LATIN": "english",
 }
 
@@ -41,9 +42,11 @@ def read_mixed_text(text: str) -> Transcript:
 def _parts_of(text: str) -> list[tuple[str, str]]:
     """Split a text where its language changes. Returns the language and the text of each part."""
     parts: list[tuple[str, str]] = []
-    for letter in text:
-        script = unicodedata.name(letter, "").split(" ")[0] if letter.isalpha() else ""
-        language = _LANGUAGES.get(script)
+    scripts = [unicodedata.name(c, "").split(" ")[0] if c.isalpha() else "" for c in text]
+    of_characters = "japanese" if {"HIRAGANA", "KATAKANA"} & {*scripts} else "mandarin"
+    languages = _LANGUAGES | dict.fromkeys(("CJK", "IDEOGRAPHIC"), of_characters)
+    for letter, script in zip(text, scripts, strict=True):
+        language = languages.get(script)
         if not parts or language not in (None, parts[-1][0]):
             before = ""
             if len(parts) == 1 and not parts[0][0]:
