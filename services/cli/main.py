@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperGroup, TyperOption
 
 from kouxing.services.cli import clients, cluster, configuration, offline, run
+from kouxing.services.cli.export import app as export_app
 from kouxing.services.cli.heads import app as head_app
 from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.options import Assignments, ConfigFile
@@ -126,6 +127,7 @@ for command in (
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(head_app, name="head")
+app.add_typer(export_app, name="export")
 app.add_typer(keys_app, name="keys")
 for kind in KINDS.values():
     app.command(kind.name, help=kind.summary, rich_help_panel=SERVICES)(_service_command(kind))

@@ -92,6 +92,11 @@ class ShapeSet:
         self._right = matrix @ effect_mm  # (N, 68): times f, the right-hand side
         self._unbounded = np.linalg.solve(self._gram, self._right)
 
+    @property
+    def equation(self) -> tuple[Float64, Float64]:
+        """Matrices of equation (2): (N, N), and (N, 68), which times the FAPs is its right side."""
+        return self._gram, self._right
+
     def faps(self, weights: Float32) -> Float32:
         """Return the FAPs (68,) of weights (N,), equation (1)."""
         faps: Float32 = np.asarray(weights, dtype=np.float32) @ self.basis

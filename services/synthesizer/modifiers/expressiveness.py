@@ -35,7 +35,7 @@ _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
 _LIPS = np.stack([UPPER, LOWER])
 _WIDTH = np.array([6, 7, 53, 54]) - 1  # positive is outward
-_PUSH = slice(16 - 1, 17)  # positive is forward
+_PUSH = np.array([16, 17]) - 1  # positive is forward
 
 
 class Expressiveness:

@@ -1,0 +1,51 @@
+/** A set of blendshapes: ARKit's 52, Oculus' 15 visemes, or VRM 1's expressions. */
+export type ShapeSetName = "arkit" | "oculus" | "vrm";
+
+export type ExpressionName =
+  | "joy"
+  | "sadness"
+  | "anger"
+  | "fear"
+  | "disgust"
+  | "surprise"
+  | "smile"
+  | "brow_up"
+  | "brow_down"
+  | "squint";
+
+export interface EngineOptions {
+  /** Sets of weights to compute; default: `["arkit"]`. */
+  shapes?: ShapeSetName[];
+  /** Size of the mouth movements, 0.5 to 2; default: the server's. */
+  expressiveness?: number;
+  /** Sound after a frame that is known when the frame is made, ms; default: the server's, 60. */
+  delayMs?: number;
+}
+
+/** The face at one time. It also has an array of weights for each requested set. */
+export interface LipFrame extends Partial<Record<ShapeSetName, Float32Array>> {
+  /** Seconds from the first sample. */
+  timeS: number;
+  /** The 68 FAPs of MPEG-4, FAP units. */
+  faps: Float32Array;
+  /** Whether someone speaks or sings at the end of the known sound. */
+  isSpeaking: boolean;
+  /** Whether someone laughs. */
+  isLaughing: boolean;
+}
+
+/** Lip sync of one voice, without a browser. */
+export class LipEngine {
+  /** Load the models and start a session. `models` is the URL of their folder; default: the package's. */
+  static load(options?: EngineOptions & { sampleRateHz?: number; models?: string | URL }): Promise<LipEngine>;
+  /** Names of the weights of each set. */
+  readonly names: Partial<Record<ShapeSetName, string[]>>;
+  /** Duration of the audio so far, seconds. */
+  readonly inputS: number;
+  /** Take samples, mono in [-1, 1]; return the frames that are due, 50 per second. */
+  push(samples: Float32Array): LipFrame[];
+  /** End the audio; return the remaining frames, until the face is at rest. */
+  finish(): LipFrame[];
+  /** Show expressions, strengths 0 to 1, for some seconds. */
+  express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;
+}

@@ -1,0 +1,124 @@
+// Lip sync of one voice: PCM in, faces out. It needs no browser, worker or thread.
+
+import { Face } from "./face.js";
+import { loadModel } from "./model.js";
+import { Resampler } from "./resampler.js";
+import { ShapeSet } from "./shapes.js";
+import { SpeechSegmenter } from "./speech-segmenter.js";
+
+const MODELS = new URL("../models/", import.meta.url);
+const DEFAULT_SHAPES = ["arkit"];
+const DEFAULT_HOLD_S = 3;
+const MAX_DELAY_MS = 300;
+
+export class LipEngine {
+  #model;
+  #resampler;
+  #segmenter;
+  #face;
+  #slice; // samples of the next 20 ms
+  #numKnown = 0; // of these
+  #numSamples = 0; // at 16 kHz
+  #numIn = 0; // samples, at the rate of the input
+  #rateHz;
+  #shapes;
+  #isSpeaking = false;
+
+  /** Use LipEngine.load instead. */
+  constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, delayMs } = {}) {
+    const { defaults, constants } = model;
+    const delayS = inRange("delayMs", delayMs ?? 1000 * defaults.delayS, 0, MAX_DELAY_MS) / 1000;
+    const amount = inRange("expressiveness", expressiveness ?? defaults.expressiveness, ...defaults.expressivenessRange);
+    this.#model = model;
+    this.#rateHz = sampleRateHz;
+    this.#slice = new Float32Array(constants.pcm.SLICE);
+    this.#resampler = new Resampler(sampleRateHz, model);
+    this.#segmenter = new SpeechSegmenter(model, delayS);
+    this.#face = new Face(model, { delayS, expressiveness: amount });
+    this.#shapes = shapes.map((set) => [set, new ShapeSet(set, model)]);
+    /** Names of the weights of each set. */
+    this.names = Object.fromEntries(this.#shapes.map(([set, { names }]) => [set, names]));
+  }
+
+  /** Load the models and start a session; the options are in index.d.ts. */
+  static async load({ models = MODELS, ...options } = {}) {
+    return new LipEngine(await loadModel(models), options);
+  }
+
+  /** Duration of the audio so far, seconds. */
+  get inputS() {
+    return this.#numIn / this.#rateHz;
+  }
+
+  /** Show expressions, strengths 0 to 1 by name, for a time. */
+  express(strengths, holdS = DEFAULT_HOLD_S) {
+    this.#face.express(strengths, holdS);
+  }
+
+  /** Take samples, mono in [-1, 1]; return the frames that are due. */
+  push(samples) {
+    if (!(samples instanceof Float32Array)) throw new TypeError("samples must be a Float32Array");
+    if (!samples.every(Number.isFinite)) throw new RangeError("some samples are not finite; give values in [-1, 1]");
+    this.#numIn += samples.length;
+    const clipped = samples.map((sample) => Math.min(Math.max(sample, -1), 1));
+    const resampled = this.#resampler.accept(clipped);
+    const frames = [];
+    for (let begin = 0; begin < resampled.length; ) {
+      const piece = resampled.subarray(begin, begin + this.#slice.length - this.#numKnown);
+      this.#slice.set(piece, this.#numKnown);
+      this.#numKnown += piece.length;
+      begin += piece.length;
+      if (this.#numKnown === this.#slice.length) {
+        frames.push(...this.#processSlice());
+        this.#numKnown = 0;
+      }
+    }
+    return frames;
+  }
+
+  /** End the audio; return the remaining frames, until the face is at rest. */
+  finish() {
+    const events = this.#segmenter.accept(this.#slice.subarray(0, this.#numKnown));
+    this.#numSamples += this.#numKnown;
+    const timeS = this.#mediaTimeS;
+    const { SILENT_DB } = this.#model.constants.stream;
+    events.push(...this.#segmenter.finish(), { type: "progress", timeS, levelDb: SILENT_DB }, { type: "end", timeS });
+    return this.#animate(events);
+  }
+
+  get #mediaTimeS() {
+    return this.#numSamples / this.#model.constants.clock.MEDIA_RATE_HZ;
+  }
+
+  #processSlice() {
+    const events = this.#segmenter.accept(this.#slice);
+    this.#numSamples += this.#slice.length;
+    const { isLaughter } = this.#segmenter;
+    events.push({ type: "progress", timeS: this.#mediaTimeS, levelDb: levelDb(this.#slice, this.#model.constants.stream), isLaughter });
+    return this.#animate(events);
+  }
+
+  #animate(events) {
+    return events.flatMap((event) => {
+      if (event.type === "speech") this.#isSpeaking = event.active;
+      return this.#face.process(event).map(({ timeS, faps }) => ({
+        timeS,
+        faps,
+        isSpeaking: this.#isSpeaking,
+        isLaughing: this.#segmenter.isLaughter,
+        ...Object.fromEntries(this.#shapes.map(([set, shapes]) => [set, shapes.weights(faps)])),
+      }));
+    });
+  }
+}
+
+function inRange(name, value, lowest, highest) {
+  if (value >= lowest && value <= highest) return value;
+  throw new RangeError(`${name} is ${value}; give ${lowest} to ${highest}`);
+}
+
+/** Return the RMS level in decibels relative to full scale. */
+function levelDb(samples, { SILENT_DB }) {
+  const power = samples.reduce((sum, sample) => sum + sample * sample, 0) / samples.length;
+  return Math.max(SILENT_DB, 10 * Math.log10(power + 1e-12));
+}

@@ -1,0 +1,110 @@
+// Expressions on a speaking face, and the size of mouth movements; shared/face/expression_motion.py
+// and services/synthesizer/modifiers/expressiveness.py have the formulas.
+
+import { clamp, smoothingShare } from "./math.js";
+
+/** The current expressions of the face. */
+export class Expressions {
+  #c; // constants
+  #faps; // of each expression at full strength
+  #numFaps;
+  #goal;
+  #halfway; // of the two-pole filter
+  #shown;
+  #remainingS = 0;
+  #free = 1;
+
+  constructor({ arrays, constants, expressionNames, numFaps }) {
+    this.#c = constants.expression;
+    this.#numFaps = numFaps;
+    this.#faps = Object.fromEntries(expressionNames.map((name) => [name, arrays[`expressions.${name}`].values]));
+    this.#goal = this.#halfway = this.#shown = new Float32Array(numFaps);
+  }
+
+  /** Show expressions, strengths 0 to 1 by name, for a time; they replace earlier ones. */
+  show(strengths, holdS) {
+    const unknown = Object.keys(strengths).find((name) => !(name in this.#faps));
+    if (unknown) throw new Error(`unknown expression ${unknown}; use ${Object.keys(this.#faps).join(", ")}`);
+    this.#goal = new Float32Array(this.#numFaps);
+    for (const [name, strength] of Object.entries(strengths)) {
+      this.#goal = this.#goal.map((x, i) => x + strength * this.#faps[name][i]);
+    }
+    this.#remainingS = holdS;
+  }
+
+  /** Add the expressions to a frame, in place. */
+  apply(faps, stepS, isSpeaking) {
+    const { EASE_S, FADE_S, FREE_S, BIND_S } = this.#c;
+    const isHeld = this.#remainingS > 0;
+    this.#remainingS -= stepS;
+    if (isSpeaking) this.#free = Math.max(this.#free - stepS / BIND_S, 0);
+    else this.#free += (1 - this.#free) * smoothingShare(stepS, FREE_S);
+    if (!isHeld && !this.#shown.some((x) => x !== 0)) return;
+    const share = smoothingShare(stepS, isHeld ? EASE_S : FADE_S);
+    this.#halfway = this.#halfway.map((x, i) => x + share * ((isHeld ? this.#goal[i] : 0) - x));
+    this.#shown = this.#shown.map((x, i) => x + share * (this.#halfway[i] - x));
+    this.#mix(faps);
+  }
+
+  #mix(faps) {
+    const { UPPER, LOWER, CLOSED, OPEN, WIDEST, WIDEST_JAW, JAW } = this.#c;
+    const added = this.#shown.slice();
+    const gaps = UPPER.map((upper, i) => -(faps[upper] + faps[LOWER[i]]));
+    const rooms = gaps.map((gap, i) => Math.min(gap, -faps[LOWER[i]], OPEN) - CLOSED);
+    const half = rooms.length / 2; // inner lips first, then outer
+    const apart = rooms.map((_, i) =>
+      Math.max(Math.min(rooms[i % half], rooms[(i % half) + half]) / (OPEN - CLOSED), this.#free),
+    );
+    UPPER.forEach((upper, i) => {
+      const lower = LOWER[i];
+      const change = clamp(
+        apart[i] * -(this.#shown[upper] + this.#shown[lower]),
+        Math.min(CLOSED - gaps[i], 0),
+        Math.max(WIDEST - gaps[i], 0),
+      );
+      const upwards = (this.#shown[lower] - this.#shown[upper]) / 2;
+      const moved = upwards > 0 ? upwards : apart[i] * upwards;
+      added[upper] = -moved - change / 2;
+      added[lower] = moved - change / 2;
+    });
+    added[JAW] = Math.min(apart[0] * this.#shown[JAW], Math.max(WIDEST_JAW - faps[JAW], 0));
+    added.forEach((x, i) => (faps[i] += x));
+  }
+}
+
+/** Scale the mouth movements of a frame, in place; an amount of 1 changes nothing. */
+export function applyExpressiveness(faps, amount, { constants: { expressiveness: c } }) {
+  if (amount === 1) return;
+  const growth = (opening) => {
+    const more = amount - 1;
+    if (more < 0) return more * opening;
+    const within = Math.min(opening, c.WIDEST / 2);
+    return more * within * (1 - within / c.WIDEST);
+  };
+  const [uppers, lowers] = c.LIPS;
+  const gap = -faps[uppers[0]] - faps[lowers[0]];
+  let isOpen = 0;
+  uppers.forEach((upper, i) => {
+    const lower = lowers[i];
+    const beyond = Math.max(-faps[upper] - faps[lower] - c.CLOSED, 0);
+    const freeUpper = Math.max(-faps[upper] - c.CLOSED, 0);
+    const freeLower = Math.max(-faps[lower] - c.CLOSED, 0);
+    const free = freeUpper + freeLower;
+    const apart = Math.min(freeLower / (c.OPEN - c.CLOSED), 1);
+    if (i === 0) isOpen = apart * clamp((gap - c.CLOSED) / (c.OPEN - c.CLOSED), 0, 1);
+    const grown = (apart * growth(Math.min(free, beyond))) / Math.max(free, 1);
+    faps[upper] -= grown * freeUpper;
+    faps[lower] -= grown * freeLower;
+  });
+  faps[c.JAW] += isOpen * growth(Math.max(faps[c.JAW], 0));
+  const more = c.SIDEWAYS * (amount - 1);
+  for (const fap of c.WIDTH) {
+    const before = faps[fap];
+    const width = before - c.USUAL_WIDTH;
+    faps[fap] = Math.max(before + more * (width > 0 ? isOpen * width : width), Math.min(before, c.MIN_WIDTH));
+  }
+  for (const fap of c.PUSH) {
+    const before = faps[fap];
+    faps[fap] = Math.min(before + more * Math.max(before - c.USUAL_PUSH, 0), Math.max(before, c.MAX_PUSH));
+  }
+}

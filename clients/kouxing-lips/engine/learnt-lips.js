@@ -1,0 +1,144 @@
+// Learnt lips: lip frames and levels in, FAPs of the mouth out; services/synthesizer/lips/learnt has
+// the rules in model.py and closures.py. Without recognized phones, the tongue stays at rest.
+
+import { clamp, smoothStep } from "./math.js";
+import { RestingLips } from "./resting-lips.js";
+import { LipTrack, Transition, add, still } from "./trajectory.js";
+
+export class LearntLips {
+  #model;
+  #neutral;
+  #delayS;
+  #queue = []; // lip frames that are not due yet
+  #stable; // the last lip frame, stabilized
+  #shares = [0, 0]; // closure shares of the last two lip frames
+  #hasLipFrames = false;
+  #isSpeaking = false;
+  #track;
+  #onTrack; // the track at the last frame
+  #transition;
+  #transitionStartS = 0;
+  #resting;
+  #lateS = 0;
+  #timeS = 0; // of the last frame
+  #mouth;
+
+  constructor(model, delayS) {
+    this.#model = model;
+    this.#delayS = delayS;
+    this.#neutral = new Float64Array(model.mouthFaps.length);
+    this.#stable = this.#neutral;
+    this.#track = new LipTrack(this.#neutral, model.constants.track);
+    this.#onTrack = this.#mouth = still(this.#neutral);
+    this.#transition = new Transition(still(this.#neutral), 1);
+    this.#resting = new RestingLips(model);
+  }
+
+  /** Add an event: { type: "lips", "speech", "progress" or "end", timeS, ... }. */
+  addEvent(event) {
+    this.#resting.addEvent(event);
+    if (event.type === "speech") this.#isSpeaking = event.active;
+    else if (event.type === "lips") {
+      this.#queue.push(event);
+      this.#hasLipFrames = true;
+    }
+  }
+
+  /** Return the FAPs of the mouth at a media time, seconds; times rise. */
+  frameAt(timeS) {
+    this.#resting.followVoice(timeS);
+    if (this.#hasLipFrames) this.#followTrack(timeS);
+    const ajar = this.#resting.shareAt(timeS);
+    this.#timeS = timeS;
+    const { AJAR } = this.#model.constants.rest;
+    const faps = this.#mouth.value.map((x, i) => x + ajar * (AJAR[i] - x));
+    for (const column of this.#model.constants.learnt.UNTRACKED) faps[column] = 0;
+    return faps;
+  }
+
+  #followTrack(timeS) {
+    const continues = this.#track.endS >= this.#timeS;
+    this.#extendTrack(timeS);
+    const { TRANSITION_S, EPSILON } = this.#model.constants.learnt;
+    if (!continues) {
+      const now = this.#track.at(this.#timeS);
+      if (isDifferent(this.#onTrack, now, EPSILON)) {
+        this.#transition = new Transition(add(this.#mouth, now, -1), TRANSITION_S);
+        this.#transitionStartS = this.#timeS;
+      }
+    }
+    this.#onTrack = this.#track.at(timeS);
+    this.#mouth = add(this.#onTrack, this.#transition.at(timeS - this.#transitionStartS));
+  }
+
+  #extendTrack(timeS) {
+    this.#track.forgetBefore(this.#timeS);
+    while (this.#queue.length && this.#track.endS < timeS) {
+      const frame = this.#queue.shift();
+      this.#track.append(frame.timeS, this.#stabilize(frame));
+      this.#lateS = Math.max(0, frame.delayS - this.#delayS);
+    }
+    this.#track.holdS = this.#isSpeaking ? this.#model.constants.track.HOLD_S + this.#lateS : 0;
+  }
+
+  /** Return the FAPs of the next lip frame, stabilized and with closures. */
+  #stabilize(frame) {
+    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_SHARE } = this.#model.constants.learnt;
+    const { closures } = this.#model.constants;
+    const rule = this.#model.closureRule;
+    if (frame.timeS - this.#track.endS <= MAX_GAP_S) {
+      this.#stable = this.#stable.map((x, i) => {
+        const change = frame.faps[i] - x;
+        return change === 0 ? x : x + change ** 3 / (change ** 2 + JITTER_SQUARED[i]);
+      });
+    } else {
+      this.#shares = [0, 0];
+      this.#stable = frame.faps;
+    }
+    const faps = this.#stable.slice();
+    separateLips(faps, closures);
+    let closure = logOddsOf(frame.closure, closures) + closureLogOdds(faps, rule, closures);
+    closure -= this.#resting.doubtAt(frame.timeS, frame.closure);
+    let share = smoothStep(0.5 + (0.5 * closure) / rule.doubt);
+    const [before, newest] = this.#shares;
+    if (before < CLOSED_SHARE && CLOSED_SHARE <= newest) share = Math.max(share, newest);
+    this.#shares = [newest, share];
+    closeLips(faps, share, closures);
+    return faps;
+  }
+}
+
+/** Return the log odds that the rule adds to those of the predictor. */
+function closureLogOdds(faps, rule, { INNER_LIPS, CORNERS, PARTED, WIDE_APART, ROUNDED }) {
+  const sum = (columns) => columns.reduce((total, column) => total + faps[column], 0);
+  const apart = rule.parted * (clamp(-sum(INNER_LIPS), PARTED, WIDE_APART) - PARTED);
+  const narrow = rule.rounded * Math.max(0, ROUNDED - sum(CORNERS));
+  return rule.sound - apart - narrow;
+}
+
+function logOddsOf(probability, { MIN_PROBABILITY, MAX_PROBABILITY }) {
+  const clipped = clamp(probability, MIN_PROBABILITY, MAX_PROBABILITY);
+  return Math.log(clipped / (1 - clipped));
+}
+
+/** Separate lips that pass through each other, in place. */
+function separateLips(faps, { UPPER, LOWER, BOTH }) {
+  UPPER.forEach((upper, i) => {
+    const crossed = Math.max(0, faps[upper] + faps[LOWER[i]]);
+    for (const row of BOTH) faps[row[i]] -= 0.5 * crossed;
+  });
+}
+
+/** Move both lips towards their closure, in place. */
+function closeLips(faps, share, { INNER, OUTER }) {
+  INNER.forEach((inner, i) => {
+    const moved = share * faps[inner];
+    faps[inner] -= moved;
+    faps[OUTER[i]] -= moved;
+  });
+}
+
+function isDifferent(one, other, epsilon) {
+  const differs = (x, y) => x.some((value, i) => Math.abs(value - y[i]) > epsilon);
+  return differs(one.value, other.value) || differs(one.velocity, other.velocity);
+}

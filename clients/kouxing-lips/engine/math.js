@@ -1,0 +1,20 @@
+// Small functions that several modules need.
+
+export function sigmoid(x) {
+  return 0.5 * Math.tanh(0.5 * x) + 0.5;
+}
+
+export function clamp(x, lowest, highest) {
+  return Math.min(Math.max(x, lowest), highest);
+}
+
+/** Map 0 to 1 onto 0 to 1 with a slope of 0 at both ends; other values are clipped. */
+export function smoothStep(share) {
+  share = clamp(share, 0, 1);
+  return share * share * (3 - 2 * share);
+}
+
+/** Return the share of a change that a one-pole low-pass filter makes in a time, 0 to 1. */
+export function smoothingShare(elapsedS, timeConstantS) {
+  return -Math.expm1(-elapsedS / timeConstantS);
+}

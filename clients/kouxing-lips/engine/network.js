@@ -1,0 +1,142 @@
+// Runs the small ear: an ONNX graph whose tensors are vectors, with products of 8-bit integers.
+//
+// The graph is the one that the server runs with onnxruntime. Only its operators are known here.
+// Values are rounded to 32 bits after each operator, as there. All vectors are allocated once, so a
+// run leaves no garbage.
+
+import { loadMatrices } from "./matvec.js";
+import { readGraph } from "./onnx-file.js";
+
+const PRODUCT = "MatMulIntegerToFloat";
+
+const unary = (compute) => (_node, [x]) => {
+  const out = new Float32Array(x.length);
+  const run = () => {
+    for (let i = 0; i < out.length; i++) out[i] = compute(x[i]);
+  };
+  return { outputs: [out], run };
+};
+
+const binary = (compute) => (_node, [x, y]) => {
+  const out = new Float32Array(Math.max(x.length, y.length));
+  const [xStep, yStep] = [x.length > 1 ? 1 : 0, y.length > 1 ? 1 : 0]; // a single value applies to all
+  const run = () => {
+    for (let i = 0; i < out.length; i++) out[i] = compute(x[i * xStep], y[i * yStep]);
+  };
+  return { outputs: [out], run };
+};
+
+const constant = (...outputs) => ({ outputs, run() {} });
+
+// Each takes a node and its inputs, and returns { outputs, run: computes them }.
+const OPERATORS = {
+  Abs: unary(Math.abs),
+  Relu: unary((x) => Math.max(x, 0)),
+  Sigmoid: unary((x) => 1 / (1 + Math.exp(-x))),
+  Tanh: unary(Math.tanh),
+  Add: binary((x, y) => x + y),
+  Sub: binary((x, y) => x - y),
+  Mul: binary((x, y) => x * y),
+  Max: binary(Math.max),
+  ReduceMax(_node, [x]) {
+    const out = new Float32Array(1);
+    return { outputs: [out], run: () => (out[0] = largest(x)) };
+  },
+  Unsqueeze: (_node, [x]) => constant(x),
+  Shape: (_node, [x]) => constant([x.length]),
+  ConstantOfShape: ({ attributes }) => constant(attributes.value),
+  Concat(_node, parts) {
+    const out = new Float32Array(parts.reduce((sum, { length }) => sum + length, 0));
+    let at = 0;
+    const places = parts.map(({ length }) => (at += length) - length);
+    return { outputs: [out], run: () => parts.forEach((part, i) => out.set(part, places[i])) };
+  },
+  Split({ outputs }, [x, lengths]) {
+    let end = 0;
+    return constant(...outputs.map((_name, i) => x.subarray(end, (end += lengths?.[i] ?? x.length / outputs.length))));
+  },
+  QuantizeLinear(_node, [x, scale, zero]) {
+    const out = new Uint8Array(x.length);
+    const run = () => {
+      for (let i = 0; i < out.length; i++) out[i] = clampByte(roundHalfEven(Math.fround(x[i] / scale[0])) + zero[0]);
+    };
+    return { outputs: [out], run };
+  },
+  [PRODUCT]({ matrix }, [x, , xScale, scales, zero]) {
+    const values = new Int8Array(x.length);
+    const out = new Float32Array(scales.length);
+    const run = () => {
+      for (let i = 0; i < values.length; i++) values[i] = x[i] - zero[0];
+      const sums = matrix.times(values);
+      for (let i = 0; i < out.length; i++) out[i] = Math.fround(xScale[0] * scales[i]) * sums[i];
+    };
+    return { outputs: [out], run };
+  },
+  Softmax(_node, [x]) {
+    const out = new Float32Array(x.length);
+    const run = () => {
+      const most = largest(x);
+      const sum = x.reduce((total, value) => total + Math.exp(value - most), 0);
+      for (let i = 0; i < out.length; i++) out[i] = Math.exp(x[i] - most) / sum;
+    };
+    return { outputs: [out], run };
+  },
+  LogSoftmax(_node, [x]) {
+    const out = new Float32Array(x.length);
+    const run = () => {
+      const most = largest(x);
+      const sum = x.reduce((total, value) => total + Math.exp(value - most), 0);
+      for (let i = 0; i < out.length; i++) out[i] = x[i] - most - Math.log(sum);
+    };
+    return { outputs: [out], run };
+  },
+};
+
+function largest(values) {
+  let most = -Infinity;
+  for (let i = 0; i < values.length; i++) most = Math.max(most, values[i]);
+  return most;
+}
+
+function clampByte(value) {
+  return Math.min(255, Math.max(0, value));
+}
+
+function roundHalfEven(x) {
+  const nearest = Math.round(x);
+  return nearest - x === 0.5 && nearest % 2 !== 0 ? nearest - 1 : nearest;
+}
+
+export class Network {
+  #values; // vectors by name
+  #steps;
+
+  /** Open the bytes of an ONNX file; throws an error if it needs other operators. */
+  constructor(bytes) {
+    const { nodes, tensors, inputs } = readGraph(bytes);
+    const unknown = nodes.find(({ type }) => !(type in OPERATORS));
+    if (unknown) throw new Error(`the network needs the operator ${unknown.type}; update the package`);
+    this.#values = Object.fromEntries(Object.entries(tensors).map(([name, { values }]) => [name, values]));
+    for (const [name, size] of Object.entries(inputs)) this.#values[name] = new Float32Array(size);
+    const products = nodes.filter(({ type }) => type === PRODUCT);
+    const matrices = loadMatrices(
+      products.map(({ inputs: [, name] }) => {
+        const { shape, values } = tensors[name];
+        return { integers: values, rows: shape[0], columns: shape[1] };
+      }),
+    );
+    products.forEach((node, number) => (node.matrix = matrices[number]));
+    this.#steps = nodes.map((node) => {
+      const { outputs, run } = OPERATORS[node.type](node, node.inputs.map((name) => this.#values[name]));
+      node.outputs.forEach((name, i) => (this.#values[name] = outputs[i]));
+      return run;
+    });
+  }
+
+  /** Compute all values of the graph by name, vectors that are valid until the next run. */
+  run(inputs) {
+    for (const [name, values] of Object.entries(inputs)) this.#values[name].set(values);
+    for (const step of this.#steps) step();
+    return this.#values;
+  }
+}

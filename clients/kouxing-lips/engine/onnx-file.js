@@ -1,0 +1,102 @@
+// Reads ONNX files: the fields of Protocol Buffers that a graph needs (onnx.proto3).
+
+const FLOAT = 1;
+const UINT8 = 2;
+const INT8 = 3;
+const INT64 = 7;
+
+/** Return { nodes, tensors: by name, inputs: their last sizes by name } of an ONNX file. */
+export function readGraph(bytes) {
+  const graph = fields(bytes)[7]?.[0];
+  if (!graph) throw new Error("this is not an ONNX file");
+  const { 1: nodes, 5: tensors, 11: inputs } = fields(graph);
+  return {
+    nodes: nodes.map(readNode),
+    tensors: Object.fromEntries(tensors.map((tensor) => [text(fields(tensor)[8]), readTensor(tensor)])),
+    inputs: Object.fromEntries(inputs.map(readInput)),
+  };
+}
+
+/** Return [name, last size] of a ValueInfoProto. */
+function readInput(bytes) {
+  const inner = (value, ...path) => path.reduce((found, field) => fields(found)[field].at(-1), value);
+  return [text(fields(bytes)[1]), inner(bytes, 2, 1, 2, 1, 1)]; // type, tensor, shape, dimension, size
+}
+
+function readNode(bytes) {
+  const { 1: inputs = [], 2: outputs = [], 4: type, 5: attributes = [] } = fields(bytes);
+  return {
+    type: text(type),
+    inputs: inputs.map(decode),
+    outputs: outputs.map(decode),
+    attributes: Object.fromEntries(attributes.map(readAttribute)),
+  };
+}
+
+function readAttribute(bytes) {
+  const { 1: name, 3: integer, 5: tensor } = fields(bytes);
+  return [text(name), tensor ? readTensor(tensor[0]).values : integer?.[0]];
+}
+
+/** Return { shape, values }. */
+function readTensor(bytes) {
+  const { 1: dimensions = [], 2: [type], 9: [raw] = [] } = fields(bytes);
+  const copy = raw?.slice().buffer;
+  const shape = dimensions.flatMap((value) => (value instanceof Uint8Array ? integersOf(value) : [value]));
+  if (type === FLOAT && copy) return { shape, values: new Float32Array(copy) };
+  if (type === UINT8 && copy) return { shape, values: new Uint8Array(copy) };
+  if (type === INT8 && copy) return { shape, values: new Int8Array(copy) };
+  if (type === INT64 && copy) return { shape, values: Array.from(new BigInt64Array(copy), Number) };
+  throw new Error(`the network has tensors of type ${type}, which this package cannot read; update the package`);
+}
+
+/** Return the values of a message by field number: integers, or bytes. */
+function fields(bytes) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const found = {};
+  let at = 0;
+  while (at < bytes.length) {
+    let key;
+    [key, at] = varint(bytes, at);
+    const kind = key % 8;
+    let value;
+    if (kind === 0) [value, at] = varint(bytes, at);
+    else if (kind === 1) [value, at] = [view.getFloat64(at, true), at + 8];
+    else if (kind === 5) [value, at] = [view.getFloat32(at, true), at + 4];
+    else if (kind === 2) {
+      let length;
+      [length, at] = varint(bytes, at);
+      value = bytes.subarray(at, at + length);
+      at += length;
+    } else throw new Error("this is not an ONNX file");
+    (found[Math.floor(key / 8)] ??= []).push(value);
+  }
+  return found;
+}
+
+function varint(bytes, at) {
+  let value = 0n;
+  for (let shift = 0n; ; shift += 7n) {
+    const byte = bytes[at++];
+    value |= BigInt(byte & 127) << shift;
+    if (!(byte & 128)) return [Number(BigInt.asIntN(64, value)), at];
+  }
+}
+
+function integersOf(bytes) {
+  const integers = [];
+  for (let at = 0; at < bytes.length; ) {
+    let value;
+    [value, at] = varint(bytes, at);
+    integers.push(value);
+  }
+  return integers;
+}
+
+function decode(bytes) {
+  return new TextDecoder().decode(bytes);
+}
+
+function text(values) {
+  return values ? decode(values[0]) : "";
+}

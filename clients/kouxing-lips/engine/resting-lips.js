@@ -1,0 +1,96 @@
+// Lips in pauses; services/synthesizer/lips/learnt/rest.py has the rules.
+
+import { Transition } from "./trajectory.js";
+
+/** The share of the ajar mouth in one session. */
+export class RestingLips {
+  #c; // constants
+  #levels = []; // of future frames: [time s, dB]
+  #changes = []; // of future frames
+  #isVoice = false;
+  #hasEnded = false;
+  #loudestDb = -Infinity;
+  #knownS = -Infinity;
+  #soundS = -Infinity;
+  #staysShut = true;
+  #timeS = Infinity;
+  #goal = 0;
+  #way = wayTo(0, 0, 0, 1);
+  #elapsedS = 0;
+
+  constructor({ constants }) {
+    this.#c = constants.rest;
+  }
+
+  addEvent(event) {
+    if (event.type === "progress") {
+      this.#levels.push([event.timeS, event.levelDb]);
+      this.#loudestDb = Math.max(event.levelDb, this.#loudestDb - this.#c.FADE_DB);
+      this.#knownS = event.timeS;
+    } else if (event.type === "speech") this.#changes.push(event);
+    else if (event.type === "end") this.#hasEnded = true;
+  }
+
+  /** Process the events up to the time of a frame; times rise. */
+  followVoice(timeS) {
+    while (this.#changes[0]?.timeS <= timeS) {
+      const change = this.#changes.shift();
+      if (change.active && !this.#isVoice) [this.#soundS, this.#staysShut] = [change.timeS, false];
+      this.#isVoice = change.active;
+    }
+    while (this.#levels[0]?.[0] <= timeS) {
+      const [levelS, levelDb] = this.#levels.shift();
+      if (this.#isSound(levelDb)) [this.#soundS, this.#staysShut] = [levelS, false];
+    }
+  }
+
+  /** Return the log odds that silence subtracts from a closure at a lip frame's time. */
+  doubtAt(timeS, closure) {
+    const c = this.#c;
+    const nextS = this.#nextSoundS();
+    const isSilent = this.#isVoice && this.#knownS > timeS + c.LAST_SOUND_S && nextS > this.#knownS;
+    const isOnset = c.YIELD_S < nextS - timeS && nextS - timeS <= c.ONSET_S;
+    if (closure >= (isOnset ? c.LIKELY : c.CERTAIN)) {
+      this.#staysShut ||= isSilent || isOnset;
+      return 0;
+    }
+    if (this.#goal > 0) return Infinity;
+    return isSilent ? c.DOUBT : 0;
+  }
+
+  /** Return the share at the time of a frame. */
+  shareAt(timeS) {
+    const c = this.#c;
+    const nextS = this.#nextSoundS();
+    if (this.#hasEnded) this.#headFor(0, c.END_S);
+    else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#headFor(1, c.PART_S);
+    else if (this.#staysShut || nextS <= timeS + c.YIELD_S) this.#headFor(0, c.YIELD_S);
+    else if (timeS > this.#soundS + c.HOLD_S) this.#headFor(0, c.CLOSE_S);
+    else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#headFor(1, c.PART_S);
+    this.#elapsedS += Math.max(timeS - this.#timeS, 0);
+    this.#timeS = timeS;
+    return this.#share();
+  }
+
+  #isSound(levelDb) {
+    return this.#isVoice && levelDb >= this.#loudestDb - this.#c.RANGE_DB;
+  }
+
+  #nextSoundS() {
+    return this.#levels.find(([, db]) => this.#isSound(db))?.[0] ?? Infinity;
+  }
+
+  #headFor(goal, durationS) {
+    if (goal === this.#goal) return;
+    this.#way = wayTo(goal, this.#share(), this.#way.at(this.#elapsedS).velocity[0], durationS);
+    [this.#goal, this.#elapsedS] = [goal, 0];
+  }
+
+  #share() {
+    return this.#goal + this.#way.at(this.#elapsedS).value[0];
+  }
+}
+
+function wayTo(goal, share, velocity, durationS) {
+  return new Transition({ value: Float64Array.of(share - goal), velocity: Float64Array.of(velocity) }, durationS);
+}

@@ -1,0 +1,131 @@
+// Finds the speech in the audio, and predicts the lips during it; services/recognizer has the
+// formulas in front_end/vad.py and speech_segmenter.py.
+
+import { LipPredictor } from "./lip-predictor.js";
+import { LogMel } from "./log-mel.js";
+
+class Detector {
+  isOn = false;
+  #noEvidence;
+  #enough;
+  #constants;
+  #evidence = 0;
+  #numImprobable = 0;
+
+  constructor(noEvidence, enough, constants) {
+    this.#noEvidence = noEvidence;
+    this.#enough = enough;
+    this.#constants = constants;
+  }
+
+  update(probability) {
+    this.#numImprobable = probability >= this.#constants.IMPROBABLE ? 0 : this.#numImprobable + 1;
+    if (this.isOn) {
+      this.isOn = this.#numImprobable < this.#constants.STOP_POSITIONS;
+      return;
+    }
+    this.#evidence = Math.max(0, this.#evidence + probability - this.#noEvidence);
+    this.isOn = this.#evidence >= this.#enough;
+    if (this.isOn) this.#evidence = 0;
+  }
+}
+
+export class SpeechSegmenter {
+  #model;
+  #mel;
+  #lips;
+  #state; // of the ear
+  #speech;
+  #laughter;
+  #frames = []; // of the next position
+  #recent = []; // features of the positions before speech
+  #numFrames = 0;
+  #isSpeaking = false;
+
+  constructor(model, delayS) {
+    this.#model = model;
+    this.#mel = new LogMel(model);
+    this.#lips = new LipPredictor(model, delayS);
+    this.#state = new Float32Array(model.stateWidth);
+    const vad = model.constants.vad;
+    this.#speech = new Detector(vad.SPEECH_NO_EVIDENCE, vad.SPEECH_ENOUGH, vad);
+    this.#laughter = new Detector(vad.LAUGHTER_NO_EVIDENCE, vad.LAUGHTER_ENOUGH, vad);
+  }
+
+  get isLaughter() {
+    return this.#laughter.isOn;
+  }
+
+  /** Take samples at 16 kHz; return speech changes and lip frames, in order. */
+  accept(samples) {
+    this.#frames.push(...this.#mel.accept(samples));
+    const { FRAMES_PER_POSITION } = this.#model.constants.segmenter;
+    const events = [];
+    while (this.#frames.length >= FRAMES_PER_POSITION) {
+      const frames = new Float32Array(this.#frames.splice(0, FRAMES_PER_POSITION).flatMap((frame) => [...frame]));
+      this.#numFrames += FRAMES_PER_POSITION;
+      const { features, voice, new_state: state } = this.#model.ear.run({ frames, state: this.#state });
+      this.#state.set(state);
+      events.push(...this.#process(new Float32Array([...frames, ...features]), voice));
+    }
+    return events;
+  }
+
+  /** End the audio; return the end of the speech. */
+  finish() {
+    return this.#isSpeaking ? [this.#endSpeech()] : [];
+  }
+
+  #process(features, voice) {
+    const { SPEECH, SUNG, LAUGHTER } = this.#model.voices;
+    if (!this.#isSpeaking) {
+      this.#recent.push(features);
+      if (this.#recent.length > this.#model.constants.segmenter.MAX_RECENT) this.#recent.shift();
+    }
+    this.#speech.update(Math.fround(voice[SPEECH] + voice[SUNG]));
+    this.#laughter.update(voice[LAUGHTER]);
+    if (this.#isSpeaking && !this.#speech.isOn) return [this.#endSpeech()];
+    if (this.#isSpeaking) return this.#predict(features, this.#numFrames - 1);
+    return this.#speech.isOn ? this.#startSpeech() : [];
+  }
+
+  #startSpeech() {
+    const { FRAMES_PER_POSITION, PRE_ROLL_FRAMES, FIRST_FRAME_PARITY, SEEN_AFTER_FRAMES } = this.#model.constants.segmenter;
+    const oldest = this.#numFrames - FRAMES_PER_POSITION * this.#recent.length;
+    let first = Math.max(oldest, this.#numFrames - PRE_ROLL_FRAMES);
+    while (first % FRAMES_PER_POSITION !== FIRST_FRAME_PARITY) first++;
+    if (this.#numFrames - first < FRAMES_PER_POSITION) return [];
+    this.#isSpeaking = true;
+    const events = [this.#speechChange(true, first)];
+    this.#lips.reset();
+    let newest = this.#numFrames - 1 - FRAMES_PER_POSITION * (this.#recent.length - 1);
+    for (const features of this.#recent) {
+      if (newest >= first + SEEN_AFTER_FRAMES) events.push(...this.#predict(features, newest));
+      newest += FRAMES_PER_POSITION;
+    }
+    this.#recent = [];
+    return events;
+  }
+
+  #endSpeech() {
+    this.#isSpeaking = false;
+    return this.#speechChange(false, this.#numFrames);
+  }
+
+  #speechChange(active, frame) {
+    const { HOP_S, WINDOW_S } = this.#model.constants.segmenter;
+    return { type: "speech", active, timeS: this.#wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2) };
+  }
+
+  #predict(features, newestFrame) {
+    const { HOP_S, WINDOW_S } = this.#model.constants.segmenter;
+    const frame = this.#lips.processPosition(newestFrame * HOP_S + WINDOW_S, features);
+    if (frame.timeS < 0) return [];
+    return [{ ...frame, type: "lips", timeS: this.#wholeSamples(frame.timeS), delayS: this.#wholeSamples(frame.delayS) }];
+  }
+
+  #wholeSamples(timeS) {
+    const { MEDIA_RATE_HZ } = this.#model.constants.clock;
+    return Math.round(timeS * MEDIA_RATE_HZ) / MEDIA_RATE_HZ;
+  }
+}

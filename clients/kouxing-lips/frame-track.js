@@ -1,0 +1,39 @@
+// The newest frames, from which the face at any time is interpolated.
+
+const MAX_S = 60; // that are kept
+
+export class FrameTrack {
+  #frames = []; // times rise
+
+  /** Append frames { timeS, faps, ... } of the engine. */
+  push(frames) {
+    this.#frames.push(...frames);
+    const first = this.#frames.findIndex(({ timeS }) => timeS >= this.#frames.at(-1).timeS - MAX_S);
+    this.#frames.splice(0, first);
+  }
+
+  /** Time of the newest frame, seconds; minus infinity before the first. */
+  get endS() {
+    return this.#frames.at(-1)?.timeS ?? -Infinity;
+  }
+
+  /** Return the face at a time, or the nearest one; null before the first frame. */
+  at(timeS) {
+    const frames = this.#frames;
+    if (frames.length === 0) return null;
+    let after = frames.length; // the newest frames are near the end
+    while (after > 0 && frames[after - 1].timeS > timeS) after--;
+    if (after === 0) return frames[0];
+    if (after === frames.length) return frames.at(-1);
+    return mix(frames[after - 1], frames[after], timeS);
+  }
+}
+
+function mix(one, other, timeS) {
+  const share = (timeS - one.timeS) / (other.timeS - one.timeS);
+  const entries = Object.entries(one).map(([name, value]) => {
+    if (!(value instanceof Float32Array)) return [name, value];
+    return [name, value.map((x, i) => x + share * (other[name][i] - x))];
+  });
+  return { ...Object.fromEntries(entries), timeS };
+}

@@ -1,0 +1,52 @@
+import type { EngineOptions, ExpressionName, LipFrame, ShapeSetName } from "./engine.js";
+
+export type { EngineOptions, ExpressionName, LipFrame, ShapeSetName };
+
+export interface LipSyncEventMap {
+  /** The voice starts or ends, or laughter does. */
+  voice: CustomEvent<{ timeS: number; isSpeaking: boolean; isLaughing: boolean }>;
+  /** New frames; `startS` is the start of the session on the clock of `context`, null for push(). */
+  frames: CustomEvent<{ frames: LipFrame[]; startS: number | null }>;
+  /** A sentence for the user, for example that the page needs a click. */
+  notice: CustomEvent<string>;
+  /** An AudioBuffer has been played. */
+  ended: Event;
+}
+
+/** Lip sync in a page. One voice at a time; a new source replaces the last one. */
+export class LipSync extends EventTarget {
+  /** Load the models and the worker. `models` is the URL of their folder; default: the package's. */
+  static create(options?: EngineOptions & { models?: string | URL }): Promise<LipSync>;
+  /** Names of the weights of each set, known from the first source on. */
+  readonly names: Partial<Record<ShapeSetName, string[]>>;
+  /** The audio context of this lip sync. */
+  readonly context: AudioContext;
+  /** The face to show now; null before the first frame. */
+  readonly current: LipFrame | null;
+  /** Return the face at a time of the session, seconds; null before the first frame. */
+  at(timeS: number): LipFrame | null;
+  /** Follow the microphone. Rejected with a sentence for the user if it cannot be opened. */
+  listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;
+  /** Follow a source. AudioBuffers and media elements are also played, in sync with the face. */
+  listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
+  /** Start a session for push(). */
+  open(sampleRateHz: number): Promise<void>;
+  /** Take PCM, mono in [-1, 1]; it may come faster than real time. */
+  push(samples: Float32Array): void;
+  /** End pushed audio. Resolved when all its frames are known. */
+  finish(): Promise<void>;
+  /** Show expressions, strengths 0 to 1, for some seconds. */
+  express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;
+  /** Start suspended sound. Call it from a click handler. */
+  resume(): Promise<void>;
+  /** Stop following the sound. */
+  stop(): void;
+  /** Stop, and release everything. */
+  close(): void;
+  addEventListener<K extends keyof LipSyncEventMap>(
+    type: K,
+    listener: (this: LipSync, event: LipSyncEventMap[K]) => void,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener(type: string, listener: EventListenerOrEventListenerObject, options?: boolean | AddEventListenerOptions): void;
+}

@@ -1,0 +1,269 @@
+// Lip sync in a page: microphone, media or PCM in, faces out. All sound stays on the device.
+
+import { FrameTrack } from "./frame-track.js";
+
+const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
+const DEFAULT_SHAPES = ["arkit"];
+const TELEPHONE_HZ = 8000;
+const MODELS = new URL("models/", import.meta.url);
+
+const TEXTS = {
+  insecure: "the browser offers no microphone to this page; open it by https:// or from localhost",
+  NotAllowedError: "the microphone is blocked; allow it in the address bar of the browser, and try again",
+  NotFoundError: "no microphone was found; connect one, and try again",
+  NotReadableError: "another program uses the microphone, or it is broken; close that program, and try again",
+  unplugged: "the microphone was unplugged; connect it, and start again",
+  telephone: "the microphone sends 8 kHz, as a telephone does, so the lips are less exact; choose another microphone",
+  suspended: "the browser has not started the sound yet; click on the page",
+  interrupted: "the system paused the sound, for example for a call; it continues afterwards",
+  hidden: "the tab is in the background; the lips follow the sound again when it is visible",
+};
+
+/** Lip sync of one voice at a time; index.d.ts describes the API. */
+export class LipSync extends EventTarget {
+  #worker;
+  #options;
+  #context = null;
+  #session = 0; // number of the newest
+  #track = new FrameTrack();
+  #source = null; // { node, release(), startS: null before the first sound, isPlayed }
+  #pending = new Map(); // resolve functions by name
+  #isSpeaking = false;
+  #isLaughing = false;
+
+  /** Names of the weights of each set. */
+  names = {};
+
+  /** Use LipSync.create instead. */
+  constructor(worker, options) {
+    super();
+    this.#worker = worker;
+    this.#options = options;
+    worker.onmessage = ({ data }) => this.#onMessage(data);
+    document.addEventListener("visibilitychange", this.#onVisibility);
+  }
+
+  /** Load the models and the worker. */
+  static async create({ models = MODELS, shapes = DEFAULT_SHAPES, ...options } = {}) {
+    const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
+    const lips = new LipSync(worker, { shapes, ...options });
+    await new Promise((resolve, reject) => {
+      lips.#pending.set("loaded", resolve).set("failed", reject);
+      worker.onerror = () => reject(new Error("cannot start the worker; serve the package from the page's own origin"));
+      worker.postMessage({ type: "load", models: new URL(models, location.href).href });
+    });
+    return lips;
+  }
+
+  /** Follow the microphone. Rejected with a sentence that says what to do. */
+  async listenToMicrophone(constraints = {}) {
+    if (!navigator.mediaDevices) throw new Error(TEXTS.insecure);
+    const audio = { channelCount: 1, echoCancellation: true, autoGainControl: true, ...constraints };
+    let stream;
+    try {
+      stream = await navigator.mediaDevices.getUserMedia({ audio });
+    } catch (error) {
+      throw new Error(TEXTS[error.name] ?? `the microphone cannot be opened: ${error.message}`, { cause: error });
+    }
+    const [track] = stream.getAudioTracks();
+    if (track.getSettings().sampleRate <= TELEPHONE_HZ) this.#report(TEXTS.telephone);
+    track.onended = () => {
+      this.stop();
+      this.#report(TEXTS.unplugged);
+    };
+    try {
+      await this.listenTo(stream);
+    } catch (error) {
+      track.stop();
+      throw error;
+    }
+    const { release } = this.#source;
+    this.#source.release = () => {
+      release();
+      track.onended = null;
+      track.stop();
+    };
+  }
+
+  /**
+   * Follow a MediaStream, a track, an AudioBuffer, a media element or an audio node of this.context.
+   * Buffers and elements are also played, with the delay that the face has.
+   */
+  async listenTo(source) {
+    const context = this.context;
+    await context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
+    this.stop();
+    const node = sourceNode(context, source);
+    const input = new AudioWorkletNode(context, "kouxing-lips", { channelCount: 1, channelCountMode: "explicit", numberOfOutputs: 0 });
+    const isPlayed = node.isPlayed;
+    const delay = isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
+    node.connect(input);
+    if (delay) node.connect(delay).connect(context.destination);
+    const { port1, port2 } = new MessageChannel();
+    await this.#open({ sampleRateHz: context.sampleRate }, port1);
+    this.#source = {
+      isPlayed,
+      startS: null,
+      release() {
+        input.port.postMessage(null);
+        node.disconnect(input);
+        if (delay) {
+          node.disconnect(delay);
+          delay.disconnect();
+        }
+        if (source instanceof AudioBuffer) node.stop();
+      },
+    };
+    input.port.postMessage(port2, [port2]);
+    if (source instanceof AudioBuffer) {
+      node.start();
+      node.onended = () => this.dispatchEvent(new Event("ended"));
+    }
+    await this.resume();
+  }
+
+  /** Start a session for push(). Its times count from the first sample. */
+  async open(sampleRateHz) {
+    this.stop();
+    await this.#open({ sampleRateHz });
+  }
+
+  /** Take PCM, mono in [-1, 1], at the rate of open(). Audio may come faster than real time. */
+  push(samples) {
+    this.#worker.postMessage({ type: "push", session: this.#session, samples });
+  }
+
+  /** End pushed audio. Resolved when all its frames are known. */
+  finish() {
+    return new Promise((resolve) => {
+      this.#pending.set("finished", resolve);
+      this.#worker.postMessage({ type: "finish", session: this.#session });
+    });
+  }
+
+  /** Show expressions, strengths 0 to 1 by name, for a time. */
+  express(strengths, holdS = 3) {
+    this.#worker.postMessage({ type: "express", strengths, holdS });
+  }
+
+  /** The audio context of this lip sync. */
+  get context() {
+    if (this.#context === null) {
+      this.#context = new AudioContext({ latencyHint: "interactive" });
+      this.#context.onstatechange = () => this.#onContextState();
+    }
+    return this.#context;
+  }
+
+  /** Start suspended sound. Browsers allow this only in a click handler. */
+  async resume() {
+    if (this.context.state === "running") return;
+    const started = this.context.resume();
+    const isBlocked = await Promise.race([started.then(() => false), new Promise((done) => setTimeout(done, 300, true))]);
+    if (!isBlocked) return;
+    this.#report(TEXTS.suspended);
+    const retry = () => this.#context?.resume();
+    for (const type of ["pointerdown", "keydown"]) document.addEventListener(type, retry, { once: true });
+  }
+
+  /** The face to show now, for sound from listenTo(): { faps, arkit, ... }; null before the first. */
+  get current() {
+    const startS = this.#source?.startS ?? null;
+    if (startS === null) return this.#track.at(Infinity);
+    const latencyS = this.#source.isPlayed ? (this.#context.outputLatency ?? 0) : 0;
+    return this.#track.at(this.#context.currentTime - startS - SHOW_AFTER_S - latencyS);
+  }
+
+  /** Return the face at a time of the session, seconds. */
+  at(timeS) {
+    return this.#track.at(timeS);
+  }
+
+  /** Stop following the sound. */
+  stop() {
+    this.#source?.release();
+    this.#source = null;
+  }
+
+  /** Stop, and release everything. */
+  close() {
+    this.stop();
+    document.removeEventListener("visibilitychange", this.#onVisibility);
+    this.#worker.terminate();
+    this.#context?.close();
+  }
+
+  async #open(options, input = null) {
+    this.#track = new FrameTrack();
+    const session = ++this.#session;
+    await new Promise((resolve, reject) => {
+      this.#pending.set("opened", resolve).set("failed", reject);
+      const message = { type: "open", session, options: { ...this.#options, ...options }, input };
+      this.#worker.postMessage(message, input ? [input] : []);
+    });
+  }
+
+  #onMessage({ type, ...data }) {
+    if (type === "error") {
+      const reject = this.#pending.get("failed");
+      this.#pending.clear();
+      if (reject) reject(new Error(data.text));
+      else this.#report(data.text);
+      return;
+    }
+    if (type !== "loaded" && data.session !== this.#session) return;
+    if (type === "frames") {
+      this.#onFrames(data);
+      return;
+    }
+    if (type === "opened") this.names = data.names;
+    const resolve = this.#pending.get(type);
+    this.#pending.clear();
+    resolve?.();
+  }
+
+  #onFrames({ frames, startS }) {
+    this.#track.push(frames);
+    const { timeS, isSpeaking, isLaughing } = frames.at(-1);
+    if (this.#source) this.#source.startS = startS;
+    if (isSpeaking !== this.#isSpeaking || isLaughing !== this.#isLaughing) {
+      [this.#isSpeaking, this.#isLaughing] = [isSpeaking, isLaughing];
+      this.dispatchEvent(new CustomEvent("voice", { detail: { timeS, isSpeaking, isLaughing } }));
+    }
+    this.dispatchEvent(new CustomEvent("frames", { detail: { frames, startS } }));
+  }
+
+  #onContextState() {
+    if (this.#source && this.#context.state === "interrupted") this.#report(TEXTS.interrupted);
+  }
+
+  #onVisibility = () => {
+    if (this.#source === null) return;
+    if (document.hidden) this.#report(TEXTS.hidden);
+    else this.#context?.resume();
+  };
+
+  #report(text) {
+    this.dispatchEvent(new CustomEvent("notice", { detail: text }));
+  }
+}
+
+const elementNodes = new WeakMap(); // an element allows only one node
+
+/** Return the audio node of a source; its property isPlayed tells whether the page plays it. */
+function sourceNode(context, source) {
+  if (source instanceof AudioNode) return Object.assign(source, { isPlayed: false });
+  if (source instanceof MediaStreamTrack) source = new MediaStream([source]);
+  if (source instanceof MediaStream) {
+    if (source.getAudioTracks().length === 0) throw new Error("the stream has no sound; give one with an audio track");
+    return Object.assign(new MediaStreamAudioSourceNode(context, { mediaStream: source }), { isPlayed: false });
+  }
+  if (source instanceof AudioBuffer) {
+    return Object.assign(new AudioBufferSourceNode(context, { buffer: source }), { isPlayed: true });
+  }
+  if (source instanceof HTMLMediaElement) {
+    if (!elementNodes.has(source)) elementNodes.set(source, new MediaElementAudioSourceNode(context, { mediaElement: source }));
+    return Object.assign(elementNodes.get(source), { isPlayed: true });
+  }
+  throw new TypeError("give a MediaStream, a track, an AudioBuffer, an audio element or an audio node");
+}

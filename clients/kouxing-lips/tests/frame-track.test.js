@@ -1,0 +1,26 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { FrameTrack } from "../frame-track.js";
+
+const frame = (timeS, jaw) => ({ timeS, faps: Float32Array.of(jaw), isSpeaking: jaw > 0 });
+
+test("a face between two frames is mixed from both", () => {
+  const track = new FrameTrack();
+  assert.equal(track.at(0), null);
+  track.push([frame(1, 0), frame(1.02, 8)]);
+  assert.deepEqual(track.at(1.015), { timeS: 1.015, faps: Float32Array.of(6), isSpeaking: false });
+});
+
+test("before the first and after the last frame, the nearest one is shown", () => {
+  const track = new FrameTrack();
+  track.push([frame(1, 2), frame(1.02, 8)]);
+  assert.equal(track.at(0).faps[0], 2);
+  assert.equal(track.at(9).faps[0], 8);
+});
+
+test("frames of the last minute are kept", () => {
+  const track = new FrameTrack();
+  track.push([frame(0, 1), frame(30, 2)]);
+  track.push([frame(70, 3)]);
+  assert.equal(track.at(0).faps[0], 2);
+});

@@ -1,0 +1,19 @@
+// Prints what the engine makes of 32-bit samples of a file: node frames.mjs MODELS FILE OPTIONS.
+
+import { readFileSync } from "node:fs";
+import { pathToFileURL } from "node:url";
+import { LipEngine } from "../engine/engine.js";
+
+const [models, file, options] = process.argv.slice(2);
+const { chunk, ...rest } = JSON.parse(options);
+try {
+  const engine = await LipEngine.load({ models: pathToFileURL(`${models}/`), ...rest });
+  const samples = new Float32Array(new Uint8Array(readFileSync(file)).buffer);
+  const frames = [];
+  for (let begin = 0; begin < samples.length; begin += chunk) frames.push(...engine.push(samples.subarray(begin, begin + chunk)));
+  frames.push(...engine.finish());
+  const plain = (_name, value) => (value instanceof Float32Array ? [...value] : value);
+  process.stdout.write(JSON.stringify({ names: engine.names, frames }, plain));
+} catch (error) {
+  process.stdout.write(JSON.stringify({ error: error.message }));
+}

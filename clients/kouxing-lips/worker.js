@@ -1,0 +1,55 @@
+// Runs the engine in a worker: sound in, faces out.
+
+import { LipEngine } from "./engine/engine.js";
+import { loadModel } from "./engine/model.js";
+
+let model = null; // a promise
+let engine = null;
+let port = null; // of the audio thread
+
+self.onmessage = async ({ data: { type, ...data } }) => {
+  try {
+    await HANDLERS[type](data);
+  } catch (error) {
+    self.postMessage({ type: "error", text: error.message });
+  }
+};
+
+const HANDLERS = {
+  /** Load the models. */
+  async load({ models }) {
+    model = await loadModel(models);
+    self.postMessage({ type: "loaded" });
+  },
+
+  /** Start a session; its sound comes from a port, or by "push". */
+  open({ session, options, input }) {
+    port?.close();
+    engine = new LipEngine(model, options);
+    self.postMessage({ type: "opened", session, names: engine.names });
+    port = input ?? null;
+    if (port === null) return;
+    const current = engine;
+    port.onmessage = ({ data: { samples, endS } }) => {
+      if (engine === current) send(session, current.push(samples), endS - current.inputS);
+    };
+  },
+
+  push({ session, samples }) {
+    send(session, engine.push(samples));
+  },
+
+  finish({ session }) {
+    send(session, engine.finish());
+    self.postMessage({ type: "finished", session });
+  },
+
+  express({ strengths, holdS }) {
+    engine.express(strengths, holdS);
+  },
+};
+
+/** Send frames to the page; startS is the start of the session on the clock of the audio thread. */
+function send(session, frames, startS = null) {
+  if (frames.length) self.postMessage({ type: "frames", session, frames, startS });
+}

@@ -1,0 +1,35 @@
+"""The commands under ``kouxing export``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import Force, check_output, print_message
+
+app = typer.Typer(no_args_is_help=True, help="Export the models for other programs.")
+
+
+@app.callback()
+def _export() -> None:
+    """Without this callback, Typer would drop the name of the only command."""
+
+
+@app.command("web")
+def export_web(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write.")],
+    force: Force = False,
+) -> None:
+    """Write the models for lip sync in a browser, without a server."""
+    from kouxing.services.cli.web_model import web_model
+
+    contents = web_model()
+    check_output(*(folder / name for name in contents if folder.is_dir()), force=force)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            (folder / name).write_bytes(content)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
+    print_message(f"wrote {folder} ({sum(map(len, contents.values())) / 1e6:.1f} MB)")

@@ -1,0 +1,138 @@
+"""The models for lip sync in a browser: the files that ``clients/kouxing-lips`` reads.
+
+============== =====================================================================
+file           contents
+============== =====================================================================
+``ear.onnx``   the network of the small ear, unchanged
+``model.bin``  arrays: mel bands, lip predictor, blendshapes, expressions
+``model.json`` types, shapes and places of these arrays; constants of the modules
+============== =====================================================================
+
+The constants are those of the modules that the server runs. The package has no values of its own,
+so a new model or another threshold needs only a new export.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.recognizer import ear, lip_frames, lip_predictor, speech_segmenter, stream
+from kouxing.services.recognizer.acoustic import network
+from kouxing.services.recognizer.acoustic.model_file import read_archive
+from kouxing.services.recognizer.front_end import features, pcm, resample, vad, whisper_mel
+from kouxing.services.synthesizer import face_animator
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.learnt import closures, model, rest, track
+from kouxing.services.synthesizer.modifiers import expressiveness
+from kouxing.shared import clock
+from kouxing.shared.face import expression_motion, shapes
+from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+
+FORMAT = "kouxing-lips 1"
+
+_ALIGNMENT_BYTES = 8
+_MAX_CONSTANT_SIZE = 400  # longer lists are arrays
+_MODULES = {
+    "animator": face_animator,
+    "clock": clock,
+    "closures": closures,
+    "expression": expression_motion,
+    "expressiveness": expressiveness,
+    "features": features,
+    "learnt": model,
+    "lips": lip_predictor,
+    "lipFrames": lip_frames,
+    "mel": whisper_mel,
+    "network": network,
+    "pcm": pcm,
+    "resample": resample,
+    "rest": rest,
+    "segmenter": speech_segmenter,
+    "shapes": shapes,
+    "stream": stream,
+    "track": track,
+    "vad": vad,
+}
+
+
+def web_model() -> dict[str, bytes]:
+    """Return the contents of the files by name."""
+    small_ear = ear.load_ear()
+    predictor = lip_predictor.load_lip_predictor()
+    arrays: dict[str, NDArray[Any]] = {
+        "mel.bands": whisper_mel.mel_bands(),
+        **{f"lips.{field.name}": getattr(predictor, field.name) for field in fields(predictor)},
+        **{f"expressions.{name}": faps for name, faps in expression_motion.EXPRESSION_FAPS.items()},
+    }
+    for name, shape_set in shapes.SHAPE_SETS.items():
+        gram, right = shape_set.equation
+        arrays |= {f"shapes.{name}.gram": gram, f"shapes.{name}.right": right}
+    blob, places = _pack(arrays)
+    settings = SynthesizerConfig()
+    header = {
+        "format": FORMAT,
+        "stateWidth": small_ear.state_width,
+        "voices": {voice.name: int(voice) for voice in ear.Voice},
+        "numFaps": NUM_FAPS,
+        "mouthFaps": MOUTH_FAPS,
+        "closureRule": asdict(closures.ClosureRule()),
+        "defaults": {
+            "frameRateHz": settings.frame_rate_hz,
+            "delayS": settings.delay_ms / 1e3,
+            "expressiveness": settings.expressiveness,
+            "expressivenessRange": (MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS),
+        },
+        "shapeNames": {name: shape_set.names for name, shape_set in shapes.SHAPE_SETS.items()},
+        "expressionNames": list(expression_motion.EXPRESSION_FAPS),
+        "constants": {name: _constants(module) for name, module in _MODULES.items()},
+        "arrays": places,
+    }
+    network_bytes = read_archive(ear.EAR_PATH).array("network", None).astype(np.uint8).tobytes()
+    return {
+        "ear.onnx": network_bytes,
+        "model.bin": blob,
+        "model.json": json.dumps(header, separators=(",", ":")).encode(),
+    }
+
+
+def _pack(arrays: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
+    """Join arrays; return the bytes, and type, shape and first byte of each array."""
+    blob = bytearray()
+    places = {}
+    for name, array in arrays.items():
+        short = _shortened(array)
+        blob += bytes(-len(blob) % _ALIGNMENT_BYTES)
+        places[name] = {"type": short.dtype.name, "shape": short.shape, "begin": len(blob)}
+        blob += short.tobytes()
+    return bytes(blob), places
+
+
+def _shortened(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array in the shortest type that keeps its values."""
+    for kind in (np.float16, np.float32):
+        short = array.astype(kind)
+        if np.array_equal(short, array):
+            return short
+    return array.astype(np.float64)
+
+
+def _constants(module: ModuleType) -> dict[str, Any]:
+    """Return the numbers and lists of numbers that a module defines in upper case."""
+    values = {
+        name.lstrip("_"): np.asarray(value).tolist()
+        for name, value in vars(module).items()
+        if name.isupper() and isinstance(value, int | float | tuple | list | np.ndarray)
+    }
+    return {name: value for name, value in values.items() if _is_small_number_list(value)}
+
+
+def _is_small_number_list(value: object) -> bool:
+    numbers = np.asarray(value)
+    return numbers.dtype.kind in "if" and numbers.size <= _MAX_CONSTANT_SIZE

@@ -1,0 +1,157 @@
+"""The package ``kouxing-lips`` makes the faces that the server makes without recognized phones."""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soxr
+from numpy.typing import NDArray
+
+from kouxing.services.cli.web_model import web_model
+from kouxing.services.live_chain import sound_events
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.phones.events import Phone
+from tests.system import DEMO, NODE, ROOT, VOWELS_FILE
+
+SCRIPT = ROOT / "clients" / "kouxing-lips" / "tests" / "frames.mjs"
+RATE_HZ = 16_000
+DELAY_S, FRAME_RATE_HZ, EXPRESSIVENESS = 0.06, 50.0, 1.4
+Frames = NDArray[np.float32]
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("models")
+    for name, content in web_model().items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def package_output(models: Path, samples: Frames, **options: Any) -> dict[str, Any]:
+    file = models / "sound.f32"
+    samples.astype("<f4").tofile(file)
+    arguments = json.dumps({"chunk": 441, "shapes": [*SHAPE_SETS], **options})
+    printed = subprocess.run(
+        [NODE, SCRIPT, models, file, arguments], capture_output=True, check=True, timeout=120
+    )
+    output: dict[str, Any] = json.loads(printed.stdout)
+    return output
+
+
+def package_faps(models: Path, samples: Frames, **options: Any) -> Frames:
+    frames = package_output(models, samples, **options)["frames"]
+    return np.array([frame["faps"] for frame in frames], np.float32)
+
+
+def server_faps(samples: Frames) -> Frames:
+    """Return the server's frames without idle motion, as if it had recognized no phones."""
+    face = FaceAnimator(
+        load_lip_model(),
+        frame_rate_hz=FRAME_RATE_HZ,
+        delay_s=DELAY_S,
+        expressiveness=EXPRESSIVENESS,
+    )
+    events = sound_events(load_model(), samples, load_lip_predictor(), DELAY_S)
+    known = [event for event in events if not isinstance(event, Phone)]
+    return np.array([faps for event in known for _, faps in face.process(event)])
+
+
+def read(path: Path) -> Frames:
+    samples, rate_hz = read_audio(path)
+    assert rate_hz == RATE_HZ
+    return samples.astype(np.float32).reshape(-1)
+
+
+def opening(faps: Frames) -> Frames:
+    return -(faps[:, 3] + faps[:, 4])
+
+
+def assert_equal(ours: Frames, theirs: Frames) -> None:
+    """Rounding to 8 bits amplifies differences in the last digit, so a few frames may differ."""
+    assert ours.shape == theirs.shape
+    difference = np.abs(ours - theirs)
+    assert difference.mean() < 0.3
+    assert np.percentile(difference.max(axis=1), 90) < 3
+    assert np.corrcoef(opening(ours), opening(theirs))[0, 1] > 0.999
+
+
+@pytest.mark.parametrize(
+    "file", [DEMO / "hello-male.wav", DEMO / "bilabials-female.wav", VOWELS_FILE]
+)
+def test_frames_equal_the_servers(models: Path, file: Path) -> None:
+    samples = read(file)
+    assert_equal(package_faps(models, samples), server_faps(samples))
+
+
+def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
+    speech, other = read(DEMO / "lake-male.wav"), read(DEMO / "fast-female.wav")
+    samples = np.concatenate([np.zeros(7001, np.float32), 0.1 * speech, np.zeros(20_000), other])
+    assert_equal(package_faps(models, samples), server_faps(samples.astype(np.float32)))
+
+
+def test_sound_at_48_khz(models: Path) -> None:
+    samples = read(DEMO / "hello-female.wav")
+    resampled = soxr.resample(samples, RATE_HZ, 48_000)
+    ours = package_faps(models, resampled, sampleRateHz=48_000)
+    theirs = server_faps(samples)
+    assert abs(len(ours) - len(theirs)) <= 1
+    shared = min(len(ours), len(theirs))
+    assert np.corrcoef(opening(ours[:shared]), opening(theirs[:shared]))[0, 1] > 0.99
+
+
+def test_any_chunks_give_the_same_frames(models: Path) -> None:
+    samples = read(DEMO / "lake-male.wav")
+    whole = package_faps(models, samples, chunk=len(samples))
+    assert np.array_equal(whole, package_faps(models, samples, chunk=97))
+
+
+def test_weights_equal_the_servers(models: Path) -> None:
+    output = package_output(models, read(DEMO / "bilabials-female.wav"))
+    for name, shapes in SHAPE_SETS.items():
+        assert output["names"][name] == list(shapes.names)
+        for frame in output["frames"]:
+            expected = shapes.weights(np.array(frame["faps"], np.float32))
+            np.testing.assert_allclose(frame[name], expected, atol=1e-4)
+
+
+def test_voice_state_follows_the_speech(models: Path) -> None:
+    samples = read(DEMO / "hello-female.wav")
+    frames = package_output(models, np.concatenate([np.zeros(RATE_HZ, np.float32), samples]))[
+        "frames"
+    ]
+    speaking = [frame["isSpeaking"] for frame in frames]
+    assert not any(speaking[:45])
+    assert any(speaking[60:])
+    assert not any(frame["isLaughing"] for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"sampleRateHz": 4000}, "the sample rate 4000 Hz is out of range; use 8000 to 192000 Hz"),
+        ({"shapes": ["arkit52"]}, "unknown shapes arkit52; use arkit, oculus, vrm"),
+        ({"expressiveness": 3}, "expressiveness is 3; give 0.5 to 2"),
+        ({"delayMs": -1}, "delayMs is -1; give 0 to 300"),
+    ],
+)
+def test_bad_options_give_a_sentence(models: Path, options: dict[str, Any], text: str) -> None:
+    assert package_output(models, np.zeros(320, np.float32), **options) == {"error": text}
+
+
+def test_samples_that_are_not_finite_give_a_sentence(models: Path) -> None:
+    output = package_output(models, np.full(320, np.nan, np.float32))
+    assert output == {"error": "some samples are not finite; give values in [-1, 1]"}
+
+
+def test_missing_models_give_a_sentence(tmp_path: Path) -> None:
+    error = package_output(tmp_path, np.zeros(320, np.float32))["error"]
+    assert error.startswith("cannot load file://")
+    assert error.endswith("write it with: kouxing export web")
