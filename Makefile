@@ -5,6 +5,7 @@
 # make quick        the tests to run while editing, under a minute
 # make check        style, types and import rules
 # make check-wheel  installs the wheel in an empty environment, and runs it
+# make lips-demo    writes the page with lip sync in the browser to dist/lips-demo
 # make lock         updates the locked versions and hashes of all Python packages
 #
 # test and check run all their stages, report each failure, and then exit with an error.
@@ -22,6 +23,8 @@ PAGE_MODULES := three/LICENSE three/build/three.core.js three/build/three.module
 MOS := evaluation/mos/page
 CLIENT := proto/node
 JAVASCRIPT := clients/javascript
+LIPS := clients/kouxing-lips
+LIPS_MODELS := $(LIPS)/models/model.json
 AVATAR := examples/browser-vrm
 BLENDER := examples/blender/.venv
 BLENDER_LOCK := examples/blender/requirements.lock
@@ -40,12 +43,12 @@ PIP_LOCK := $(PIP) --require-hashes --requirement
 NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --no-audit --no-fund --loglevel=error --prefix
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-TEST_STAGES := test-python test-page
+TEST_STAGES := test-python test-page test-lips
 CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos javascript compose docker)
 STAGES = $(MAKE) --keep-going --no-print-directory
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run demo setup wheel test quick blender check check-wheel lock clean $(TEST_STAGES) $(CHECK_STAGES)
+.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo lock clean $(TEST_STAGES) $(CHECK_STAGES)
 
 run: setup
 	$(BIN)/kouxing run --play $(SAMPLE)
@@ -64,7 +67,8 @@ wheel: .venv/installed $(PAGE)/node_modules/.package-lock.json
 		rm -rf build $(PAGE)/vendor; exit $$status
 	ls -l dist
 
-test: .venv/installed-dev setup $(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR))
+test: .venv/installed-dev setup $(LIPS_MODELS) \
+		$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR))
 	$(STAGES) $(TEST_STAGES)
 
 test-python:
@@ -72,6 +76,9 @@ test-python:
 
 test-page:
 	$(NPM) $(PAGE) test
+
+test-lips:
+	$(NPM) $(LIPS) test
 
 quick: .venv/installed-dev
 	$(PYTEST) -q -n auto --maxprocesses 4 -m "(unit or property or contract) and not slow"
@@ -105,6 +112,7 @@ check-mos:
 
 check-javascript:
 	$(NPM) $(JAVASCRIPT) run lint
+	$(NPM) $(LIPS) run lint
 
 check-compose:
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
@@ -114,6 +122,9 @@ check-docker:
 
 check-wheel: wheel
 	$(PYTHON) deploy/check_wheel.py dist/kouxing-*.whl
+
+lips-demo: setup $(LIPS_MODELS) $(JAVASCRIPT)/node_modules/.package-lock.json
+	$(BIN)/node $(LIPS)/demo/build.mjs dist/lips-demo
 
 # The locks suit every system and Python >= 3.11. The version of torch is fixed: training depends on it.
 # When it changes, copy the hashes of its CPU builds from the index of TORCH_CPU to LOCK_TORCH_CPU.
@@ -131,7 +142,8 @@ lock: .venv/installed-dev
 
 clean:
 	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
-		$(JAVASCRIPT)/node_modules $(AVATAR)/node_modules $(PAGE)/head*.glb build dist out
+		$(JAVASCRIPT)/node_modules $(LIPS)/node_modules $(LIPS)/models $(AVATAR)/node_modules \
+		$(PAGE)/head*.glb build dist out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
@@ -154,7 +166,7 @@ $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
 	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
 
-$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR)): \
+$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR)): \
 		%/node_modules/.package-lock.json: %/package-lock.json | .venv/installed
 	$(NPM) $* ci
 	touch $@
@@ -167,3 +179,7 @@ $(BLENDER)/installed: $(BLENDER_LOCK)
 
 $(HEADS): $(HEAD_SOURCES) | .venv/installed
 	$(BIN)/kouxing head export --all --force $(PAGE)
+
+$(LIPS_MODELS): $(wildcard services/recognizer/models/*.npz) services/cli/web_model.py \
+		$(wildcard services/synthesizer/lips/learnt/*.py shared/face/*) | .venv/installed
+	$(BIN)/kouxing export web --force $(LIPS)/models

@@ -1,6 +1,7 @@
-// <kouxing-face>: a GLB or VRM model that is moved by a session or by a recording.
+// <kouxing-face>: a GLB or VRM model that is moved by a session, by a recording, or by local lip sync.
 
 import * as THREE from "three";
+import { Blinks } from "./blinks.js";
 import { DrawRate, ImageQueue, drawsInSoftware } from "./page/draw-rate.js";
 import { Player } from "./page/player.js";
 import { FapTrack } from "./page/playout.js";
@@ -17,7 +18,7 @@ const MAX_STEP_S = 0.1; // of the physics of hair
 
 /** The custom element; README.md lists its attributes. */
 export class KouxingFace extends HTMLElement {
-  static observedAttributes = ["src", "gateway", "session", "token", "recording"];
+  static observedAttributes = ["src", "gateway", "session", "token", "recording", "local"];
   #renderer = null;
   #note = document.createElement("p"); // the last error
   #drawRate = null;
@@ -33,6 +34,9 @@ export class KouxingFace extends HTMLElement {
   #values = null; // shown values of the avatar's set
   #names = [];
   #recording = null; // { frames, names, nowS, onEnded }
+  #lips = null; // a promise of the local lip sync
+  #localFaces = null; // the same, once it is loaded
+  #blinks = new Blinks();
   #drawnMs = 0;
   #animationFrame = 0;
 
@@ -71,12 +75,14 @@ export class KouxingFace extends HTMLElement {
     this.#loadId++;
     this.#resizeObserver.disconnect();
     this.#disconnect();
+    this.#closeLips();
     this.#renderer?.dispose();
     this.#renderer = null;
   }
 
   attributeChangedCallback(name) {
     if (this.#renderer === null) return;
+    if (name === "local") this.#closeLips();
     if (name === "src") this.#load();
     else this.#connect();
   }
@@ -121,6 +127,31 @@ export class KouxingFace extends HTMLElement {
     });
   }
 
+  /** The local lip sync: a promise of a LipSync of kouxing-lips. Its sources move the model. */
+  get lips() {
+    if (!this.hasAttribute("local")) throw new Error("<kouxing-face> has no attribute local; add it");
+    this.#lips ??= this.#loadLips();
+    return this.#lips;
+  }
+
+  async #loadLips() {
+    const { LipSync } = await import("kouxing-lips");
+    const models = this.getAttribute("local");
+    const lips = await LipSync.create({ shapes: ["arkit", "oculus", "vrm"], ...(models ? { models } : {}) });
+    if (this.#renderer === null || !this.hasAttribute("local")) lips.close();
+    lips.addEventListener("notice", ({ detail }) => this.dispatchEvent(new CustomEvent("notice", { detail })));
+    this.#localFaces = lips;
+    return lips;
+  }
+
+  #closeLips() {
+    this.#lips?.then(
+      (lips) => lips.close(),
+      () => {},
+    );
+    this.#lips = this.#localFaces = null;
+  }
+
   async #load() {
     const [loadId, url] = [++this.#loadId, this.getAttribute("src")];
     this.#disconnect();
@@ -155,6 +186,10 @@ export class KouxingFace extends HTMLElement {
   #connect() {
     this.#disconnect();
     if (this.#avatar === null || this.hasAttribute("recording")) return;
+    if (this.hasAttribute("local")) {
+      this.lips.catch((error) => this.#fail(error, error.message));
+      return;
+    }
     const [session, token] = ["session", "token"].map((name) => this.getAttribute(name) ?? "");
     const shapes = this.set === "faps" ? "" : this.set;
     const gateway = this.getAttribute("gateway") ?? location.origin;
@@ -199,10 +234,21 @@ export class KouxingFace extends HTMLElement {
     if (this.#avatar === null || !this.#images.isDue(nowMs)) return;
     if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize();
     if (this.#recording) this.#poseRecording();
+    else if (this.hasAttribute("local")) this.#poseLocally(nowMs);
     else if (this.#viewer !== null && this.#values !== null) this.#show(this.#player.faps, this.#names);
     this.#avatar.update(Math.min(MAX_STEP_S, (nowMs - this.#drawnMs) / 1000));
     this.#drawnMs = nowMs;
     this.#images.draw(nowMs, () => this.#renderer.render(this.#scene, this.#camera));
+  }
+
+  #poseLocally(nowMs) {
+    const face = this.#localFaces?.current;
+    if (!face) return;
+    const { set } = this;
+    const names = this.#localFaces.names[set] ?? [];
+    const values = face[set].slice();
+    this.#blinks.apply(values, names, nowMs / 1000);
+    this.#show(values, names);
   }
 
   #poseRecording() {

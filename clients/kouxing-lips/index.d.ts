@@ -7,7 +7,7 @@ export interface LipSyncEventMap {
   voice: CustomEvent<{ timeS: number; isSpeaking: boolean; isLaughing: boolean }>;
   /** New frames; `startS` is the start of the session on the clock of `context`, null for push(). */
   frames: CustomEvent<{ frames: LipFrame[]; startS: number | null }>;
-  /** A sentence for the user, for example that the page needs a click. */
+  /** A sentence for the user, for example that the page needs a click; empty once it no longer applies. */
   notice: CustomEvent<string>;
   /** An AudioBuffer has been played. */
   ended: Event;

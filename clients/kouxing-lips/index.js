@@ -234,7 +234,9 @@ export class LipSync extends EventTarget {
   }
 
   #onContextState() {
-    if (this.#source && this.#context.state === "interrupted") this.#report(TEXTS.interrupted);
+    if (this.#source === null) return;
+    if (this.#context.state === "interrupted") this.#report(TEXTS.interrupted);
+    else if (this.#context.state === "running") this.#report("");
   }
 
   #onVisibility = () => {

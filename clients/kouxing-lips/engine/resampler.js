@@ -2,7 +2,6 @@
 
 /** Streaming: any chunking gives the same samples. */
 export class Resampler {
-  #rateHz;
   #up;
   #down;
   #table; // rows of the filter, one for each phase
@@ -18,7 +17,6 @@ export class Resampler {
     if (!(rateHz >= c.MIN_RATE_HZ && rateHz <= highest)) {
       throw new RangeError(`the sample rate ${rateHz} Hz is out of range; use ${c.MIN_RATE_HZ} to ${highest} Hz`);
     }
-    this.#rateHz = rateHz;
     const common = gcd(c.SAMPLE_RATE_HZ, rateHz);
     [this.#up, this.#down] = [c.SAMPLE_RATE_HZ / common, rateHz / common];
     const lower = Math.min(1, c.SAMPLE_RATE_HZ / rateHz);

@@ -19,6 +19,8 @@ export default [
     },
   },
   { files: ["*.js"], languageOptions: { globals: globals.browser } },
-  { files: ["*-worklet.js"], languageOptions: { globals: globals.audioWorklet } },
+  { files: ["engine/*.js", "demo/*.js"], languageOptions: { globals: globals.browser } },
+  { files: ["*-worklet.js", "worklet.js"], languageOptions: { globals: globals.audioWorklet } },
+  { files: ["worker.js", "demo/service-worker.js"], languageOptions: { globals: { ...globals.worker, ...globals.serviceworker } } },
   { files: ["*.test.mjs", "tests/*.js"], languageOptions: { globals: globals.node } },
 ];

@@ -1,0 +1,118 @@
+// The demo page: heads and avatars that speak with the microphone, a sample or a file.
+
+import "kouxing-client/face.js";
+
+const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
+const AVATAR = /\.(vrm|glb)$/i;
+const byId = (id) => document.getElementById(id);
+const [face, note] = [byId("face"), byId("note")];
+
+for (const head of HEADS) {
+  const button = document.createElement("button");
+  button.setAttribute("role", "radio");
+  button.innerHTML = `<img src="heads/${head}.webp" alt="${head}">`;
+  button.onclick = () => showHead(head);
+  button.dataset.head = head;
+  byId("heads").append(button);
+}
+showHead(HEADS[0]);
+
+face.addEventListener("notice", ({ detail }) => (note.textContent = detail));
+face.addEventListener("error", ({ message }) => (note.textContent = message));
+
+byId("microphone").onclick = () =>
+  act(async (lips) => {
+    if (byId("microphone").ariaPressed === "true") {
+      lips.stop();
+      setMicrophone(false);
+      return;
+    }
+    await lips.listenToMicrophone();
+    setMicrophone(true);
+  });
+byId("sample").onclick = () => act((lips) => play(lips, "sample.wav"));
+byId("file").onchange = ({ target }) => {
+  take(target.files[0]);
+  target.value = "";
+};
+
+document.body.ondragover = (event) => {
+  event.preventDefault();
+  document.body.classList.add("dropping");
+};
+document.body.ondragleave = () => document.body.classList.remove("dropping");
+document.body.ondrop = (event) => {
+  event.preventDefault();
+  document.body.classList.remove("dropping");
+  take(event.dataTransfer.files[0]);
+};
+
+prepare();
+navigator.serviceWorker?.register("service-worker.js");
+
+/** Load the lip sync, and show its visemes and the state of the voice. */
+async function prepare() {
+  const lips = await face.lips;
+  lips.addEventListener("voice", ({ detail: { isSpeaking, isLaughing } }) => {
+    note.textContent = isLaughing ? "Laughter" : isSpeaking ? "Speech" : "Silence";
+  });
+  const items = [];
+  const show = () => {
+    requestAnimationFrame(show);
+    const weights = lips.current?.oculus;
+    if (!weights) return;
+    while (items.length < weights.length) {
+      const item = document.createElement("li");
+      item.textContent = lips.names.oculus[items.length];
+      items.push(item);
+      byId("visemes").append(item);
+    }
+    items.forEach((item, i) => item.style.setProperty("--weight", weights[i].toFixed(2)));
+  };
+  show();
+}
+
+/** Run an action on the lip sync; show the sentence of its error. */
+async function act(action) {
+  note.textContent = "";
+  try {
+    await action(await face.lips);
+  } catch (error) {
+    note.textContent = error.message;
+  }
+}
+
+async function play(lips, url) {
+  setMicrophone(false);
+  const answer = await fetch(url);
+  let buffer;
+  try {
+    buffer = await lips.context.decodeAudioData(await answer.arrayBuffer());
+  } catch {
+    throw new Error("the browser cannot read this file; choose a WAV, MP3, M4A or OGG file");
+  }
+  await lips.listenTo(buffer);
+}
+
+/** Show an avatar file, or play a sound file. */
+function take(file) {
+  if (!file) return;
+  const url = URL.createObjectURL(file);
+  if (AVATAR.test(file.name)) {
+    choose("");
+    face.setAttribute("src", url);
+  } else act((lips) => play(lips, url));
+}
+
+function showHead(head) {
+  choose(head);
+  face.setAttribute("src", `heads/${head}.glb`);
+}
+
+function choose(head) {
+  for (const button of byId("heads").children) button.ariaChecked = String(button.dataset.head === head);
+}
+
+function setMicrophone(isOn) {
+  byId("microphone").ariaPressed = String(isOn);
+}

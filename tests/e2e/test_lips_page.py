@@ -1,0 +1,136 @@
+"""The demo page of kouxing-lips in Chromium: lip sync without a server."""
+
+import base64
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kouxing.services.cli.web_model import web_model
+from tests.browser import Browser, serve_folder
+from tests.process.test_lips_package import package_faps, read
+from tests.system import DEMO, NODE, ROOT
+
+PACKAGE = ROOT / "clients" / "kouxing-lips"
+SIZE_PX = (420, 700)
+FACE = "document.getElementById('face')"
+NOTE = "document.getElementById('note').textContent"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site") / "demo"
+    subprocess.run([NODE, PACKAGE / "demo" / "build.mjs", folder], check=True, timeout=60)
+    return folder
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    browser = Browser(tmp_path, DEMO / "hello-female.wav", size_px=SIZE_PX)
+    yield browser
+    browser.close()
+
+
+def open_demo(browser: Browser, origin: str) -> None:
+    browser.command("Page.navigate", url=f"{origin}/")
+    browser.wait_for(f"{FACE}?.set != null")
+    browser.evaluate(f"{FACE}.lips.then((lips) => {{ window.lips = lips; return 1; }})")
+    browser.evaluate(
+        "window.opened = 0; window.lips.addEventListener('frames', ({ detail: { frames } }) => {"
+        " for (const { faps } of frames)"
+        " window.opened = Math.max(window.opened, -faps[3] - faps[4]); })"
+    )
+
+
+def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.click("microphone")
+        browser.wait_for("window.opened > 200")
+        browser.wait_for(f"{NOTE} === 'Speech'")
+        browser.wait_for(f"{FACE}.shown && {FACE}.shown[2] > 20")
+        browser.click("microphone")
+        assert browser.evaluate("document.getElementById('microphone').ariaPressed") == "false"
+    assert not [text for text in browser.complaints if "GL Driver" not in text]
+
+
+def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate("navigator.serviceWorker.ready.then(() => 1)")
+        browser.wait_for("navigator.serviceWorker.controller !== null")
+    open_demo(browser, origin)
+    browser.click("sample")
+    browser.wait_for("window.opened > 200")
+
+
+def test_frames_in_the_browser_equal_those_of_node(
+    browser: Browser, site: Path, tmp_path: Path
+) -> None:
+    samples = read(DEMO / "lake-male.wav")
+    for name, content in web_model().items():
+        (tmp_path / name).write_bytes(content)
+    sound = base64.b64encode(samples.astype("<f4").tobytes()).decode()
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        faps = browser.evaluate(
+            "(async () => { const all = [];"
+            "const lips = window.lips;"
+            "lips.addEventListener('frames', ({ detail }) => all.push(...detail.frames));"
+            f"const bytes = Uint8Array.from(atob('{sound}'), (c) => c.charCodeAt(0));"
+            "await lips.open(16000); lips.push(new Float32Array(bytes.buffer));"
+            "await lips.finish(); return all.map(({ faps }) => [...faps]); })()"
+        )
+    np.testing.assert_allclose(np.array(faps), package_faps(tmp_path, samples), atol=1e-3)
+
+
+def test_an_avatar_speaks(browser: Browser, site: Path) -> None:
+    avatar = site / "avatar.vrm"
+    subprocess.run([NODE.with_name("kouxing"), "head", "export", "--force", avatar], check=True)
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate(f"{FACE}.setAttribute('src', 'avatar.vrm')")
+        browser.wait_for(f"['vrm', 'arkit'].includes({FACE}.set)")
+        browser.click("sample")
+        browser.wait_for(f"({FACE}.shown?.jawOpen ?? {FACE}.shown?.aa) > 0.05")
+
+
+def test_sound_before_a_click_gives_a_notice(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        play = "window.lips.listenTo(new AudioBuffer({ length: 48000, sampleRate: 48000 }))"
+        browser.evaluate(f"{play}.then(() => 1)")
+        assert "click on the page" in browser.evaluate(NOTE)
+        browser.click("note")
+        browser.wait_for("window.lips.context.state === 'running'")
+        browser.wait_for(f"{NOTE} === ''")
+
+
+def test_a_blocked_microphone_gives_a_sentence(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate(
+            "navigator.mediaDevices.getUserMedia ="
+            " () => Promise.reject(new DOMException('', 'NotAllowedError')); 1"
+        )
+        browser.click("microphone")
+        browser.wait_for(f"{NOTE}.startsWith('the microphone is blocked; allow it')")
+        browser.evaluate(
+            "navigator.mediaDevices.getUserMedia ="
+            " () => Promise.reject(new DOMException('', 'NotFoundError')); 1"
+        )
+        browser.click("microphone")
+        browser.wait_for(f"{NOTE}.startsWith('no microphone was found')")
+
+
+def test_wrong_files_give_a_sentence(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate(
+            "const drop = new Event('drop', { bubbles: true });"
+            "drop.dataTransfer = { files: [new File(['text'], 'speech.txt')] };"
+            "document.body.dispatchEvent(drop); 1"
+        )
+        browser.wait_for(f"{NOTE}.startsWith('the browser cannot read this file')")
