@@ -395,6 +395,24 @@ def chain(
     )
 
 
+@bench_app.command(name="lips-page")
+def lips_page(
+    audio: AudioFile,
+    package: Annotated[Path, typer.Option(help="Folder of kouxing-lips in a source tree.")] = Path(
+        "clients/kouxing-lips"
+    ),
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure size, delay and processor time of lip sync in the browser. Needs Chromium."""
+    from kouxing.evaluation.system.lips_page import measure, show
+
+    check_output(json_file, force=force)
+    figures = measure(audio, package)
+    show(figures, Console())
+    write_json(json_file, asdict(figures))
+
+
 @bench_app.command()
 def load(
     audio: Annotated[

@@ -1,13 +1,8 @@
 """A headless Chromium with one page, of which pictures can be taken, and a server of files."""
 
 import base64
-import contextlib
-import functools
-import http.server
 import io
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -56,22 +51,3 @@ class Browser(Chromium):
         data = self.command("Page.captureScreenshot", format="png")["data"]
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             return np.asarray(image.convert("RGB"))
-
-
-@contextlib.contextmanager
-def serve_folder(folder: Path, port: int = 0) -> Iterator[str]:
-    """Serve a folder like ``python -m http.server``; yield the origin."""
-
-    class Handler(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    handler = functools.partial(Handler, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()

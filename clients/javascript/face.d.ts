@@ -1,19 +1,31 @@
 import type { PhoneMessage, SessionMessage, ShapeSet } from "./index.js";
 
+/** The methods of kouxing-lips' LipSync; its own types have all. */
+export interface LocalLips extends EventTarget {
+  listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;
+  listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
+  express(strengths: Record<string, number>, holdS?: number): void;
+  resume(): Promise<void>;
+  stop(): void;
+}
+
 export interface KouxingFaceEventMap extends HTMLElementEventMap {
+  notice: CustomEvent<string>;
   session: CustomEvent<SessionMessage>;
   phone: CustomEvent<PhoneMessage>;
 }
 
 /**
- * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`.
- * Events: `load`, `error`, `session`, `phone`.
+ * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`, or `local`.
+ * Events: `load`, `error`, `session`, `phone`, `notice`.
  */
 export class KouxingFace extends HTMLElement {
   /** Set of values that moves the model; null before loading. */
   readonly set: ShapeSet | "faps" | null;
   /** The shown values: weights by name, or 68 FAPs; null before the first. */
   readonly shown: Record<string, number> | number[] | null;
+  /** The local lip sync; throws an error without the attribute `local`. */
+  readonly lips: Promise<LocalLips>;
   /** Turn the session's sound on. Call it from a click handler. */
   turnSoundOn(): Promise<void>;
   turnSoundOff(): void;

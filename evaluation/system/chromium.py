@@ -1,16 +1,22 @@
 """A headless Chromium with one page, driven by the Chrome DevTools Protocol."""
 
 import asyncio
+import contextlib
+import functools
+import http.server
 import json
 import shutil
 import subprocess
+import threading
 import time
-from collections.abc import Callable
+import wave
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 
+from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
 _TIMEOUT_S = 60.0
@@ -101,17 +107,17 @@ class Chromium:
         size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1}
         self.command("Emulation.setDeviceMetricsOverride", **size, mobile=mobile)
 
-    def cpu_s(self) -> float:
-        """Return the CPU time of the process that draws, seconds."""
-        return self._loop.run_until_complete(self._cpu_s())
+    def cpu_s(self, kind: str = "GPU") -> float:
+        """Return the CPU time of the processes of a kind: GPU (it draws), renderer or utility."""
+        return self._loop.run_until_complete(self._cpu_s(kind))
 
-    async def _cpu_s(self) -> float:
+    async def _cpu_s(self, kind: str) -> float:
         async with self._http.get(f"http://127.0.0.1:{self._port}/json/version") as answer:
             url = (await answer.json())["webSocketDebuggerUrl"]
         async with self._http.ws_connect(url) as socket:
             await socket.send_json({"id": 1, "method": "SystemInfo.getProcessInfo"})
             processes = (await socket.receive_json())["result"]["processInfo"]
-        return float(sum(process["cpuTime"] for process in processes if process["type"] == "GPU"))
+        return float(sum(process["cpuTime"] for process in processes if process["type"] == kind))
 
     def evaluate(self, script: str) -> Any:
         """Return the value of an expression of the page."""
@@ -169,6 +175,36 @@ class Chromium:
         except TimeoutError:
             state = self.evaluate("JSON.stringify(window.kouxing?.state)")
             raise TimeoutError(f"{condition}; state {state}; {self.complaints}") from None
+
+
+@contextlib.contextmanager
+def serve_folder(folder: Path, port: int = 0) -> Iterator[str]:
+    """Serve a folder like ``python -m http.server``; yield the origin."""
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    handler = functools.partial(Handler, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def write_microphone(audio: Path, wav: Path) -> None:
+    """Write a recording as the WAV file that the microphone repeats.
+
+    Raises ``UserError`` if the file is not audio.
+    """
+    samples, rate_hz = read_audio(audio)
+    with wave.open(str(wav), "wb") as voice:
+        voice.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
+        voice.writeframes((samples * 32767).astype("<i2").tobytes())
 
 
 def wait_until(condition: Callable[[], object], limit_s: float) -> None:

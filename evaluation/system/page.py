@@ -9,17 +9,15 @@ refresh after the picture was drawn.
 import os
 import tempfile
 import time
-import wave
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from kouxing.evaluation.system.chromium import Chromium
+from kouxing.evaluation.system.chromium import Chromium, write_microphone
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.evaluation.tables import format_number
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
@@ -46,12 +44,9 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
 
     Raises UserError if the file is not audio, or the services or Chromium cannot start.
     """
-    samples, rate_hz = read_audio(path)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with wave.open(str(folder / "voice.wav"), "wb") as voice:
-            voice.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
-            voice.writeframes((samples * 32767).astype("<i2").tobytes())
+        write_microphone(path, folder / "voice.wav")
         with LocalSystem(folder, console) as system:
             browser = Chromium(folder / "profile", SIZE_PX, folder / "voice.wav")
             try:

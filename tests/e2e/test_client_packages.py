@@ -19,8 +19,9 @@ import pytest
 import soundfile
 from kouxing_client import Client
 
+from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.shared.face.shapes import SHAPE_SETS
-from tests.browser import Browser, serve_folder
+from tests.browser import Browser
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file
 from tests.glb_writer import Mesh, write_glb

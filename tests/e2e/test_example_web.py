@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from kouxing_client import Client
 
+from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.wire.session import FlushSession
 from tests import heads
-from tests.browser import Browser, serve_folder
+from tests.browser import Browser
 from tests.e2e.page_control import PageControl
 from tests.system import DEMO, ROOT, Gateway, start_python, wait_until
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
-from tests.browser import Browser, serve_folder
+from tests.browser import Browser
 from tests.process.test_lips_package import package_faps, read
 from tests.system import DEMO, NODE, ROOT
 

@@ -32,6 +32,7 @@ console.log(time, values.length);
 const face: KouxingFace = document.createElement("kouxing-face");
 face.addEventListener("session", ({ detail }) => console.log(detail.epoch));
 await face.turnSoundOn();
+await (await face.lips).listenToMicrophone();
 if (face.set !== "faps" && face.shown !== null && !Array.isArray(face.shown)) console.log(face.shown.jawOpen);
 
 // @ts-expect-error: unknown shapes

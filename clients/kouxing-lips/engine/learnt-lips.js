@@ -26,7 +26,7 @@ export class LearntLips {
   constructor(model, delayS) {
     this.#model = model;
     this.#delayS = delayS;
-    this.#neutral = new Float64Array(model.mouthFaps.length);
+    this.#neutral = model.mouthFaps.map(() => 0);
     this.#stable = this.#neutral;
     this.#track = new LipTrack(this.#neutral, model.constants.track);
     this.#onTrack = this.#mouth = still(this.#neutral);

@@ -10,6 +10,7 @@ export class LipPredictor {
   #delay; // number of the used delay
   #delayS;
   #state;
+  #buffers; // of a step
 
   /** @param delayS delay of the face; the longest delay of the model that fits is used */
   constructor({ arrays, constants, mouthFaps }, delayS) {
@@ -22,6 +23,10 @@ export class LipPredictor {
     const inTime = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
     this.#delayS = inTime.at(-1) ?? delaysS[0];
     this.#delay = delaysS.indexOf(this.#delayS);
+    const { projection, entry_weights, state_weights, output_bias } = this.#weights;
+    const gates = state_weights.shape[1];
+    const sizes = [...projection.shape, entry_weights.shape[1], gates, gates, output_bias.shape[1]];
+    this.#buffers = sizes.map((size) => new Float64Array(size));
     this.reset();
   }
 
@@ -40,55 +45,47 @@ export class LipPredictor {
   processPosition(knownS, features) {
     const outputs = this.#step(features);
     const { COLUMNS, PAIRS, CLOSURE } = this.#constants;
-    const faps = new Float64Array(this.#numMouthFaps);
-    COLUMNS.forEach((column, i) => (faps[column] = outputs[i]));
+    const faps = new Array(this.#numMouthFaps).fill(0);
+    COLUMNS.forEach((column, i) => (faps[column] = Math.fround(outputs[i])));
     for (const [one, other] of PAIRS) faps[other] = faps[one];
     return { timeS: knownS - this.#delayS, delayS: this.#delayS, faps, closure: sigmoid(outputs[CLOSURE]) };
   }
 
+  /** Return the outputs at the delay, from features that stay unchanged. */
   #step(features) {
     const w = this.#weights;
-    const centered = features.map((value, i) => value - w.feature_mean.values[i]);
-    const component = times(centered, w.projection);
-    const entered = plus(times(component, w.entry_weights), w.entry_bias).map((value) => Math.max(value, 0));
-    const fromInput = plus(times(entered, w.input_weights), w.input_bias);
-    const fromState = plus(times(this.#state, w.state_weights), w.state_bias);
+    const [centered, component, entered, fromInput, fromState, outputs] = this.#buffers;
+    for (let i = 0; i < centered.length; i++) centered[i] = features[i] - w.feature_mean.values[i];
+    times(component, centered, w.projection);
+    times(entered, component, w.entry_weights, w.entry_bias);
+    for (let i = 0; i < entered.length; i++) entered[i] = Math.max(entered[i], 0);
+    times(fromInput, entered, w.input_weights, w.input_bias);
+    times(fromState, this.#state, w.state_weights, w.state_bias);
     const size = this.#state.length;
-    this.#state = this.#state.map((value, i) => {
+    for (let i = 0; i < size; i++) {
       const reset = sigmoid(fromInput[i] + fromState[i]);
       const update = sigmoid(fromInput[size + i] + fromState[size + i]);
       const next = Math.tanh(fromInput[2 * size + i] + reset * fromState[2 * size + i]);
-      return (1 - update) * next + update * value;
-    });
-    const inner = new Float32Array([...this.#state, ...entered]);
-    const lips = features.subarray(features.length - w.lip_weights.shape[0]);
-    const [fromLips, recurrent] = [this.#atDelay(lips, w.lip_weights), this.#atDelay(inner, w.output_weights)];
-    const bias = w.output_bias.values.subarray(this.#delay * fromLips.length);
-    return fromLips.map((value, i) => value + recurrent[i] + bias[i]);
-  }
-
-  /** Return the product of a vector (n,) and the part of weights (n, delays, outputs) for the delay. */
-  #atDelay(vector, { values, shape: [, numDelays, numOutputs] }) {
-    const out = new Float32Array(numOutputs);
-    for (let output = 0; output < numOutputs; output++) {
-      let sum = 0;
-      for (let i = 0; i < vector.length; i++) sum += vector[i] * values[(i * numDelays + this.#delay) * numOutputs + output];
-      out[output] = sum;
+      this.#state[i] = (1 - update) * next + update * this.#state[i];
     }
-    return out;
+    const numLips = w.lip_weights.shape[0];
+    for (let output = 0; output < outputs.length; output++) {
+      const weight = (array, i) => array.values[(i * array.shape[1] + this.#delay) * outputs.length + output];
+      let sum = w.output_bias.values[this.#delay * outputs.length + output];
+      for (let i = 0; i < numLips; i++) sum += features[features.length - numLips + i] * weight(w.lip_weights, i);
+      for (let i = 0; i < size; i++) sum += this.#state[i] * weight(w.output_weights, i);
+      for (let i = 0; i < size; i++) sum += entered[i] * weight(w.output_weights, size + i);
+      outputs[output] = sum;
+    }
+    return outputs;
   }
 }
 
-/** Return the product of a vector (rows,) and a matrix. */
-function times(vector, { values, shape: [rows, columns] }) {
-  const sums = new Float64Array(columns);
+/** Compute the product of a vector (rows,) and a matrix (rows, columns), plus a bias. */
+function times(out, vector, { values, shape: [rows, columns] }, bias = null) {
+  for (let column = 0; column < columns; column++) out[column] = bias?.values[column] ?? 0;
   for (let row = 0; row < rows; row++) {
     const factor = vector[row];
-    for (let column = 0, at = row * columns; column < columns; column++, at++) sums[column] += factor * values[at];
+    for (let column = 0, at = row * columns; column < columns; column++, at++) out[column] += factor * values[at];
   }
-  return Float32Array.from(sums);
-}
-
-function plus(vector, { values }) {
-  return vector.map((value, i) => value + values[i]);
 }

@@ -10,6 +10,9 @@ export class LogMel {
   #edges;
   #cosines; // (half / 2 + 1, half): of 2 pi k n / size
   #sines;
+  #even; // sums of samples n and size - n, whose cosines are equal
+  #odd; // differences, for the sines
+  #power; // the spectrum
   #samples = new Float32Array(0);
 
   constructor({ arrays, constants: { mel } }) {
@@ -25,6 +28,7 @@ export class LogMel {
         wave((2 * Math.PI * ((Math.floor(i / half) * (i % half)) % this.#size)) / this.#size),
       );
     [this.#cosines, this.#sines] = [table(Math.cos), table(Math.sin)];
+    [this.#even, this.#odd, this.#power] = [half, half, half + 1].map((size) => new Float64Array(size));
   }
 
   /** Take samples at 16 kHz, in [-1, 1]; return the new feature frames. */
@@ -43,36 +47,39 @@ export class LogMel {
 
   #bandsOf(powers) {
     const { shape, values } = this.#bands;
-    return Float32Array.from(this.#edges, ([first, end], band) => {
+    const bands = new Float32Array(this.#edges.length);
+    for (let band = 0; band < bands.length; band++) {
+      const [first, end] = this.#edges[band];
       let total = 0;
       for (let bin = first; bin < end; bin++) total += values[bin * shape[1] + band] * powers[bin];
-      return (Math.log10(Math.max(total, this.#floor)) + 4) / 4;
-    });
+      bands[band] = (Math.log10(Math.max(total, this.#floor)) + 4) / 4;
+    }
+    return bands;
   }
 
   /** Return the power spectrum, a discrete Fourier transform that uses three symmetries. */
   #powers(samples) {
     const half = this.#size / 2;
-    const even = new Float64Array(half); // sums of samples n and size - n, whose cosines are equal
-    const odd = new Float64Array(half); // differences, for the sines
+    const [even, odd, powers, cosines, sines] = [this.#even, this.#odd, this.#power, this.#cosines, this.#sines];
     const at = (n) => this.#window[n] * samples[n];
     even[0] = at(0);
     const middle = at(half);
     for (let n = 1; n < half; n++) {
-      const [one, other] = [at(n), at(this.#size - n)];
+      const one = at(n);
+      const other = at(this.#size - n);
       even[n] = one + other;
       odd[n] = one - other;
     }
-    const powers = new Float64Array(half + 1);
     for (let k = 0; k <= half / 2; k++) {
       // terms with even and odd n; bin half - k has the same with other signs
-      let [realEven, realOdd, imaginaryEven, imaginaryOdd] = [k % 2 ? -middle : middle, 0, 0, 0];
+      let realEven = k % 2 ? -middle : middle;
+      let [realOdd, imaginaryEven, imaginaryOdd] = [0, 0, 0];
       const row = k * half;
       for (let n = 0; n < half; n += 2) {
-        realEven += even[n] * this.#cosines[row + n];
-        realOdd += even[n + 1] * this.#cosines[row + n + 1];
-        imaginaryEven += odd[n] * this.#sines[row + n];
-        imaginaryOdd += odd[n + 1] * this.#sines[row + n + 1];
+        realEven += even[n] * cosines[row + n];
+        realOdd += even[n + 1] * cosines[row + n + 1];
+        imaginaryEven += odd[n] * sines[row + n];
+        imaginaryOdd += odd[n + 1] * sines[row + n + 1];
       }
       powers[k] = (realEven + realOdd) ** 2 + (imaginaryEven + imaginaryOdd) ** 2;
       powers[half - k] = (realEven - realOdd) ** 2 + (imaginaryOdd - imaginaryEven) ** 2;

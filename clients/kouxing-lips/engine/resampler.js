@@ -34,12 +34,15 @@ export class Resampler {
     known.set(samples, this.#known.length);
     const end = this.#first + known.length;
     const numReady = Math.max(0, Math.ceil(((end - this.#half) * this.#up) / this.#down) - this.#numOut);
-    const out = Float32Array.from({ length: numReady }, (_, row) => {
+    const out = new Float32Array(numReady);
+    for (let row = 0; row < numReady; row++) {
       const position = (this.#numOut + row) * this.#down;
       const begin = Math.floor(position / this.#up) - this.#half + 1 - this.#first;
       const filter = this.#table[position % this.#up];
-      return filter.reduce((total, weight, tap) => total + weight * known[begin + tap], 0);
-    });
+      let total = 0;
+      for (let tap = 0; tap < filter.length; tap++) total += filter[tap] * known[begin + tap];
+      out[row] = total;
+    }
     this.#numOut += numReady;
     const drop = Math.max(0, Math.floor((this.#numOut * this.#down) / this.#up) - this.#half + 1 - this.#first);
     this.#known = known.slice(drop);

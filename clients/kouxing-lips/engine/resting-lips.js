@@ -92,5 +92,5 @@ export class RestingLips {
 }
 
 function wayTo(goal, share, velocity, durationS) {
-  return new Transition({ value: Float64Array.of(share - goal), velocity: Float64Array.of(velocity) }, durationS);
+  return new Transition({ value: [share - goal], velocity: [velocity] }, durationS);
 }

@@ -21,6 +21,8 @@ export class ShapeSet {
   #gram;
   #right;
   #scratch; // a matrix
+  #atOne; // which weights were 1 in the last solution, the first guess of the next
+  #free; // which were between 0 and 1
   #finish;
   #c; // constants
 
@@ -32,6 +34,8 @@ export class ShapeSet {
     this.#gram = rowsOf(arrays[`shapes.${set}.gram`]);
     this.#right = rowsOf(arrays[`shapes.${set}.right`]);
     this.#scratch = new Float64Array(this.names.length ** 2);
+    this.#atOne = this.names.map(() => false);
+    this.#free = this.names.map(() => false);
     this.#finish = FINISH[set] ?? (() => {});
   }
 
@@ -45,9 +49,7 @@ export class ShapeSet {
 
   #solve(right) {
     const all = [...right.keys()];
-    const guess = this.#solveFor(all, right.slice());
-    const atOne = guess.map((value) => value >= 1);
-    const free = guess.map((value) => value > 0 && value < 1);
+    const [atOne, free] = [this.#atOne, this.#free];
     let [fewest, patience] = [right.length + 1, this.#c.PATIENCE];
     for (;;) {
       const weights = atOne.map(Number);

@@ -3,7 +3,7 @@
 
 /** A state { value, velocity } that does not move. */
 export function still(value) {
-  return { value, velocity: new Float64Array(value.length) };
+  return { value, velocity: value.map(() => 0) };
 }
 
 /** Return a state plus a factor times another. */
@@ -14,7 +14,7 @@ export function add(one, other, factor = 1) {
   };
 }
 
-/** Leads a difference to zero along a cubic. */
+/** Leads a difference, a state, to zero along a cubic. */
 export class Transition {
   #difference;
   #durationS;
@@ -54,10 +54,10 @@ export class LipTrack {
 
   append(timeS, faps) {
     const { MAX_GAP_S, CLOSE_S, OPEN_S } = this.#constants;
-    let velocity = new Float64Array(faps.length);
+    let velocity = faps.map(() => 0);
     if (timeS - this.endS <= MAX_GAP_S) {
       const { value } = this.#knots.at(-1).state;
-      velocity = velocity.map((_, i) => (faps[i] - value[i]) / (timeS - this.endS));
+      velocity = faps.map((x, i) => (x - value[i]) / (timeS - this.endS));
     } else {
       if (this.#knots.length) this.#knots.push({ timeS: this.endS + CLOSE_S, state: this.#rest });
       this.#knots.push({ timeS: timeS - OPEN_S, state: this.#rest });

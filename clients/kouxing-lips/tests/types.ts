@@ -1,0 +1,27 @@
+// The API in TypeScript. Only the types are checked.
+
+import { LipSync } from "kouxing-lips";
+import { LipEngine } from "kouxing-lips/engine";
+import type { LipFrame } from "kouxing-lips";
+
+const lips: LipSync = await LipSync.create({ shapes: ["vrm"], delayMs: 160 });
+lips.addEventListener("voice", ({ detail }) => console.log(detail.isLaughing));
+await lips.listenToMicrophone({ noiseSuppression: false });
+await lips.listenTo(document.querySelector("audio")!);
+await lips.open(24000);
+lips.push(new Float32Array(480));
+await lips.finish();
+lips.express({ joy: 0.5 });
+const face: LipFrame | null = lips.current;
+if (face?.vrm) console.log(face.vrm[lips.names.vrm!.indexOf("aa")]);
+lips.close();
+
+const engine = await LipEngine.load({ sampleRateHz: 48000, shapes: ["oculus"] });
+for (const { timeS, oculus } of engine.push(new Float32Array(480))) console.log(timeS, oculus?.[0]);
+
+// @ts-expect-error: unknown shapes
+await LipEngine.load({ shapes: ["apple"] });
+// @ts-expect-error: unknown expression
+lips.express({ happy: 1 });
+// @ts-expect-error: samples are not text
+lips.push("sound");
