@@ -180,6 +180,7 @@ $(BLENDER)/installed: $(BLENDER_LOCK)
 $(HEADS): $(HEAD_SOURCES) | .venv/installed
 	$(BIN)/kouxing head export --all --force $(PAGE)
 
-$(LIPS_MODELS): $(wildcard services/recognizer/models/*.npz) services/cli/web_model.py \
-		$(wildcard services/synthesizer/lips/learnt/*.py shared/face/*) | .venv/installed
+$(LIPS_MODELS): services/cli/web_model.py $(wildcard services/recognizer/models/*.npz \
+		services/recognizer/*.py services/recognizer/*/*.py services/synthesizer/*.py \
+		services/synthesizer/modifiers/*.py services/synthesizer/lips/learnt/*.py shared/face/*) | .venv/installed
 	$(BIN)/kouxing export web --force $(LIPS)/models

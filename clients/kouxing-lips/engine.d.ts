@@ -18,6 +18,8 @@ export interface EngineOptions {
   shapes?: ShapeSetName[];
   /** Size of the mouth movements, 0.5 to 2; default: the server's. */
   expressiveness?: number;
+  /** How strongly the face shows the feeling in the voice, 0 to 1; default: the server's, 0.5. */
+  feeling?: number;
   /** Sound after a frame that is known when the frame is made, ms; default: the server's, 60. */
   delayMs?: number;
 }

@@ -4,7 +4,7 @@
 file           contents
 ============== =====================================================================
 ``ear.onnx``   the network of the small ear, unchanged
-``model.bin``  arrays: mel bands, lip predictor, blendshapes, expressions
+``model.bin``  arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
 ``model.json`` types, shapes and places of these arrays; constants of the modules
 ============== =====================================================================
 
@@ -22,14 +22,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer import ear, lip_frames, lip_predictor, speech_segmenter, stream
+from kouxing.services.recognizer import (
+    ear,
+    lip_frames,
+    lip_predictor,
+    speech_segmenter,
+    stream,
+    voice_traits,
+)
 from kouxing.services.recognizer.acoustic import network
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import features, pcm, resample, vad, whisper_mel
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.learnt import closures, model, rest, track
-from kouxing.services.synthesizer.modifiers import expressiveness
+from kouxing.services.synthesizer.modifiers import expressiveness, feeling, laughter
 from kouxing.shared import clock
 from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
@@ -46,6 +53,8 @@ _MODULES = {
     "expression": expression_motion,
     "expressiveness": expressiveness,
     "features": features,
+    "feeling": feeling,
+    "laughter": laughter,
     "learnt": model,
     "lips": lip_predictor,
     "lipFrames": lip_frames,
@@ -58,6 +67,7 @@ _MODULES = {
     "shapes": shapes,
     "stream": stream,
     "track": track,
+    "traits": voice_traits,
     "vad": vad,
 }
 
@@ -65,10 +75,12 @@ _MODULES = {
 def web_model() -> dict[str, bytes]:
     """Return the contents of the files by name."""
     small_ear = ear.load_ear()
+    readout = voice_traits.load_voice_readout()
     predictor = lip_predictor.load_lip_predictor()
     arrays: dict[str, NDArray[Any]] = {
         "mel.bands": whisper_mel.mel_bands(),
         **{f"lips.{field.name}": getattr(predictor, field.name) for field in fields(predictor)},
+        **{f"traits.{field.name}": getattr(readout, field.name) for field in fields(readout)},
         **{f"expressions.{name}": faps for name, faps in expression_motion.EXPRESSION_FAPS.items()},
     }
     for name, shape_set in shapes.SHAPE_SETS.items():
@@ -87,6 +99,7 @@ def web_model() -> dict[str, bytes]:
             "frameRateHz": settings.frame_rate_hz,
             "delayS": settings.delay_ms / 1e3,
             "expressiveness": settings.expressiveness,
+            "feeling": settings.feeling,
             "expressivenessRange": (MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS),
         },
         "shapeNames": {name: shape_set.names for name, shape_set in shapes.SHAPE_SETS.items()},

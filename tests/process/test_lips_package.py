@@ -23,7 +23,8 @@ from tests.system import DEMO, NODE, ROOT, VOWELS_FILE
 
 SCRIPT = ROOT / "clients" / "kouxing-lips" / "tests" / "frames.mjs"
 RATE_HZ = 16_000
-DELAY_S, FRAME_RATE_HZ, EXPRESSIVENESS = 0.06, 50.0, 1.4
+DELAY_S, FRAME_RATE_HZ, EXPRESSIVENESS, FEELING = 0.06, 50.0, 1.4, 0.5
+HEAD_TURN = slice(47, 50)  # FAPs 48 to 50
 Frames = NDArray[np.float32]
 
 
@@ -58,6 +59,7 @@ def server_faps(samples: Frames) -> Frames:
         frame_rate_hz=FRAME_RATE_HZ,
         delay_s=DELAY_S,
         expressiveness=EXPRESSIVENESS,
+        feeling=FEELING,
     )
     events = sound_events(load_model(), samples, load_lip_predictor(), DELAY_S)
     known = [event for event in events if not isinstance(event, Phone)]
@@ -78,6 +80,7 @@ def assert_equal(ours: Frames, theirs: Frames) -> None:
     """Rounding to 8 bits amplifies differences in the last digit, so a few frames may differ."""
     assert ours.shape == theirs.shape
     difference = np.abs(ours - theirs)
+    difference[:, HEAD_TURN] /= 100  # of 1e-5 radians; a hundredth of a degree is not visible
     assert difference.mean() < 0.3
     assert np.percentile(difference.max(axis=1), 90) < 3
     assert np.corrcoef(opening(ours), opening(theirs))[0, 1] > 0.999

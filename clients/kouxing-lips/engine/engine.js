@@ -25,16 +25,17 @@ export class LipEngine {
   #isSpeaking = false;
 
   /** Use LipEngine.load instead. */
-  constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, delayMs } = {}) {
+  constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, feeling, delayMs } = {}) {
     const { defaults, constants } = model;
     const delayS = inRange("delayMs", delayMs ?? 1000 * defaults.delayS, 0, MAX_DELAY_MS) / 1000;
     const amount = inRange("expressiveness", expressiveness ?? defaults.expressiveness, ...defaults.expressivenessRange);
+    const strength = inRange("feeling", feeling ?? defaults.feeling, 0, 1);
     this.#model = model;
     this.#rateHz = sampleRateHz;
     this.#slice = new Float32Array(constants.pcm.SLICE);
     this.#resampler = new Resampler(sampleRateHz, model);
     this.#segmenter = new SpeechSegmenter(model, delayS);
-    this.#face = new Face(model, { delayS, expressiveness: amount });
+    this.#face = new Face(model, { delayS, expressiveness: amount, feeling: strength });
     this.#shapes = shapes.map((set) => [set, new ShapeSet(set, model)]);
     /** Names of the weights of each set. */
     this.names = Object.fromEntries(this.#shapes.map(([set, { names }]) => [set, names]));
@@ -93,8 +94,8 @@ export class LipEngine {
   #processSlice() {
     const events = this.#segmenter.accept(this.#slice);
     this.#numSamples += this.#slice.length;
-    const { isLaughter } = this.#segmenter;
-    events.push({ type: "progress", timeS: this.#mediaTimeS, levelDb: levelDb(this.#slice, this.#model.constants.stream), isLaughter });
+    const level = levelDb(this.#slice, this.#model.constants.stream);
+    events.push({ ...this.#segmenter.traits, type: "progress", timeS: this.#mediaTimeS, levelDb: level });
     return this.#animate(events);
   }
 
@@ -105,7 +106,7 @@ export class LipEngine {
         timeS,
         faps,
         isSpeaking: this.#isSpeaking,
-        isLaughing: this.#segmenter.isLaughter,
+        isLaughing: this.#segmenter.traits.isLaughter,
         ...Object.fromEntries(this.#shapes.map(([set, shapes]) => [set, shapes.weights(faps)])),
       }));
     });

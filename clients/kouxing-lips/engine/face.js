@@ -2,6 +2,7 @@
 // rules.
 
 import { Expressions, applyExpressiveness } from "./expressions.js";
+import { Feeling } from "./feeling.js";
 import { LearntLips } from "./learnt-lips.js";
 
 export class Face {
@@ -12,12 +13,13 @@ export class Face {
   #lips;
   #expressions;
   #laughter;
-  #hasLaughed = false;
+  #feeling;
+  #voice = []; // the current progress and later ones
   #nextFrame = 0;
   #isSpeaking = false; // at the last frame
   #changes = []; // of future frames
 
-  constructor(model, { delayS, expressiveness }) {
+  constructor(model, { delayS, expressiveness, feeling }) {
     this.#model = model;
     this.#delayS = delayS;
     this.#rateHz = model.defaults.frameRateHz;
@@ -25,6 +27,7 @@ export class Face {
     this.#lips = new LearntLips(model, delayS);
     this.#expressions = new Expressions(model);
     this.#laughter = new Expressions(model);
+    this.#feeling = new Feeling(model, feeling);
   }
 
   express(strengths, holdS) {
@@ -33,7 +36,7 @@ export class Face {
 
   /** Process an event; return the frames { timeS, faps } that are now due. */
   process(event) {
-    const { REST_S, LAUGHTER_HOLD_S } = this.#model.constants.animator;
+    const { REST_S } = this.#model.constants.animator;
     if (event.type === "end") {
       const silence = { type: "speech", active: false, timeS: event.timeS };
       this.#lips.addEvent(silence);
@@ -41,10 +44,7 @@ export class Face {
     }
     this.#lips.addEvent(event);
     if (event.type === "speech") this.#changes.push(event);
-    if (event.isLaughter) {
-      this.#laughter.show({ joy: 1 }, LAUGHTER_HOLD_S);
-      this.#hasLaughed = true;
-    }
+    if (event.type === "progress") this.#voice.push(event);
     if (event.type === "end") return this.#framesUntil(event.timeS + this.#delayS + REST_S);
     return event.type === "progress" ? this.#framesUntil(event.timeS) : [];
   }
@@ -57,16 +57,21 @@ export class Face {
   }
 
   #makeFrame(timeS) {
-    const { MOUTH, SPEECH_LEAD_S } = this.#model.constants.animator;
+    const { MOUTH, SPEECH_LEAD_S, VOICE_LEAD_S } = this.#model.constants.animator;
     while (this.#changes[0]?.timeS <= timeS) this.#isSpeaking = this.#changes.shift().active;
     const startsSoon = this.#changes.some((change) => change.active && change.timeS <= timeS + SPEECH_LEAD_S);
+    while (this.#voice[1]?.timeS <= timeS + VOICE_LEAD_S) this.#voice.shift();
+    const voice = this.#voice[0];
+    const stepS = 1 / this.#rateHz;
     const mouth = this.#lips.frameAt(timeS);
     const faps = new Float32Array(this.#model.numFaps);
     MOUTH.forEach((fap, i) => (faps[fap] = mouth[i]));
     applyExpressiveness(faps, this.#expressiveness, this.#model);
     const isSpeaking = this.#isSpeaking || startsSoon;
-    this.#expressions.apply(faps, 1 / this.#rateHz, isSpeaking);
-    if (this.#hasLaughed) this.#laughter.apply(faps, 1 / this.#rateHz, isSpeaking);
+    this.#feeling.apply(faps, stepS, isSpeaking ? voice : null);
+    this.#expressions.apply(faps, stepS, isSpeaking);
+    if (voice?.isLaughter) this.#laughter.show({ joy: 1 }, this.#model.constants.laughter.HOLD_S);
+    this.#laughter.apply(faps, stepS, isSpeaking);
     return { timeS, faps };
   }
 }

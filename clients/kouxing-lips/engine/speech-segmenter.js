@@ -3,30 +3,27 @@
 
 import { LipPredictor } from "./lip-predictor.js";
 import { LogMel } from "./log-mel.js";
+import { VoiceTraits } from "./voice-traits.js";
 
-class Detector {
-  isOn = false;
-  #noEvidence;
-  #enough;
-  #constants;
+class VoiceActivityDetector {
+  isSpeech = false;
+  #c; // constants
   #evidence = 0;
   #numImprobable = 0;
 
-  constructor(noEvidence, enough, constants) {
-    this.#noEvidence = noEvidence;
-    this.#enough = enough;
-    this.#constants = constants;
+  constructor({ constants }) {
+    this.#c = constants.vad;
   }
 
   update(probability) {
-    this.#numImprobable = probability >= this.#constants.IMPROBABLE ? 0 : this.#numImprobable + 1;
-    if (this.isOn) {
-      this.isOn = this.#numImprobable < this.#constants.STOP_POSITIONS;
+    this.#numImprobable = probability >= this.#c.IMPROBABLE ? 0 : this.#numImprobable + 1;
+    if (this.isSpeech) {
+      this.isSpeech = this.#numImprobable < this.#c.STOP_POSITIONS;
       return;
     }
-    this.#evidence = Math.max(0, this.#evidence + probability - this.#noEvidence);
-    this.isOn = this.#evidence >= this.#enough;
-    if (this.isOn) this.#evidence = 0;
+    this.#evidence = Math.max(0, this.#evidence + probability - this.#c.NO_EVIDENCE);
+    this.isSpeech = this.#evidence >= this.#c.ENOUGH;
+    if (this.isSpeech) this.#evidence = 0;
   }
 }
 
@@ -35,8 +32,8 @@ export class SpeechSegmenter {
   #mel;
   #lips;
   #state; // of the ear
-  #speech;
-  #laughter;
+  #detector;
+  #traits;
   #frames = []; // of the next position
   #recent = []; // features of the positions before speech
   #numFrames = 0;
@@ -47,13 +44,13 @@ export class SpeechSegmenter {
     this.#mel = new LogMel(model);
     this.#lips = new LipPredictor(model, delayS);
     this.#state = new Float32Array(model.stateWidth);
-    const vad = model.constants.vad;
-    this.#speech = new Detector(vad.SPEECH_NO_EVIDENCE, vad.SPEECH_ENOUGH, vad);
-    this.#laughter = new Detector(vad.LAUGHTER_NO_EVIDENCE, vad.LAUGHTER_ENOUGH, vad);
+    this.#detector = new VoiceActivityDetector(model);
+    this.#traits = new VoiceTraits(model);
   }
 
-  get isLaughter() {
-    return this.#laughter.isOn;
+  /** What the voice shows at the end of the audio: { arousal, valence, isLaughter, isBreath }. */
+  get traits() {
+    return this.#traits.newest;
   }
 
   /** Take samples at 16 kHz; return speech changes and lip frames, in order. */
@@ -77,16 +74,16 @@ export class SpeechSegmenter {
   }
 
   #process(features, voice) {
-    const { SPEECH, SUNG, LAUGHTER } = this.#model.voices;
+    const { SPEECH, SUNG } = this.#model.voices;
     if (!this.#isSpeaking) {
       this.#recent.push(features);
       if (this.#recent.length > this.#model.constants.segmenter.MAX_RECENT) this.#recent.shift();
     }
-    this.#speech.update(Math.fround(voice[SPEECH] + voice[SUNG]));
-    this.#laughter.update(voice[LAUGHTER]);
-    if (this.#isSpeaking && !this.#speech.isOn) return [this.#endSpeech()];
+    this.#detector.update(Math.fround(voice[SPEECH] + voice[SUNG]));
+    this.#traits.accept(this.#state, voice);
+    if (this.#isSpeaking && !this.#detector.isSpeech) return [this.#endSpeech()];
     if (this.#isSpeaking) return this.#predict(features, this.#numFrames - 1);
-    return this.#speech.isOn ? this.#startSpeech() : [];
+    return this.#detector.isSpeech ? this.#startSpeech() : [];
   }
 
   #startSpeech() {

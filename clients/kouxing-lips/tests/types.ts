@@ -4,7 +4,7 @@ import { LipSync } from "kouxing-lips";
 import { LipEngine } from "kouxing-lips/engine";
 import type { LipFrame } from "kouxing-lips";
 
-const lips: LipSync = await LipSync.create({ shapes: ["vrm"], delayMs: 160 });
+const lips: LipSync = await LipSync.create({ shapes: ["vrm"], delayMs: 160, feeling: 0 });
 lips.addEventListener("voice", ({ detail }) => console.log(detail.isLaughing));
 await lips.listenToMicrophone({ noiseSuppression: false });
 await lips.listenTo(document.querySelector("audio")!);

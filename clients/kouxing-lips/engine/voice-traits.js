@@ -1,0 +1,53 @@
+// Feeling, laughter and breath in a voice; services/recognizer/voice_traits.py has the formulas.
+
+import { clamp } from "./math.js";
+
+export class VoiceTraits {
+  /** What the voice shows at the newest position. */
+  newest = { arousal: 0, valence: 0, isLaughter: false, isBreath: false };
+  #c; // constants
+  #voices;
+  #weights;
+  #bias;
+  #feeling; // arousal and valence
+  #mean;
+  #numVoiced = 0;
+  #evidence = [0, 0]; // of laughter, of breath
+
+  constructor({ arrays, constants, voices }) {
+    this.#c = constants.traits;
+    this.#voices = voices;
+    this.#weights = arrays["traits.weights"];
+    this.#bias = arrays["traits.bias"].values;
+    this.#feeling = this.#mean = [...arrays["traits.mean"].values];
+  }
+
+  /** Take the next position's state and probabilities of the kinds of voice. */
+  accept(state, voice) {
+    const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_SHARE } = this.#c;
+    const { values, shape } = this.#weights;
+    const outputs = Array.from(this.#bias, (bias, output) =>
+      state.reduce((sum, value, i) => sum + value * values[i * shape[1] + output], bias),
+    );
+    const towards = (values_, share) => values_.map((value, i) => value + share * (outputs[i] - value));
+    if (voice[this.#voices.SPEECH] + voice[this.#voices.SUNG] > MIN_VOICE) {
+      this.#numVoiced++;
+      this.#mean = towards(this.#mean, 1 / Math.min(this.#numVoiced + PRIOR_POSITIONS, MAX_POSITIONS));
+      this.#feeling = towards(this.#feeling, 1 / Math.min(this.#numVoiced + PRIOR_FEELING, MEAN_POSITIONS));
+    }
+    this.#evidence = this.#evidence.map((value, i) => value + EVIDENCE_SHARE * (outputs[2 + i] - value));
+    const [arousal, valence] = this.#feeling.map((value, i) => this.#rounded(clamp(value - this.#mean[i], -1, 1)));
+    const isOn = (evidence, wasOn) => evidence > (wasOn ? this.#c.STOP : this.#c.START);
+    this.newest = {
+      arousal,
+      valence,
+      isLaughter: isOn(this.#evidence[0], this.newest.isLaughter),
+      isBreath: isOn(this.#evidence[1], this.newest.isBreath),
+    };
+  }
+
+  #rounded(value) {
+    const scale = 10 ** this.#c.DIGITS;
+    return Math.round(scale * value) / scale;
+  }
+}
