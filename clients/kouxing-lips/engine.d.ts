@@ -14,6 +14,8 @@ export type ExpressionName =
   | "squint";
 
 export interface EngineOptions {
+  /** Whether to recognize phones, which also improve the closures of the lips; default: true. */
+  phones?: boolean;
   /** Sets of weights to compute; default: `["arkit"]`. */
   shapes?: ShapeSetName[];
   /** Size of the mouth movements, 0.5 to 2; default: the server's. */
@@ -36,6 +38,23 @@ export interface LipFrame extends Partial<Record<ShapeSetName, Float32Array>> {
   isLaughing: boolean;
 }
 
+/**
+ * A recognized phone of Mandarin. It is emitted at least twice: first with an estimated duration, at
+ * last with `isFinal`. A phone with `isFinal` and the duration 0 is withdrawn.
+ */
+export interface LipPhone {
+  /** Counts the phones of a session from 0. */
+  index: number;
+  /** An initial, a final, or "sil". */
+  symbol: string;
+  /** Seconds from the first sample. */
+  onsetS: number;
+  durationS: number;
+  /** 0 to 1. */
+  confidence: number;
+  isFinal: boolean;
+}
+
 /** Lip sync of one voice, without a browser. */
 export class LipEngine {
   /** Load the models and start a session. `models` is the URL of their folder; default: the package's. */
@@ -46,6 +65,8 @@ export class LipEngine {
   readonly inputS: number;
   /** Take samples, mono in [-1, 1]; return the frames that are due, 50 per second. */
   push(samples: Float32Array): LipFrame[];
+  /** Phones that the last push() or finish() found or changed. */
+  readonly newPhones: LipPhone[];
   /** End the audio; return the remaining frames, until the face is at rest. */
   finish(): LipFrame[];
   /** Show expressions, strengths 0 to 1, for some seconds. */

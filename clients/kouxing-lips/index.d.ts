@@ -1,10 +1,12 @@
-import type { EngineOptions, ExpressionName, LipFrame, ShapeSetName } from "./engine.js";
+import type { EngineOptions, ExpressionName, LipFrame, LipPhone, ShapeSetName } from "./engine.js";
 
-export type { EngineOptions, ExpressionName, LipFrame, ShapeSetName };
+export type { EngineOptions, ExpressionName, LipFrame, LipPhone, ShapeSetName };
 
 export interface LipSyncEventMap {
   /** The voice starts or ends, or laughter does. */
   voice: CustomEvent<{ timeS: number; isSpeaking: boolean; isLaughing: boolean }>;
+  /** A phone is found or changed. */
+  phone: CustomEvent<LipPhone>;
   /** New frames; `startS` is the start of the session on the clock of `context`, null for push(). */
   frames: CustomEvent<{ frames: LipFrame[]; startS: number | null }>;
   /** A sentence for the user, for example that the page needs a click; empty once it no longer applies. */

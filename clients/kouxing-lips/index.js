@@ -44,13 +44,13 @@ export class LipSync extends EventTarget {
   }
 
   /** Load the models and the worker. */
-  static async create({ models = MODELS, shapes = DEFAULT_SHAPES, ...options } = {}) {
+  static async create({ models = MODELS, phones = true, shapes = DEFAULT_SHAPES, ...options } = {}) {
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
     const lips = new LipSync(worker, { shapes, ...options });
     await new Promise((resolve, reject) => {
       lips.#pending.set("loaded", resolve).set("failed", reject);
       worker.onerror = () => reject(new Error("cannot start the worker; serve the package from the page's own origin"));
-      worker.postMessage({ type: "load", models: new URL(models, location.href).href });
+      worker.postMessage({ type: "load", models: new URL(models, location.href).href, phones });
     });
     return lips;
   }
@@ -222,7 +222,9 @@ export class LipSync extends EventTarget {
     resolve?.();
   }
 
-  #onFrames({ frames, startS }) {
+  #onFrames({ frames, phones, startS }) {
+    for (const phone of phones) this.dispatchEvent(new CustomEvent("phone", { detail: phone }));
+    if (frames.length === 0) return;
     this.#track.push(frames);
     const { timeS, isSpeaking, isLaughing } = frames.at(-1);
     if (this.#source) this.#source.startS = startS;

@@ -17,8 +17,8 @@ self.onmessage = async ({ data: { type, ...data } }) => {
 
 const HANDLERS = {
   /** Load the models. */
-  async load({ models }) {
-    model = await loadModel(models);
+  async load({ models, phones }) {
+    model = await loadModel(models, { phones });
     self.postMessage({ type: "loaded" });
   },
 
@@ -51,5 +51,6 @@ const HANDLERS = {
 
 /** Send frames to the page; startS is the start of the session on the clock of the audio thread. */
 function send(session, frames, startS = null) {
-  if (frames.length) self.postMessage({ type: "frames", session, frames, startS });
+  const phones = engine.newPhones;
+  if (frames.length || phones.length) self.postMessage({ type: "frames", session, frames, phones, startS });
 }

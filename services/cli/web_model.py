@@ -5,6 +5,7 @@ file           contents
 ============== =====================================================================
 ``ear.onnx``   the network of the small ear, unchanged
 ``model.bin``  arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
+``phones.bin`` arrays: HMMs and phone language model of the light model, needed only for phones
 ``model.json`` types, shapes and places of these arrays; constants of the modules
 ============== =====================================================================
 
@@ -26,13 +27,19 @@ from kouxing.services.recognizer import (
     ear,
     lip_frames,
     lip_predictor,
+    live_decoder,
     speech_segmenter,
     stream,
     voice_traits,
 )
-from kouxing.services.recognizer.acoustic import network
+from kouxing.services.recognizer.acoustic import model_file, network
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
+from kouxing.services.recognizer.acoustic.light import light_model_from
+from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import features, pcm, resample, vad, whisper_mel
+from kouxing.services.recognizer.search import decoder
+from kouxing.services.recognizer.search.output_rule import MODEL_RULES
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.learnt import closures, model, rest, track
@@ -50,6 +57,8 @@ _MODULES = {
     "animator": face_animator,
     "clock": clock,
     "closures": closures,
+    "decoder": decoder,
+    "ear": ear,
     "expression": expression_motion,
     "expressiveness": expressiveness,
     "features": features,
@@ -58,7 +67,9 @@ _MODULES = {
     "learnt": model,
     "lips": lip_predictor,
     "lipFrames": lip_frames,
+    "liveDecoder": live_decoder,
     "mel": whisper_mel,
+    "modelFile": model_file,
     "network": network,
     "pcm": pcm,
     "resample": resample,
@@ -86,7 +97,22 @@ def web_model() -> dict[str, bytes]:
     for name, shape_set in shapes.SHAPE_SETS.items():
         gram, right = shape_set.equation
         arrays |= {f"shapes.{name}.gram": gram, f"shapes.{name}.right": right}
+    light = light_model_from(read_archive(model_path("light")))
+    topology = light.topology
+    phone_arrays: dict[str, NDArray[Any]] = {
+        **{
+            name: array
+            for name, array in model_file.phone_lm_arrays(topology.phone_lm).items()
+            if name.startswith("lm_")
+        },
+        "first_state": topology.first_state.astype(np.int32),
+        "log_stay": topology.log_stay,
+        "log_leave": topology.log_leave,
+        "duration_mean_s": topology.duration_mean_s,
+        "log_prior": light.log_prior,
+    }
     blob, places = _pack(arrays)
+    phone_blob, phone_places = _pack(phone_arrays)
     settings = SynthesizerConfig()
     header = {
         "format": FORMAT,
@@ -105,13 +131,32 @@ def web_model() -> dict[str, bytes]:
         "shapeNames": {name: shape_set.names for name, shape_set in shapes.SHAPE_SETS.items()},
         "expressionNames": list(expression_motion.EXPRESSION_FAPS),
         "constants": {name: _constants(module) for name, module in _MODULES.items()},
+        "phones": _phones_header(topology),
         "arrays": places,
+        "phoneArrays": phone_places,
     }
     network_bytes = read_archive(ear.EAR_PATH).array("network", None).astype(np.uint8).tobytes()
     return {
         "ear.onnx": network_bytes,
         "model.bin": blob,
+        "phones.bin": phone_blob,
         "model.json": json.dumps(header, separators=(",", ":")).encode(),
+    }
+
+
+def _phones_header(topology: Topology) -> dict[str, Any]:
+    """Return what the package needs about the phones in addition to arrays."""
+    inventory, rule = topology.inventory, MODEL_RULES["light"]
+    return {
+        "symbols": inventory.phones,
+        "silence": inventory.silence,
+        "closing": {
+            viseme: [symbol for symbol, of in inventory.visemes.items() if of[0][0] == viseme]
+            for viseme in ("b", "f")
+        },
+        "lmScale": topology.lm_scale,
+        "phonePenalty": topology.phone_penalty,
+        "rule": {"numStableFrames": rule.num_stable_frames, "minConfidence": rule.min_confidence},
     }
 
 
@@ -128,7 +173,9 @@ def _pack(arrays: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, dict[str, A
 
 
 def _shortened(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array in the shortest type that keeps its values."""
+    """Return an array in the shortest type that keeps its values; integers keep theirs."""
+    if array.dtype.kind in "iu":
+        return array
     for kind in (np.float16, np.float32):
         short = array.astype(kind)
         if np.array_equal(short, array):
@@ -141,7 +188,7 @@ def _constants(module: ModuleType) -> dict[str, Any]:
     values = {
         name.lstrip("_"): np.asarray(value).tolist()
         for name, value in vars(module).items()
-        if name.isupper() and isinstance(value, int | float | tuple | list | np.ndarray)
+        if name.isupper() and isinstance(value, int | float | tuple | list | np.ndarray | np.number)
     }
     return {name: value for name, value in values.items() if _is_small_number_list(value)}
 

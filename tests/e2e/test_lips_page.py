@@ -94,7 +94,7 @@ def test_an_avatar_speaks(browser: Browser, site: Path) -> None:
         open_demo(browser, origin)
         browser.evaluate(f"{FACE}.setAttribute('src', 'avatar.vrm')")
         browser.wait_for(f"['vrm', 'arkit'].includes({FACE}.set)")
-        browser.click("sample")
+        browser.click("microphone")
         browser.wait_for(f"({FACE}.shown?.jawOpen ?? {FACE}.shown?.aa) > 0.05")
 
 

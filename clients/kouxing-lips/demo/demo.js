@@ -3,6 +3,7 @@
 import "kouxing-client/face.js";
 
 const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
+const NUM_PHONES = 12; // that are shown
 const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
 const [face, note] = [byId("face"), byId("note")];
@@ -55,6 +56,12 @@ async function prepare() {
   const lips = await face.lips;
   lips.addEventListener("voice", ({ detail: { isSpeaking, isLaughing } }) => {
     note.textContent = isLaughing ? "Laughter" : isSpeaking ? "Speech" : "Silence";
+  });
+  const phones = new Map(); // symbols by index
+  lips.addEventListener("phone", ({ detail: { index, symbol, durationS } }) => {
+    if (index === 0) phones.clear(); // a new sound
+    phones.set(index, durationS > 0 ? symbol : "");
+    note.textContent = [...phones.values()].slice(-NUM_PHONES).join(" ");
   });
   const items = [];
   const show = () => {

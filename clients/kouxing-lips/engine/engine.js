@@ -2,6 +2,7 @@
 
 import { Face } from "./face.js";
 import { loadModel } from "./model.js";
+import { PhoneRecognizer } from "./phone-recognizer.js";
 import { Resampler } from "./resampler.js";
 import { ShapeSet } from "./shapes.js";
 import { SpeechSegmenter } from "./speech-segmenter.js";
@@ -34,7 +35,7 @@ export class LipEngine {
     this.#rateHz = sampleRateHz;
     this.#slice = new Float32Array(constants.pcm.SLICE);
     this.#resampler = new Resampler(sampleRateHz, model);
-    this.#segmenter = new SpeechSegmenter(model, delayS);
+    this.#segmenter = new SpeechSegmenter(model, delayS, model.phoneArrays ? new PhoneRecognizer(model) : null);
     this.#face = new Face(model, { delayS, expressiveness: amount, feeling: strength });
     this.#shapes = shapes.map((set) => [set, new ShapeSet(set, model)]);
     /** Names of the weights of each set. */
@@ -42,9 +43,12 @@ export class LipEngine {
   }
 
   /** Load the models and start a session; the options are in index.d.ts. */
-  static async load({ models = MODELS, ...options } = {}) {
-    return new LipEngine(await loadModel(models), options);
+  static async load({ models = MODELS, phones = true, ...options } = {}) {
+    return new LipEngine(await loadModel(models, { phones }), options);
   }
+
+  /** Phones that the last push() or finish() found or changed. */
+  newPhones = [];
 
   /** Duration of the audio so far, seconds. */
   get inputS() {
@@ -62,10 +66,15 @@ export class LipEngine {
     if (!samples.every(Number.isFinite)) throw new RangeError("some samples are not finite; give values in [-1, 1]");
     this.#numIn += samples.length;
     const clipped = samples.map((sample) => Math.min(Math.max(sample, -1), 1));
-    const resampled = this.#resampler.accept(clipped);
+    this.newPhones = [];
+    return this.#process(this.#resampler.accept(clipped));
+  }
+
+  /** Process samples at 16 kHz. */
+  #process(samples) {
     const frames = [];
-    for (let begin = 0; begin < resampled.length; ) {
-      const piece = resampled.subarray(begin, begin + this.#slice.length - this.#numKnown);
+    for (let begin = 0; begin < samples.length; ) {
+      const piece = samples.subarray(begin, begin + this.#slice.length - this.#numKnown);
       this.#slice.set(piece, this.#numKnown);
       this.#numKnown += piece.length;
       begin += piece.length;
@@ -79,12 +88,14 @@ export class LipEngine {
 
   /** End the audio; return the remaining frames, until the face is at rest. */
   finish() {
+    this.newPhones = [];
+    const frames = this.#process(this.#resampler.finish());
     const events = this.#segmenter.accept(this.#slice.subarray(0, this.#numKnown));
     this.#numSamples += this.#numKnown;
     const timeS = this.#mediaTimeS;
     const { SILENT_DB } = this.#model.constants.stream;
     events.push(...this.#segmenter.finish(), { type: "progress", timeS, levelDb: SILENT_DB }, { type: "end", timeS });
-    return this.#animate(events);
+    return [...frames, ...this.#animate(events)];
   }
 
   get #mediaTimeS() {
@@ -102,6 +113,7 @@ export class LipEngine {
   #animate(events) {
     return events.flatMap((event) => {
       if (event.type === "speech") this.#isSpeaking = event.active;
+      if (event.type === "phone") this.newPhones.push(event.phone);
       return this.#face.process(event).map(({ timeS, faps }) => ({
         timeS,
         faps,

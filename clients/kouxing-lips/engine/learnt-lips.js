@@ -1,6 +1,7 @@
 // Learnt lips: lip frames and levels in, FAPs of the mouth out; services/synthesizer/lips/learnt has
-// the rules in model.py and closures.py. Without recognized phones, the tongue stays at rest.
+// the rules in model.py and closures.py. The tongue stays at rest.
 
+import { ClosingPhones, logOddsOf } from "./closing-phones.js";
 import { clamp, smoothStep } from "./math.js";
 import { RestingLips } from "./resting-lips.js";
 import { LipTrack, Transition, add, still } from "./trajectory.js";
@@ -9,6 +10,8 @@ export class LearntLips {
   #model;
   #neutral;
   #delayS;
+  #bilabials;
+  #labiodentals;
   #queue = []; // lip frames that are not due yet
   #stable; // the last lip frame, stabilized
   #shares = [0, 0]; // closure shares of the last two lip frames
@@ -26,6 +29,7 @@ export class LearntLips {
   constructor(model, delayS) {
     this.#model = model;
     this.#delayS = delayS;
+    [this.#bilabials, this.#labiodentals] = ["b", "f"].map((viseme) => new ClosingPhones(model, viseme));
     this.#neutral = model.mouthFaps.map(() => 0);
     this.#stable = this.#neutral;
     this.#track = new LipTrack(this.#neutral, model.constants.track);
@@ -38,6 +42,7 @@ export class LearntLips {
   addEvent(event) {
     this.#resting.addEvent(event);
     if (event.type === "speech") this.#isSpeaking = event.active;
+    else if (event.type === "phone") for (const phones of [this.#bilabials, this.#labiodentals]) phones.add(event.phone, this.#timeS);
     else if (event.type === "lips") {
       this.#queue.push(event);
       this.#hasLipFrames = true;
@@ -73,6 +78,8 @@ export class LearntLips {
 
   #extendTrack(timeS) {
     this.#track.forgetBefore(this.#timeS);
+    const oldestS = timeS - this.#model.constants.learnt.MEMORY_S;
+    for (const phones of [this.#bilabials, this.#labiodentals]) phones.forgetBefore(oldestS);
     while (this.#queue.length && this.#track.endS < timeS) {
       const frame = this.#queue.shift();
       this.#track.append(frame.timeS, this.#stabilize(frame));
@@ -83,7 +90,7 @@ export class LearntLips {
 
   /** Return the FAPs of the next lip frame, stabilized and with closures. */
   #stabilize(frame) {
-    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_SHARE } = this.#model.constants.learnt;
+    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_SHARE, TEETH_LOG_ODDS } = this.#model.constants.learnt;
     const { closures } = this.#model.constants;
     const rule = this.#model.closureRule;
     if (frame.timeS - this.#track.endS <= MAX_GAP_S) {
@@ -97,28 +104,27 @@ export class LearntLips {
     }
     const faps = this.#stable.slice();
     separateLips(faps, closures);
-    let closure = logOddsOf(frame.closure, closures) + closureLogOdds(faps, rule, closures);
-    closure -= this.#resting.doubtAt(frame.timeS, frame.closure);
-    let share = smoothStep(0.5 + (0.5 * closure) / rule.doubt);
+    const shareOf = (logOdds) => smoothStep(0.5 + (0.5 * logOdds) / rule.doubt);
+    const teeth = this.#labiodentals.logOddsAt(frame.timeS) - TEETH_LOG_ODDS;
+    const phones = this.#bilabials.logOddsAt(frame.timeS);
+    let closure = closureLogOdds(faps, logOddsOf(frame.closure, closures), phones, rule, closures);
+    closure -= this.#resting.doubtAt(frame.timeS, frame.closure, phones);
+    moveToRest(faps, shareOf(teeth), closures.LOWER, closures.LOWER_OUTER);
+    let share = shareOf(closure);
     const [before, newest] = this.#shares;
     if (before < CLOSED_SHARE && CLOSED_SHARE <= newest) share = Math.max(share, newest);
     this.#shares = [newest, share];
-    closeLips(faps, share, closures);
+    moveToRest(faps, share, closures.INNER, closures.OUTER);
     return faps;
   }
 }
 
-/** Return the log odds that the rule adds to those of the predictor. */
-function closureLogOdds(faps, rule, { INNER_LIPS, CORNERS, PARTED, WIDE_APART, ROUNDED }) {
+/** Return the log odds of a closure, from those of the sound and those that phones add. */
+function closureLogOdds(faps, sound, phones, rule, { INNER_LIPS, CORNERS, PARTED, WIDE_APART, ROUNDED }) {
   const sum = (columns) => columns.reduce((total, column) => total + faps[column], 0);
   const apart = rule.parted * (clamp(-sum(INNER_LIPS), PARTED, WIDE_APART) - PARTED);
   const narrow = rule.rounded * Math.max(0, ROUNDED - sum(CORNERS));
-  return rule.sound - apart - narrow;
-}
-
-function logOddsOf(probability, { MIN_PROBABILITY, MAX_PROBABILITY }) {
-  const clipped = clamp(probability, MIN_PROBABILITY, MAX_PROBABILITY);
-  return Math.log(clipped / (1 - clipped));
+  return rule.sound + sound + phones - (1 - phones / rule.phone) * (apart + narrow);
 }
 
 /** Separate lips that pass through each other, in place. */
@@ -129,12 +135,12 @@ function separateLips(faps, { UPPER, LOWER, BOTH }) {
   });
 }
 
-/** Move both lips towards their closure, in place. */
-function closeLips(faps, share, { INNER, OUTER }) {
-  INNER.forEach((inner, i) => {
-    const moved = share * faps[inner];
-    faps[inner] -= moved;
-    faps[OUTER[i]] -= moved;
+/** Move inner lips towards rest, and the outer lips by the same distance, in place. */
+function moveToRest(faps, share, inner, outer) {
+  inner.forEach((column, i) => {
+    const moved = share * faps[column];
+    faps[column] -= moved;
+    faps[outer[i]] -= moved;
   });
 }
 

@@ -4,29 +4,48 @@ import { Network } from "./network.js";
 
 const FORMAT = "kouxing-lips 1";
 const FILES = ["ear.onnx", "model.bin", "model.json"];
-const ARRAYS = { float16: Uint16Array, float32: Float32Array, float64: Float64Array };
+const PHONES_FILE = "phones.bin";
+const ARRAYS = {
+  float16: Uint16Array,
+  float32: Float32Array,
+  float64: Float64Array,
+  int8: Int8Array,
+  int32: Int32Array,
+  uint8: Uint8Array,
+};
 
 /**
  * Load the models.
  *
  * @param base URL of the folder with the files; in Node also a file URL
+ * @param options { phones: whether to load the phone recognizer, too }
  * @returns a promise of { ear: Network, arrays: { values, shape } by name, constants, ... }; it is
  *   rejected if a file is missing or of another version
  */
-export async function loadModel(base) {
-  const [ear, blob, header] = await Promise.all(FILES.map((name) => readBytes(new URL(name, base))));
+export async function loadModel(base, { phones = false } = {}) {
+  const files = phones ? [...FILES, PHONES_FILE] : FILES;
+  const [ear, blob, header, phonesBlob] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
   const model = JSON.parse(new TextDecoder().decode(header));
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
   }
-  const arrays = Object.fromEntries(
-    Object.entries(model.arrays).map(([name, { type, shape, begin }]) => {
+  return {
+    ...model,
+    arrays: unpack(blob, model.arrays),
+    phoneArrays: phones ? unpack(phonesBlob, model.phoneArrays) : null,
+    ear: new Network(ear),
+  };
+}
+
+/** Return { shape, values } by name. */
+function unpack(blob, places) {
+  return Object.fromEntries(
+    Object.entries(places).map(([name, { type, shape, begin }]) => {
       const size = shape.reduce((a, b) => a * b, 1);
       const stored = new ARRAYS[type](blob.buffer, blob.byteOffset + begin, size);
       return [name, { shape, values: type === "float16" ? Float32Array.from(stored, halfToFloat) : stored }];
     }),
   );
-  return { ...model, arrays, ear: new Network(ear) };
 }
 
 async function readBytes(url) {

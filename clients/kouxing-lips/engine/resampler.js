@@ -8,7 +8,9 @@ export class Resampler {
   #half;
   #known;
   #first; // number of the first known sample
+  #numIn = 0;
   #numOut = 0;
+  #numPerSecond; // [out, in]
 
   /** Throws a RangeError if the rate is outside 8000 to 192000 Hz. */
   constructor(rateHz, { constants: { resample: c } }) {
@@ -17,6 +19,7 @@ export class Resampler {
     if (!(rateHz >= c.MIN_RATE_HZ && rateHz <= highest)) {
       throw new RangeError(`the sample rate ${rateHz} Hz is out of range; use ${c.MIN_RATE_HZ} to ${highest} Hz`);
     }
+    this.#numPerSecond = [c.SAMPLE_RATE_HZ, rateHz];
     const common = gcd(c.SAMPLE_RATE_HZ, rateHz);
     [this.#up, this.#down] = [c.SAMPLE_RATE_HZ / common, rateHz / common];
     const lower = Math.min(1, c.SAMPLE_RATE_HZ / rateHz);
@@ -28,7 +31,20 @@ export class Resampler {
 
   /** Take samples, mono in [-1, 1]; return those that are ready at 16 kHz. */
   accept(samples) {
-    if (this.#up === this.#down) return samples;
+    this.#numIn += samples.length;
+    return this.#up === this.#down ? samples : this.#resample(samples);
+  }
+
+  /** End the stream; return the remaining samples. */
+  finish() {
+    const [numOut, numIn] = this.#numPerSecond;
+    const numTotal = Math.ceil((this.#numIn * numOut) / numIn);
+    if (this.#up === this.#down) return new Float32Array(0);
+    const numBefore = this.#numOut;
+    return this.#resample(new Float32Array(this.#half)).subarray(0, numTotal - numBefore);
+  }
+
+  #resample(samples) {
     const known = new Float32Array(this.#known.length + samples.length);
     known.set(this.#known);
     known.set(samples, this.#known.length);

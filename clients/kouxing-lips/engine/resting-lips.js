@@ -13,6 +13,7 @@ export class RestingLips {
   #knownS = -Infinity;
   #soundS = -Infinity;
   #staysShut = true;
+  #isPhone = false; // a phone closes the lips
   #timeS = Infinity;
   #goal = 0;
   #way = wayTo(0, 0, 0, 1);
@@ -44,9 +45,11 @@ export class RestingLips {
     }
   }
 
-  /** Return the log odds that silence subtracts from a closure at a lip frame's time. */
-  doubtAt(timeS, closure) {
+  /** Return the log odds that silence subtracts from a closure, given those that phones add. */
+  doubtAt(timeS, closure, phones) {
     const c = this.#c;
+    this.#isPhone = phones > 0;
+    if (this.#isPhone) return 0;
     const nextS = this.#nextSoundS();
     const isSilent = this.#isVoice && this.#knownS > timeS + c.LAST_SOUND_S && nextS > this.#knownS;
     const isOnset = c.YIELD_S < nextS - timeS && nextS - timeS <= c.ONSET_S;
@@ -64,7 +67,7 @@ export class RestingLips {
     const nextS = this.#nextSoundS();
     if (this.#hasEnded) this.#headFor(0, c.END_S);
     else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#headFor(1, c.PART_S);
-    else if (this.#staysShut || nextS <= timeS + c.YIELD_S) this.#headFor(0, c.YIELD_S);
+    else if (this.#isPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#headFor(0, c.YIELD_S);
     else if (timeS > this.#soundS + c.HOLD_S) this.#headFor(0, c.CLOSE_S);
     else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#headFor(1, c.PART_S);
     this.#elapsedS += Math.max(timeS - this.#timeS, 0);

@@ -34,13 +34,15 @@ export class SpeechSegmenter {
   #state; // of the ear
   #detector;
   #traits;
+  #phones; // a PhoneRecognizer, or null
   #frames = []; // of the next position
-  #recent = []; // features of the positions before speech
+  #recent = []; // of the positions before speech: { features, row: log posteriors of the phones }
   #numFrames = 0;
   #isSpeaking = false;
 
-  constructor(model, delayS) {
+  constructor(model, delayS, phones) {
     this.#model = model;
+    this.#phones = phones;
     this.#mel = new LogMel(model);
     this.#lips = new LipPredictor(model, delayS);
     this.#state = new Float32Array(model.stateWidth);
@@ -53,7 +55,7 @@ export class SpeechSegmenter {
     return this.#traits.newest;
   }
 
-  /** Take samples at 16 kHz; return speech changes and lip frames, in order. */
+  /** Take samples at 16 kHz; return speech changes, phones and lip frames, in order. */
   accept(samples) {
     this.#frames.push(...this.#mel.accept(samples));
     const { FRAMES_PER_POSITION } = this.#model.constants.segmenter;
@@ -61,28 +63,30 @@ export class SpeechSegmenter {
     while (this.#frames.length >= FRAMES_PER_POSITION) {
       const frames = new Float32Array(this.#frames.splice(0, FRAMES_PER_POSITION).flatMap((frame) => [...frame]));
       this.#numFrames += FRAMES_PER_POSITION;
-      const { features, voice, new_state: state } = this.#model.ear.run({ frames, state: this.#state });
+      const { features, phones, voice, new_state: state } = this.#model.ear.run({ frames, state: this.#state });
       this.#state.set(state);
-      events.push(...this.#process(new Float32Array([...frames, ...features]), voice));
+      const row = this.#phones ? phones.slice() : null;
+      events.push(...this.#process({ features: new Float32Array([...frames, ...features]), row }, voice));
     }
     return events;
   }
 
   /** End the audio; return the end of the speech. */
   finish() {
-    return this.#isSpeaking ? [this.#endSpeech()] : [];
+    return this.#isSpeaking ? this.#endSpeech() : [];
   }
 
-  #process(features, voice) {
+  #process(position, voice) {
     const { SPEECH, SUNG } = this.#model.voices;
+    const phones = this.#isSpeaking ? this.#recognize([position], this.#framesPerPosition) : [];
     if (!this.#isSpeaking) {
-      this.#recent.push(features);
+      this.#recent.push(position);
       if (this.#recent.length > this.#model.constants.segmenter.MAX_RECENT) this.#recent.shift();
     }
     this.#detector.update(Math.fround(voice[SPEECH] + voice[SUNG]));
     this.#traits.accept(this.#state, voice);
-    if (this.#isSpeaking && !this.#detector.isSpeech) return [this.#endSpeech()];
-    if (this.#isSpeaking) return this.#predict(features, this.#numFrames - 1);
+    if (this.#isSpeaking && !this.#detector.isSpeech) return [...phones, ...this.#endSpeech()];
+    if (this.#isSpeaking) return [...phones, ...this.#predict(position, this.#numFrames - 1)];
     return this.#detector.isSpeech ? this.#startSpeech() : [];
   }
 
@@ -93,11 +97,12 @@ export class SpeechSegmenter {
     while (first % FRAMES_PER_POSITION !== FIRST_FRAME_PARITY) first++;
     if (this.#numFrames - first < FRAMES_PER_POSITION) return [];
     this.#isSpeaking = true;
-    const events = [this.#speechChange(true, first)];
+    this.#phones?.start(first);
+    const events = [this.#speechChange(true, first), ...this.#recognize(this.#recent, this.#numFrames - first)];
     this.#lips.reset();
     let newest = this.#numFrames - 1 - FRAMES_PER_POSITION * (this.#recent.length - 1);
-    for (const features of this.#recent) {
-      if (newest >= first + SEEN_AFTER_FRAMES) events.push(...this.#predict(features, newest));
+    for (const position of this.#recent) {
+      if (newest >= first + SEEN_AFTER_FRAMES) events.push(...this.#predict(position, newest));
       newest += FRAMES_PER_POSITION;
     }
     this.#recent = [];
@@ -106,7 +111,18 @@ export class SpeechSegmenter {
 
   #endSpeech() {
     this.#isSpeaking = false;
-    return this.#speechChange(false, this.#numFrames);
+    const phones = this.#phones?.finish() ?? [];
+    return [...phones.map(eventOf), this.#speechChange(false, this.#numFrames)];
+  }
+
+  get #framesPerPosition() {
+    return this.#model.constants.segmenter.FRAMES_PER_POSITION;
+  }
+
+  /** Return the phones that follow from the last frames of some positions. */
+  #recognize(positions, numFrames) {
+    const rows = positions.flatMap(({ row }) => Array(this.#framesPerPosition).fill(row));
+    return (this.#phones?.accept(rows.slice(-numFrames)) ?? []).map(eventOf);
   }
 
   #speechChange(active, frame) {
@@ -114,7 +130,7 @@ export class SpeechSegmenter {
     return { type: "speech", active, timeS: this.#wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2) };
   }
 
-  #predict(features, newestFrame) {
+  #predict({ features }, newestFrame) {
     const { HOP_S, WINDOW_S } = this.#model.constants.segmenter;
     const frame = this.#lips.processPosition(newestFrame * HOP_S + WINDOW_S, features);
     if (frame.timeS < 0) return [];
@@ -125,4 +141,8 @@ export class SpeechSegmenter {
     const { MEDIA_RATE_HZ } = this.#model.constants.clock;
     return Math.round(timeS * MEDIA_RATE_HZ) / MEDIA_RATE_HZ;
   }
+}
+
+function eventOf(phone) {
+  return { type: "phone", phone };
 }

@@ -6,6 +6,7 @@ import type { LipFrame } from "kouxing-lips";
 
 const lips: LipSync = await LipSync.create({ shapes: ["vrm"], delayMs: 160, feeling: 0 });
 lips.addEventListener("voice", ({ detail }) => console.log(detail.isLaughing));
+lips.addEventListener("phone", ({ detail: { symbol, isFinal } }) => isFinal && console.log(symbol.length));
 await lips.listenToMicrophone({ noiseSuppression: false });
 await lips.listenTo(document.querySelector("audio")!);
 await lips.open(24000);
@@ -16,7 +17,9 @@ const face: LipFrame | null = lips.current;
 if (face?.vrm) console.log(face.vrm[lips.names.vrm!.indexOf("aa")]);
 lips.close();
 
-const engine = await LipEngine.load({ sampleRateHz: 48000, shapes: ["oculus"] });
+const engine = await LipEngine.load({ sampleRateHz: 48000, shapes: ["oculus"], phones: false });
+const symbols: string[] = engine.newPhones.map(({ symbol }) => symbol);
+console.log(symbols);
 for (const { timeS, oculus } of engine.push(new Float32Array(480))) console.log(timeS, oculus?.[0]);
 
 // @ts-expect-error: unknown shapes

@@ -1,0 +1,49 @@
+// Recognized phones that close the lips; services/synthesizer/lips/learnt/closures.py has the rules.
+
+/** The recognized phones of one kind of closure: "b" (b p m) or "f". */
+export class ClosingPhones {
+  #c; // constants
+  #rule;
+  #symbols;
+  #phones = new Map(); // by index: { phone, knownS }
+
+  constructor({ constants, closureRule, phones }, viseme) {
+    this.#c = constants.closures;
+    this.#rule = closureRule;
+    this.#symbols = new Set(phones.closing[viseme]);
+  }
+
+  /** Add a phone or a revision; `nowS` is the time of the last frame. */
+  add(phone, nowS) {
+    const known = this.#phones.get(phone.index);
+    this.#phones.delete(phone.index);
+    const newest = known?.phone.isFinal && !phone.isFinal ? known.phone : phone;
+    if (!this.#symbols.has(newest.symbol)) return;
+    this.#phones.set(phone.index, { phone: newest, knownS: known?.knownS ?? nowS });
+  }
+
+  /** Forget phones that started before a time. */
+  forgetBefore(timeS) {
+    for (const [index, { phone }] of this.#phones) if (phone.onsetS < timeS) this.#phones.delete(index);
+  }
+
+  /** Return the log odds of a closure that the phones add at a time. */
+  logOddsAt(timeS) {
+    return [...this.#phones.values()].reduce((most, known) => Math.max(most, this.#logOddsOf(known, timeS)), 0);
+  }
+
+  #logOddsOf({ phone, knownS }, timeS) {
+    const { HOLD_S, MAX_LATE_S, LATE_HOLD_S, EDGE_S } = this.#c;
+    const most = Math.min(logOddsOf(Math.max(phone.confidence, 0.5), this.#c), this.#rule.phone);
+    let endS = phone.onsetS + Math.min(phone.durationS, HOLD_S);
+    if (knownS < phone.onsetS + MAX_LATE_S) endS = Math.max(endS, knownS + LATE_HOLD_S);
+    const outsideS = Math.max(phone.onsetS - timeS, timeS - endS, 0);
+    return most * Math.max(0, 1 - outsideS / EDGE_S);
+  }
+}
+
+/** Return the log odds of a probability clipped to the rule's range. */
+export function logOddsOf(probability, { MIN_PROBABILITY, MAX_PROBABILITY }) {
+  const clipped = Math.min(Math.max(probability, MIN_PROBABILITY), MAX_PROBABILITY);
+  return Math.log(clipped / (1 - clipped));
+}

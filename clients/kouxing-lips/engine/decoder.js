@@ -1,0 +1,270 @@
+// Streaming Viterbi search over a loop of phones; services/recognizer/search/decoder.py explains it.
+// All states of a phone have the same score, that of the small ear.
+
+const NO_RECORD = -1;
+const NO_TOKEN = -1;
+
+export class Decoder {
+  #c; // constants
+  #lm;
+  #hmms; // firstState, logStay, logLeave, lmScale, penalty, silence
+  #maxStates;
+  #context;
+  #top;
+  #score; // (tokens, states)
+  #link; // (tokens, states)
+  #tokenOf; // by context
+  #entry;
+  #entryLink;
+  #logProbs;
+  #nextContexts;
+
+  constructor(lm, hmms, { constants }) {
+    this.#c = constants.decoder;
+    this.#lm = lm;
+    this.#hmms = hmms;
+    const maxTokens = this.#c.MAX_TOKENS;
+    const numPhones = hmms.firstState.length - 1;
+    this.#maxStates = Math.max(...Array.from({ length: numPhones }, (_, phone) => this.#numStates(phone)));
+    this.#context = new Int32Array(maxTokens);
+    this.#top = new Float32Array(maxTokens);
+    this.#score = new Float32Array(maxTokens * this.#maxStates);
+    this.#link = new Int32Array(maxTokens * this.#maxStates);
+    this.#tokenOf = new Int16Array(lm.phone.length).fill(NO_TOKEN);
+    this.#entry = new Float32Array(maxTokens);
+    this.#entryLink = new Int32Array(maxTokens);
+    this.#logProbs = new Float32Array(numPhones);
+    this.#nextContexts = new Int32Array(numPhones);
+    this.reset();
+  }
+
+  /** Start a new stretch of speech at frame 0. */
+  reset() {
+    for (let token = 0; token < (this.numTokens ?? 0); token++) this.#tokenOf[this.#context[token]] = NO_TOKEN;
+    this.numFrames = 0;
+    this.numTokens = 0;
+    this.records = []; // { end, phone, before: number of another }
+    this.shared = []; // segments that no later frame can change
+    this.lastShared = NO_RECORD;
+    this.best = [0, 0]; // token, and state of its phone
+    this.confidence = 0;
+  }
+
+  /** Search the next frame, given the scores of the phones; return the confidence in the last phone. */
+  advance(scores) {
+    this.#prune();
+    this.#startPhones();
+    this.best = this.#advanceStates(scores);
+    this.confidence = this.#normalize();
+    this.numFrames++;
+    return this.confidence;
+  }
+
+  /** The last phone of the best string so far: { phone, start, confidence }. */
+  get lastPhone() {
+    const phone = this.#lm.phone[this.#context[this.best[0]]];
+    return { phone, start: this.#end(this.#linkAt(...this.best)), confidence: this.confidence };
+  }
+
+  /** Return the segments of the best string that start at a frame or later, without the last. */
+  pathSince(frame) {
+    return [...this.shared, ...this.#trace(this.#linkAt(...this.best))].filter(({ start }) => start >= frame);
+  }
+
+  /** Frame up to which all paths had the same phones when dropRecords was last called. */
+  get sharedEnd() {
+    return this.#end(this.lastShared);
+  }
+
+  /** Forget the phones before a frame. */
+  forgetBefore(frame) {
+    this.shared = this.shared.filter(({ start }) => start >= frame);
+  }
+
+  /** Return the best string at the end of the speech. */
+  finalPath() {
+    if (this.numFrames === 0) return [];
+    let [best, state] = this.best;
+    let highest = this.#c.IMPOSSIBLE;
+    for (let token = 0; token < this.numTokens; token++) {
+      const phone = this.#phoneOf(token);
+      const last = this.#numStates(phone) - 1;
+      const ends = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
+      if (ends > highest) [highest, best, state] = [ends, token, last];
+    }
+    const link = this.#linkAt(best, state);
+    const last = { phone: this.#phoneOf(best), start: this.#end(link), end: this.numFrames };
+    return [...this.shared, ...this.#trace(link), last];
+  }
+
+  /** Store the phones that all paths share, and drop records that no path needs. */
+  dropRecords() {
+    const places = [];
+    for (let token = 0; token < this.numTokens; token++) {
+      for (let state = 0; state < this.#maxStates; state++) {
+        const place = token * this.#maxStates + state;
+        if (this.#score[place] > this.#c.IMPOSSIBLE) places.push(place);
+      }
+    }
+    const paths = new Int32Array(this.records.length);
+    for (const place of places) if (this.#link[place] !== NO_RECORD) paths[this.#link[place]]++;
+    for (let record = paths.length - 1; record >= 0; record--) {
+      const { before } = this.records[record];
+      if (paths[record] && before !== NO_RECORD) paths[before] += paths[record];
+    }
+    const shared = paths.lastIndexOf(places.length);
+    this.shared.push(...this.#trace(shared));
+    const numberOf = new Int32Array(this.records.length).fill(NO_RECORD);
+    const kept = [];
+    this.records.forEach((record, number) => {
+      if (!paths[number] || number < shared) return;
+      numberOf[number] = kept.length;
+      kept.push({ ...record, before: record.before === NO_RECORD ? NO_RECORD : numberOf[record.before] });
+    });
+    this.records = kept;
+    for (const place of places) if (this.#link[place] !== NO_RECORD) this.#link[place] = numberOf[this.#link[place]];
+    this.lastShared = shared === NO_RECORD ? NO_RECORD : numberOf[shared];
+  }
+
+  #numStates(phone) {
+    return this.#hmms.firstState[phone + 1] - this.#hmms.firstState[phone];
+  }
+
+  #phoneOf(token) {
+    return this.#lm.phone[this.#context[token]];
+  }
+
+  #linkAt(token, state) {
+    return this.#link[token * this.#maxStates + state];
+  }
+
+  /** Drop the tokens outside the beam. */
+  #prune() {
+    for (let token = 0; token < this.numTokens; ) {
+      if (this.#top[token] >= -this.#c.BEAM) {
+        token++;
+        continue;
+      }
+      this.#tokenOf[this.#context[token]] = NO_TOKEN;
+      const last = --this.numTokens;
+      if (token < last) {
+        [this.#context[token], this.#top[token]] = [this.#context[last], this.#top[last]];
+        const [from, end, to] = [last * this.#maxStates, (last + 1) * this.#maxStates, token * this.#maxStates];
+        this.#score.copyWithin(to, from, end);
+        this.#link.copyWithin(to, from, end);
+        this.#tokenOf[this.#context[token]] = token;
+      }
+    }
+  }
+
+  /** Record the phones that may end before the frame, and start the phones that may follow. */
+  #startPhones() {
+    const { BEAM, IMPOSSIBLE } = this.#c;
+    this.#entry.fill(IMPOSSIBLE);
+    if (this.numFrames === 0) {
+      this.#continueFrom(this.#hmms.silence + 1, 0, NO_RECORD); // speech starts after a pause
+      return;
+    }
+    const numTokens = this.numTokens;
+    for (let token = 0; token < numTokens; token++) {
+      const phone = this.#phoneOf(token);
+      const last = this.#numStates(phone) - 1;
+      const leaving = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
+      if (leaving < -BEAM) continue;
+      this.records.push({ end: this.numFrames, phone, before: this.#linkAt(token, last) });
+      this.#continueFrom(this.#context[token], leaving, this.records.length - 1);
+    }
+  }
+
+  /** Enter all phones that may follow a context. */
+  #continueFrom(context, leaving, record) {
+    const { BEAM, IMPOSSIBLE, MAX_TOKENS } = this.#c;
+    const { lmScale, penalty, silence } = this.#hmms;
+    this.#lm.lookUp(context, this.#logProbs, this.#nextContexts);
+    if (this.numFrames === 0) this.#logProbs[silence] = 0;
+    for (let phone = 0; phone < this.#logProbs.length; phone++) {
+      const candidate = Math.fround(Math.fround(leaving + Math.fround(lmScale * this.#logProbs[phone])) + penalty);
+      if (candidate < -BEAM) continue;
+      const next = this.#nextContexts[phone];
+      if (this.#tokenOf[next] === NO_TOKEN) {
+        if (this.numTokens === MAX_TOKENS) continue;
+        const token = this.numTokens++;
+        this.#context[token] = next;
+        this.#tokenOf[next] = token;
+        const begin = token * this.#maxStates;
+        this.#score.fill(IMPOSSIBLE, begin, begin + this.#maxStates);
+        this.#link.fill(NO_RECORD, begin, begin + this.#maxStates);
+      }
+      const following = this.#tokenOf[next];
+      if (candidate > this.#entry[following]) {
+        this.#entry[following] = candidate;
+        this.#entryLink[following] = record;
+      }
+    }
+  }
+
+  /** Advance the paths within the phones by one frame; return the best token and its state. */
+  #advanceStates(scores) {
+    const { IMPOSSIBLE } = this.#c;
+    const { firstState, logStay, logLeave } = this.#hmms;
+    let [highest, bestToken, bestState] = [IMPOSSIBLE, 0, 0];
+    for (let token = 0; token < this.numTokens; token++) {
+      const phone = this.#phoneOf(token);
+      const first = firstState[phone];
+      const begin = token * this.#maxStates;
+      this.#top[token] = IMPOSSIBLE;
+      for (let state = firstState[phone + 1] - first - 1; state >= 0; state--) {
+        let value = Math.fround(this.#score[begin + state] + logStay[first + state]);
+        let link = this.#link[begin + state];
+        const moved = state ? Math.fround(this.#score[begin + state - 1] + logLeave[first + state - 1]) : this.#entry[token];
+        if (moved > value) [value, link] = [moved, state ? this.#link[begin + state - 1] : this.#entryLink[token]];
+        const score = Math.max(Math.fround(value + scores[phone]), IMPOSSIBLE);
+        this.#score[begin + state] = score;
+        this.#link[begin + state] = link;
+        if (score > this.#top[token]) {
+          this.#top[token] = score;
+          if (score > highest) [highest, bestToken, bestState] = [score, token, state];
+        }
+      }
+    }
+    return [bestToken, bestState];
+  }
+
+  /** Subtract the best score, so that numbers stay small; return the last phone's confidence. */
+  #normalize() {
+    const { BEAM, IMPOSSIBLE } = this.#c;
+    const [bestToken, bestState] = this.best;
+    const best = this.#score[bestToken * this.#maxStates + bestState];
+    const bestPhone = this.#phoneOf(bestToken);
+    let [share, total] = [0, 0];
+    for (let token = 0; token < this.numTokens; token++) {
+      let before = NO_RECORD;
+      for (let place = token * this.#maxStates; place < (token + 1) * this.#maxStates; place++) {
+        if (this.#score[place] === this.#top[token]) before = this.#link[place];
+        if (this.#score[place] > IMPOSSIBLE) this.#score[place] -= best;
+      }
+      this.#top[token] -= best;
+      if (this.#top[token] <= -BEAM) continue;
+      const weight = Math.exp(this.#top[token]);
+      total += weight;
+      if (this.#phoneOf(token) === bestPhone || this.records[before]?.phone === bestPhone) share += weight;
+    }
+    return share / total;
+  }
+
+  /** Return the segments after the shared ones, up to the one of a record. */
+  #trace(record) {
+    const segments = [];
+    while (record !== NO_RECORD && record !== this.lastShared) {
+      const { end, phone, before } = this.records[record];
+      segments.unshift({ phone, start: this.#end(before), end });
+      record = before;
+    }
+    return segments;
+  }
+
+  /** Return the first frame after the phone of a record. */
+  #end(record) {
+    return record === NO_RECORD ? 0 : this.records[record].end;
+  }
+}
