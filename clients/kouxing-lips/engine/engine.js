@@ -35,7 +35,7 @@ export class LipEngine {
     this.#rateHz = sampleRateHz;
     this.#slice = new Float32Array(constants.pcm.SLICE);
     this.#resampler = new Resampler(sampleRateHz, model);
-    this.#segmenter = new SpeechSegmenter(model, delayS, model.phoneArrays ? new PhoneRecognizer(model) : null);
+    this.#segmenter = new SpeechSegmenter(model, delayS, model.phoneLm ? new PhoneRecognizer(model) : null);
     this.#face = new Face(model, { delayS, expressiveness: amount, feeling: strength });
     this.#shapes = shapes.map((set) => [set, new ShapeSet(set, model)]);
     /** Names of the weights of each set. */

@@ -10,6 +10,7 @@ export class LipPredictor {
   #delay; // number of the used delay
   #delayS;
   #state;
+  #entry; // product of the matrices of x and u: nothing is between them
   #buffers; // of a step
 
   /** @param delayS delay of the face; the longest delay of the model that fits is used */
@@ -24,8 +25,9 @@ export class LipPredictor {
     this.#delayS = inTime.at(-1) ?? delaysS[0];
     this.#delay = delaysS.indexOf(this.#delayS);
     const { projection, entry_weights, state_weights, output_bias } = this.#weights;
+    this.#entry = product(projection, entry_weights);
     const gates = state_weights.shape[1];
-    const sizes = [...projection.shape, entry_weights.shape[1], gates, gates, output_bias.shape[1]];
+    const sizes = [...this.#entry.shape, gates, gates, output_bias.shape[1]];
     this.#buffers = sizes.map((size) => new Float64Array(size));
     this.reset();
   }
@@ -54,10 +56,9 @@ export class LipPredictor {
   /** Return the outputs at the delay, from features that stay unchanged. */
   #step(features) {
     const w = this.#weights;
-    const [centered, component, entered, fromInput, fromState, outputs] = this.#buffers;
+    const [centered, entered, fromInput, fromState, outputs] = this.#buffers;
     for (let i = 0; i < centered.length; i++) centered[i] = features[i] - w.feature_mean.values[i];
-    times(component, centered, w.projection);
-    times(entered, component, w.entry_weights, w.entry_bias);
+    times(entered, centered, this.#entry, w.entry_bias);
     for (let i = 0; i < entered.length; i++) entered[i] = Math.max(entered[i], 0);
     times(fromInput, entered, w.input_weights, w.input_bias);
     times(fromState, this.#state, w.state_weights, w.state_bias);
@@ -81,9 +82,22 @@ export class LipPredictor {
   }
 }
 
+/** Return the product of two matrices. */
+function product(one, other) {
+  const [rows, columns] = [one.shape[0], other.shape[1]];
+  const values = new Float32Array(rows * columns);
+  const row = new Float64Array(columns);
+  const zeros = { values: new Float32Array(columns) };
+  for (let i = 0; i < rows; i++) {
+    times(row, one.values.subarray(i * one.shape[1], (i + 1) * one.shape[1]), other, zeros);
+    values.set(row, i * columns);
+  }
+  return { values, shape: [rows, columns] };
+}
+
 /** Compute the product of a vector (rows,) and a matrix (rows, columns), plus a bias. */
-function times(out, vector, { values, shape: [rows, columns] }, bias = null) {
-  for (let column = 0; column < columns; column++) out[column] = bias?.values[column] ?? 0;
+function times(out, vector, { values, shape: [rows, columns] }, bias) {
+  for (let column = 0; column < columns; column++) out[column] = bias.values[column];
   for (let row = 0; row < rows; row++) {
     const factor = vector[row];
     for (let column = 0, at = row * columns; column < columns; column++, at++) out[column] += factor * values[at];

@@ -1,6 +1,7 @@
 // The files of `kouxing export web`.
 
 import { Network } from "./network.js";
+import { PhoneLm } from "./phone-lm.js";
 
 const FORMAT = "kouxing-lips 1";
 const FILES = ["ear.onnx", "model.bin", "model.json"];
@@ -19,8 +20,8 @@ const ARRAYS = {
  *
  * @param base URL of the folder with the files; in Node also a file URL
  * @param options { phones: whether to load the phone recognizer, too }
- * @returns a promise of { ear: Network, arrays: { values, shape } by name, constants, ... }; it is
- *   rejected if a file is missing or of another version
+ * @returns a promise of { ear: Network, phoneLm: PhoneLm or null, arrays: { values, shape } by name,
+ *   constants, ... }; it is rejected if a file is missing or of another version
  */
 export async function loadModel(base, { phones = false } = {}) {
   const files = phones ? [...FILES, PHONES_FILE] : FILES;
@@ -29,10 +30,12 @@ export async function loadModel(base, { phones = false } = {}) {
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
   }
+  const phoneArrays = phones ? unpack(phonesBlob, model.phoneArrays) : null;
   return {
     ...model,
     arrays: unpack(blob, model.arrays),
-    phoneArrays: phones ? unpack(phonesBlob, model.phoneArrays) : null,
+    phoneArrays,
+    phoneLm: phones ? new PhoneLm(phoneArrays, model.constants) : null,
     ear: new Network(ear),
   };
 }

@@ -13,7 +13,7 @@ export class PhoneLm {
   #firstChild;
   #logProb;
 
-  constructor({ phoneArrays, constants }) {
+  constructor(phoneArrays, constants) {
     const [children, phone, probs, backoffs] = ["children", "phone", "log_prob", "log_backoff"].map(
       (name) => phoneArrays[`lm_${name}`].values,
     );
@@ -29,13 +29,12 @@ export class PhoneLm {
     for (let node = 0; node < children.length; node++) {
       const isContext = children[node] > 0 || node <= children[0];
       this.contextOf[node] = isContext ? node : this.contextOf[shorter[node]];
-      if (node > 0) for (const child of this.#childrenOf(node)) shorter[child] = this.#ending(shorter[node], phone[child], shorter);
+      if (node === 0) continue;
+      for (let child = this.#firstChild[node]; child < this.#firstChild[node + 1]; child++) {
+        shorter[child] = this.#ending(shorter[node], phone[child], shorter);
+      }
     }
     this.backoff = shorter.map((node) => this.contextOf[node]);
-  }
-
-  *#childrenOf(node) {
-    for (let child = this.#firstChild[node]; child < this.#firstChild[node + 1]; child++) yield child;
   }
 
   /** Return the node of a phone after a context, or after the longest ending of it that has one. */

@@ -2,7 +2,6 @@
 // acoustic/light.py, search/output_rule.py and live_decoder.py.
 
 import { Decoder } from "./decoder.js";
-import { PhoneLm } from "./phone-lm.js";
 
 const [FIRST, INSIDE] = [0, 1]; // position of a phone between pauses
 
@@ -40,7 +39,7 @@ export class PhoneRecognizer {
       lmScale: Math.fround(phones.lmScale),
       penalty: Math.fround(phones.phonePenalty),
     };
-    this.#decoder = new Decoder(new PhoneLm(model), hmms, model);
+    this.#decoder = new Decoder(model.phoneLm, hmms, model);
   }
 
   /** Start a stretch of speech at a feature frame. */
