@@ -43,7 +43,7 @@ from kouxing.services.recognizer.search.output_rule import MODEL_RULES
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.learnt import closures, model, rest, track
-from kouxing.services.synthesizer.modifiers import expressiveness, feeling, laughter
+from kouxing.services.synthesizer.modifiers import expressiveness, feeling, nonverbal
 from kouxing.shared import clock
 from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
@@ -63,7 +63,6 @@ _MODULES = {
     "expressiveness": expressiveness,
     "features": features,
     "feeling": feeling,
-    "laughter": laughter,
     "learnt": model,
     "lips": lip_predictor,
     "lipFrames": lip_frames,
@@ -71,6 +70,7 @@ _MODULES = {
     "mel": whisper_mel,
     "modelFile": model_file,
     "network": network,
+    "nonverbal": nonverbal,
     "pcm": pcm,
     "resample": resample,
     "rest": rest,

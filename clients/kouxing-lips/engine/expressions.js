@@ -25,11 +25,16 @@ export class Expressions {
   show(strengths, holdS) {
     const unknown = Object.keys(strengths).find((name) => !(name in this.#faps));
     if (unknown) throw new Error(`unknown expression ${unknown}; use ${Object.keys(this.#faps).join(", ")}`);
-    this.#goal = new Float32Array(this.#numFaps);
+    let goal = new Float32Array(this.#numFaps);
     for (const [name, strength] of Object.entries(strengths)) {
-      this.#goal = this.#goal.map((x, i) => x + strength * this.#faps[name][i]);
+      goal = goal.map((x, i) => x + strength * this.#faps[name][i]);
     }
-    this.#remainingS = holdS;
+    this.showFaps(goal, holdS);
+  }
+
+  /** Replace the expressions by FAPs (68,) for a time. */
+  showFaps(goal, holdS) {
+    [this.#goal, this.#remainingS] = [goal, holdS];
   }
 
   /** Add the expressions to a frame, in place. */

@@ -13,6 +13,7 @@ export class Face {
   #lips;
   #expressions;
   #laughter;
+  #breath;
   #feeling;
   #voice = []; // the current progress and later ones
   #nextFrame = 0;
@@ -27,6 +28,7 @@ export class Face {
     this.#lips = new LearntLips(model, delayS);
     this.#expressions = new Expressions(model);
     this.#laughter = new Expressions(model);
+    this.#breath = new Expressions(model);
     this.#feeling = new Feeling(model, feeling);
   }
 
@@ -58,6 +60,7 @@ export class Face {
 
   #makeFrame(timeS) {
     const { MOUTH, SPEECH_LEAD_S, VOICE_LEAD_S } = this.#model.constants.animator;
+    const { LAUGHTER, BREATH, HOLD_S } = this.#model.constants.nonverbal;
     while (this.#changes[0]?.timeS <= timeS) this.#isSpeaking = this.#changes.shift().active;
     const startsSoon = this.#changes.some((change) => change.active && change.timeS <= timeS + SPEECH_LEAD_S);
     while (this.#voice[1]?.timeS <= timeS + VOICE_LEAD_S) this.#voice.shift();
@@ -70,8 +73,10 @@ export class Face {
     const isSpeaking = this.#isSpeaking || startsSoon;
     this.#feeling.apply(faps, stepS, isSpeaking ? voice : null);
     this.#expressions.apply(faps, stepS, isSpeaking);
-    if (voice?.isLaughter) this.#laughter.show({ joy: 1 }, this.#model.constants.laughter.HOLD_S);
+    if (voice?.isLaughter) this.#laughter.showFaps(LAUGHTER, HOLD_S);
+    else if (voice?.isBreath) this.#breath.showFaps(BREATH, HOLD_S);
     this.#laughter.apply(faps, stepS, isSpeaking);
+    this.#breath.apply(faps, stepS, isSpeaking);
     return { timeS, faps };
   }
 }
