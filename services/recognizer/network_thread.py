@@ -9,13 +9,13 @@ from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.stream import SpeechStream
 
 MAX_SESSIONS = 4  # decoded together; the results of all of them are sent at the end
+MAX_WAIT_S = 0.02  # for more sessions, if the processor is to be spared
 
 
 class NetworkThread:
-    """Decodes sessions whose next audio is due for the block network.
+    """Decodes sessions whose next audio is due for the block network (``is_due``).
 
-    Sessions that become due in the meantime wait, and share the next runs. While a session is here
-    (``is_scoring``), its stream must not be used elsewhere.
+    While a session is on the thread (``is_scoring``), its stream must not be used elsewhere.
 
     Parameters
     ----------
@@ -31,38 +31,48 @@ class NetworkThread:
         self._on_decoded = on_decoded
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="network")
         self._due: list[RecognizerSession] = []
+        self._due_since_s = 0.0  # the first of them
         self._batch: list[RecognizerSession] = []
         self._job: Future[None] | None = None
 
-    def add(self, sessions: Sequence[RecognizerSession]) -> None:
-        """Decode the accepted audio of some sessions."""
-        for session in sessions:
-            session.is_scoring = True
-        self._due += sessions
-        self._start_batch()
+    def add(self, session: RecognizerSession, now_s: float) -> None:
+        """Let a session wait for the network, if it does not wait yet."""
+        if not session.is_due:
+            session.is_due = True
+            self._due_since_s = self._due_since_s if self._due else now_s
+            self._due.append(session)
+
+    def start(self, now_s: float, *, saves_time: bool = False) -> None:
+        """Decode the accepted audio of waiting sessions, unless the thread is busy.
+
+        With ``saves_time``, wait for several sessions, because they take less time together.
+        """
+        if self._job is not None or not self._due:
+            return
+        is_early = now_s < self._due_since_s + MAX_WAIT_S
+        if saves_time and is_early and len(self._due) < MAX_SESSIONS:
+            return
+        self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
+        for session in self._batch:
+            session.is_due, session.is_scoring = False, True
+        streams = [session.stream for session in self._batch]
+        self._job = self._executor.submit(self._decode, streams)
+        self._job.add_done_callback(lambda _: self._on_decoded())
 
     def take_decoded(self) -> list[RecognizerSession]:
         """Return the sessions that were decoded since the last call."""
         if self._job is None or not self._job.done():
             return []
         self._job.result()  # raises what the decoding has raised
-        decoded, self._job = self._batch, None
-        for session in decoded:
+        self._job = None
+        for session in self._batch:
             session.is_scoring = False
-        self._start_batch()
-        return decoded
+        return self._batch
 
     def wait(self) -> None:
         """Wait until the current batch, if any, is decoded."""
         if self._job is not None:
             wait([self._job])
-
-    def _start_batch(self) -> None:
-        if self._job is None and self._due:
-            self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
-            streams = [session.stream for session in self._batch]
-            self._job = self._executor.submit(self._decode, streams)
-            self._job.add_done_callback(lambda _: self._on_decoded())
 
     def _decode(self, streams: Sequence[SpeechStream]) -> None:
         start_s = time.thread_time()

@@ -47,7 +47,8 @@ READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, an
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # between ticks while a session is open
-STEP_S, MIN_TOGETHER = 0.004, 4  # between steps, to process audio of this many sessions together
+STEP_S = 0.003  # between steps with several sessions, to process their audio together
+MIN_TOGETHER, MAX_TOGETHER = 4, 4  # sessions
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
@@ -344,45 +345,47 @@ class RecognizerService(Service):
     def _decode_all_live(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode all queued audio of live sessions."""
         while any(session.is_decoding for session in sessions):
+            self._network.start(time.monotonic())
             self._network.wait()
             self._decode_live(sessions)
 
     def _decode_live(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode a part of the queued audio of live sessions; skip audio that is too old.
 
-        The thread of the block network continues with sessions that need the network. Their further
-        audio waits for it. Under load, their lips do not.
+        The thread of the block network continues with sessions that need the network. Meanwhile,
+        their further audio waits. Under load, their lips do not.
         """
         if decoded := self._network.take_decoded():
             self._send_decoded(decoded)
         sessions = [session for session in sessions if session.audio and not session.is_scoring]
-        if not sessions:
-            return
         now_s = time.monotonic()
-        part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / len(sessions)))
-        is_behind = any(session.audio.overload.is_behind for session in sessions)
-        work = self._work() - self._unpaced_work
-        hop = self._pace.update(work, now_s, is_behind=is_behind)
-        for session in sessions:
-            session.accept_waveform(part_s, now_s, hop)
-        self._recognizer.hear_streams([session.stream for session in sessions])
-        if len(self._sessions) > 1:
-            self._start_network(sessions, hop)
-            self._decode([session for session in sessions if not session.is_scoring])
-        else:  # no other session waits; the network runs less often if there are more
-            network_s = self._recognizer.network_s
-            self._decode(sessions)
-            self.busy.exclude(self._recognizer.network_s - network_s)
+        if sessions:
+            is_behind = any(session.audio.overload.is_behind for session in sessions)
+            self._pace.update(self._work() - self._unpaced_work, now_s, is_behind=is_behind)
+        part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
+        for begin in range(0, len(sessions), MAX_TOGETHER):  # the first ones do not wait for all
+            group = sessions[begin : begin + MAX_TOGETHER]
+            for session in group:
+                session.accept_waveform(part_s, now_s, self._pace.hop)
+            self._recognizer.hear_streams([session.stream for session in group])
+            if len(self._sessions) > 1:
+                self._decode([session for session in group if not self._waits_for_network(session)])
+            else:  # no other session waits; the network runs less often if there are more
+                network_s = self._recognizer.network_s
+                self._decode(group)
+                self.busy.exclude(self._recognizer.network_s - network_s)
+        self._network.start(now_s, saves_time=self._pace.hop > 1)
         self.send_heartbeat_if_due()
 
-    def _start_network(self, sessions: Sequence[RecognizerSession], hop: int) -> None:
-        """Let the other thread continue with sessions that need the block network."""
-        due = [one for one in sessions if self._recognizer.needs_network(one.stream)]
-        if hop > 1:
-            for session in due:
-                session.stream.decode_early()
-                self._send_results(session)
-        self._network.add(due)
+    def _waits_for_network(self, session: RecognizerSession) -> bool:
+        """Let a session wait for the block network if it needs it; under load, send its lips."""
+        if not self._recognizer.needs_network(session.stream):
+            return False
+        if self._pace.hop > 1:
+            session.stream.decode_early()
+            self._send_results(session)
+        self._network.add(session, time.monotonic())
+        return True
 
     def _work(self) -> Work:
         network_s = self._recognizer.network_s

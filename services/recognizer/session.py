@@ -86,7 +86,8 @@ class RecognizerSession:
             self.resumption = Resumption(to_seconds(start.media_time), silence)
         overload = Overload(max_behind_s, now_s + CATCH_UP_S if start.epoch > 1 else now_s)
         self.audio = LiveAudio(start.sample_rate_hz, overload)  # not decoded yet
-        self.is_scoring = False  # on the block network's thread
+        self.is_due = False  # waits for the block network's thread
+        self.is_scoring = False  # on this thread
         self.accepted_s = now_s  # when the stream last took audio
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
@@ -114,7 +115,7 @@ class RecognizerSession:
     @property
     def is_decoding(self) -> bool:
         """Whether received live audio is not decoded yet."""
-        return bool(self.audio) or self.is_scoring
+        return bool(self.audio) or self.is_due or self.is_scoring
 
     @property
     def received_sequence(self) -> int:
