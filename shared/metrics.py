@@ -128,9 +128,9 @@ class LoadMeter:
         self._busy_s = self._busy_at(now_s)
         self._changed_s, self._works = now_s, False
 
-    def exclude(self, duration_s: float) -> None:
-        """Do not count some work, because it would take less time if there was more other work."""
-        self._busy_s -= duration_s
+    def add(self, duration_s: float) -> None:
+        """Count work of another thread, or, if negative, less of the loop's work."""
+        self._busy_s += duration_s
 
     def share(self, now_s: float) -> float:
         """Return the share of time, 0 to 1, since an earlier call. Call this regularly."""

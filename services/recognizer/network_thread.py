@@ -27,6 +27,7 @@ class NetworkThread:
 
     def __init__(self, recognizer: Recognizer, on_decoded: Callable[[], None]) -> None:
         self.work_s = 0.0  # processor time of the batches so far
+        self.batch_s = 0.0  # of the newest batch
         self._recognizer = recognizer
         self._on_decoded = on_decoded
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="network")
@@ -77,4 +78,5 @@ class NetworkThread:
     def _decode(self, streams: Sequence[SpeechStream]) -> None:
         start_s = time.thread_time()
         self._recognizer.decode_streams(streams)
-        self.work_s += time.thread_time() - start_s
+        self.batch_s = time.thread_time() - start_s
+        self.work_s += self.batch_s

@@ -28,7 +28,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
-from kouxing.shared.overload import NetworkPace, Work
+from kouxing.shared.overload import MAX_HOP, NetworkPace, Work
 from kouxing.shared.phones.events import Progress, SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
@@ -49,6 +49,7 @@ FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end
 SESSION_TICK_S = 0.04  # between ticks while a session is open
 STEP_S = 0.003  # between steps with several sessions, to process their audio together
 MIN_TOGETHER, MAX_TOGETHER = 4, 4  # sessions
+NETWORK_WEIGHT = 0.5  # of the block network's time in the load of the service
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
@@ -355,7 +356,10 @@ class RecognizerService(Service):
         The thread of the block network continues with sessions that need the network. Meanwhile,
         their further audio waits. Under load, their lips do not.
         """
+        # Under load, the network runs at the longest hop, and on another core.
+        network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
         if decoded := self._network.take_decoded():
+            self.busy.add(network_weight * self._network.batch_s)
             self._send_decoded(decoded)
         sessions = [session for session in sessions if session.audio and not session.is_scoring]
         now_s = time.monotonic()
@@ -370,10 +374,10 @@ class RecognizerService(Service):
             self._recognizer.hear_streams([session.stream for session in group])
             if len(self._sessions) > 1:
                 self._decode([session for session in group if not self._waits_for_network(session)])
-            else:  # no other session waits; the network runs less often if there are more
+            else:  # no other session waits
                 network_s = self._recognizer.network_s
                 self._decode(group)
-                self.busy.exclude(self._recognizer.network_s - network_s)
+                self.busy.add((network_weight - 1.0) * (self._recognizer.network_s - network_s))
         self._network.start(now_s, saves_time=self._pace.hop > 1)
         self.send_heartbeat_if_due()
 

@@ -47,9 +47,10 @@ def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None
     assert busy.share(9.0) == 1.0
 
 
-def test_excluded_work_does_not_count() -> None:
+@pytest.mark.parametrize(("added_s", "share"), [(-0.4, 0.2), (0.1, 0.7), (9.0, 1.0)])
+def test_the_busy_share_includes_added_work(added_s: float, share: float) -> None:
     busy = LoadMeter(2.0, 0.0)
     busy.start_working(0.0)
     busy.start_waiting(0.6)
-    busy.exclude(0.4)
-    assert busy.share(1.0) == pytest.approx(0.2)
+    busy.add(added_s)
+    assert busy.share(1.0) == pytest.approx(share)

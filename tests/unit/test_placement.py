@@ -37,7 +37,7 @@ def num_admitted(load: WorkerLoad, now_s: float) -> int:
 def test_admits_as_many_sessions_as_the_measured_load_leaves_room_for(
     num_sessions: int, measured: float, admitted: int
 ) -> None:
-    assert num_admitted(WorkerLoad(), 0.0) == 3, "its cost is unknown"
+    assert num_admitted(WorkerLoad(), 0.0) == 8, "its cost is unknown"
     assert num_admitted(loaded(num_sessions, measured), 10.0) == admitted
 
 
@@ -113,9 +113,9 @@ def test_refuses_a_session_without_room_and_says_when_to_try_again(system: Syste
 
 def test_unpaced_sessions_of_one_key_leave_room_for_another_client(system: System) -> None:
     opening, greedy = OpenSession(request="r", paced=False), Peer(b"a", "greedy")
-    for _ in range(4):  # two of the three for which each recognizer has room
+    for _ in range(14):  # seven of the eight for which each recognizer has room
         system.sessions.open(opening, greedy, 0.0)
-    with pytest.raises(Refusal, match=r"this and another session need 50 % .* 30 % is left"):
+    with pytest.raises(Refusal, match=r"this and another session need 20 % .* 10 % is left"):
         system.sessions.open(opening, greedy, 0.0)
     assert system.sessions.open(opening, Peer(b"b", "other"), 0.0)
 
