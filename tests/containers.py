@@ -63,7 +63,7 @@ def image_environment() -> dict[str, str]:
     """Return the variables that the image sets, without its paths of programs."""
     text = (ROOT / "deploy" / "Dockerfile").read_text("utf-8").replace("\\\n", " ")
     (line,) = re.findall(r"^ENV (.*)$", text, re.MULTILINE)
-    variables = dict(each.split("=", 1) for each in line.split())
+    variables = dict(item.split("=", 1) for item in line.split())
     return {name: value for name, value in variables.items() if name != "PATH"}
 
 

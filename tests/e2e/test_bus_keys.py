@@ -74,7 +74,7 @@ def hidden(message: Message, shift: int) -> bytes:
 def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
     found = []
     while there.wait(timeout_s):
-        found += [each.message for each in there.receive() if isinstance(each.message, Message)]
+        found += [item.message for item in there.receive() if isinstance(item.message, Message)]
     return found
 
 
@@ -97,7 +97,7 @@ def test_a_socket_accepts_only_keys_of_its_role(
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
         assert router.wait(LIMIT_S if gets_in else 0.5) == gets_in
-        assert [each.sender.key for each in router.receive()] == gets_in * [key.public]
+        assert [item.sender.key for item in router.receive()] == gets_in * [key.public]
         assert (bus.probe(endpoint) is Reach.ACCEPTED) == gets_in
 
 
@@ -172,7 +172,7 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
             list(publisher.receive())
         for session in ("theirs", "mine"):
             publisher.send(FapFrame(session=session, values=bytes(272), mask=bytes(9)))
-        kinds = [(type(each), each.session) for each in messages_of(subscriber)]
+        kinds = [(type(item), item.session) for item in messages_of(subscriber)]
         assert kinds == [(Joined, "mine"), (FapFrame, "mine")]
 
 

@@ -156,7 +156,7 @@ def test_services_send_the_frames_of_the_chain(
         message_of(event) for event in chain.events if isinstance(event, LipPositions)
     ]
     assert sent.lips
-    recognised = [event for event in chain.events if isinstance(event, Phone)]
+    recognized_phones = [event for event in chain.events if isinstance(event, Phone)]
     assert [
         (phone.index, phone.symbol, phone.media_time, phone.duration, phone.confidence, phone.final)
         for phone in sent.phones
@@ -169,7 +169,7 @@ def test_services_send_the_frames_of_the_chain(
             phone.confidence,
             phone.final,
         )
-        for phone in recognised
+        for phone in recognized_phones
     ]
 
 

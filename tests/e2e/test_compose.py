@@ -121,10 +121,10 @@ def test_containers_are_healthy_private_and_speak(
         while len(services := client.status().services) < len(HOSTS) - 1:
             assert time.monotonic() < end_s, services
             time.sleep(0.2)
-        told = {each for state in services for each in state.endpoints.values()}
+        told = {item for state in services for item in state.endpoints.values()}
         check_page(told, network.address("gateway-1"))
     for host, port in (("recognizer-1", 5560), ("synthesizer-1", 5571)):
-        assert any(each.startswith(f"tcp://{network.address(host)}:{port} ") for each in told), told
+        assert any(item.startswith(f"tcp://{network.address(host)}:{port} ") for item in told), told
 
     speaker = start(containers, "client-1", "client", keys, "speak", str(VOWELS_FILE), "--fast")
     assert speaker.wait(60) == 0, containers.log("client-1").read_text("utf-8")
@@ -136,10 +136,10 @@ def check_page(told: Collection[str], gateway: str) -> None:
     (published,) = COMPOSE["services"]["gateway"]["ports"]
     host, port, own_port = published.split(":")
     (secret,) = [
-        each.removeprefix(address)
+        item.removeprefix(address)
         for address in [f"http://{host}:{port}/#"]
-        for each in told
-        if each.startswith(address)
+        for item in told
+        if item.startswith(address)
     ]
     for query, status in (("", 403), (f"?{secret}", 200)):
         with contextlib.closing(HTTPConnection(gateway, int(own_port), timeout=60)) as http:

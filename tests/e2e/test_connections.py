@@ -66,9 +66,9 @@ def test_fast_senders_wait_while_nothing_is_received(bus: Bus) -> None:
     time.sleep(0.5)  # as when a service pauses a socket
     received = collect(bus, audio, lambda all_: len(all_) == len(senders) * num_chunks)
     numbers: dict[str, list[int]] = {}
-    for each in received:
-        assert isinstance(each.message, Message)
-        numbers.setdefault(each.message.session, []).append(each.message.sequence)
+    for item in received:
+        assert isinstance(item.message, Message)
+        numbers.setdefault(item.message.session, []).append(item.message.sequence)
     assert numbers == {str(name): [*range(num_chunks)] for name in range(len(senders))}
 
 
@@ -86,7 +86,7 @@ def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
                 taken += audio.receive()
         slow.sendall(wire_bytes(chunk(2, 10)))
         taken += collect(bus, audio, lambda all_: chunk(2, 10) in [r.message for r in all_])
-    assert chunk(1) in [each.message for each in taken]
+    assert chunk(1) in [item.message for item in taken]
 
 
 def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:

@@ -74,7 +74,7 @@ def test_only_a_sessions_own_worker_says_that_it_is_idle(
         idle = {witness.name: SessionInput(idle_s=1e9)}
         stranger.send(replace(HEARTBEAT, sessions=idle))
         wait_until(lambda: "a-false-one" in instances(client))
-        assert witness.name in {each.session for each in client.status().sessions}
+        assert witness.name in {item.session for item in client.status().sessions}
         stranger.send(replace(HEARTBEAT, state="draining"))
         wait_until(lambda: "a-false-one" not in instances(client))
 
@@ -142,7 +142,7 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
 
 
 def test_a_key_may_do_what_its_roles_say(keyed: Client, client: Client, witness: Session) -> None:
-    assert witness.name in {each.session for each in keyed.status().sessions}
+    assert witness.name in {item.session for item in keyed.status().sessions}
     with pytest.raises(Refused, match=r"not-allowed: .* no role client"):
         keyed.open_session()
     with pytest.raises(Refused, match=r"not-allowed: .* no role client or operator"):
@@ -183,5 +183,5 @@ def test_very_many_false_services_leave_the_status_readable(system: System, clie
             answer(stranger, HeartbeatReply)
         stranger.send(replace(heartbeat, instance="one-too-many"))
         assert answer(stranger, Error).code == "too-many-services"
-        lamps = [each for each in client.status().services if each.service == "lamp"]
+        lamps = [item for item in client.status().services if item.service == "lamp"]
         assert len(lamps) == MAX_SERVICES_PER_KEY

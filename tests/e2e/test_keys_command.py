@@ -66,7 +66,7 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         assert all(name in listed for name in ("recognizer-host", "synthesizer-host", "laptop"))
         assert kouxing("keys", "revoke", "recognizer-host").returncode == 0
         system.wait_until(
-            lambda report: "recognizer" not in {each.service for each in report.services}
+            lambda report: "recognizer" not in {item.service for item in report.services}
         )
         advice = "kouxing keys add NAME --role service:recognizer"
         wait_until(lambda: advice in system.log("recognizer"))

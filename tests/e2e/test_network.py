@@ -75,7 +75,7 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
 
 
 def symbols(seen: Seen, since: int = 0) -> list[str]:
-    return [each.symbol for each in seen.spoken_phones() if each.media_time >= since]
+    return [item.symbol for item in seen.spoken_phones() if item.media_time >= since]
 
 
 def assert_same(seen: Seen, expected: Seen, since: int = 0) -> None:

@@ -176,7 +176,7 @@ def test_a_face_learns_when_the_session_that_it_listens_to_speaks(stage: Stage) 
     heard: list[bool | None] = []
     for _ in range(1000):
         stage.control.step(0.01)
-        received = [each.message for each in synthesizer.receive()]
+        received = [item.message for item in synthesizer.receive()]
         heard += [message.face.listening for message in received if isinstance(message, SetFace)]
         if len(heard) == 2:
             break

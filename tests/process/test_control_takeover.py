@@ -52,7 +52,7 @@ def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
     while len(received) < num:
         assert time.monotonic() < end_s
         stage.control.step(0.01)
-        received += [each.message for each in socket.receive()]  # type: ignore[misc]
+        received += [item.message for item in socket.receive()]  # type: ignore[misc]
     return received
 
 

@@ -60,7 +60,7 @@ def _page(port: int) -> str:
 
 
 def _names(families: dict[str, list[Metric]]) -> set[str]:
-    return {family.name for each in families.values() for family in each}
+    return {family.name for item in families.values() for family in item}
 
 
 def test_every_metric_is_documented(families: dict[str, list[Metric]]) -> None:
@@ -74,7 +74,7 @@ def test_every_metric_is_documented(families: dict[str, list[Metric]]) -> None:
 
 def test_the_dashboard_uses_only_known_metrics(families: dict[str, list[Metric]]) -> None:
     dashboard = json.loads((ROOT / "deploy" / "grafana.json").read_text("utf-8"))
-    served = {name for each in families.values() for family in each for name in _forms(family)}
+    served = {name for item in families.values() for family in item for name in _forms(family)}
     for panel in dashboard["panels"]:
         for target in panel["targets"]:
             names = re.findall(r"\b(?:kouxing|process)_\w+", target["expr"])

@@ -90,11 +90,11 @@ def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
     for name in conditions[1:]:
         assert (videos / name / "hello.mp4").read_bytes() == b"made before", "it is kept"
     figures = json.loads((tmp_path / "figures.json").read_text(encoding="utf-8"))
-    bound, recognised, live, next_phone = figures["scores"]
+    bound, from_phones, live, next_phone = figures["scores"]
     assert bound["like_scheme_1"]["correlation"]["opening"] == pytest.approx(1.0)
     assert bound["like_scheme_1"]["lag_ms"] == 0
     assert bound["face_delay_ms"] is bound["phone_delay_p50_ms"] is None
-    assert recognised["phone_delay_p50_ms"] is None
+    assert from_phones["phone_delay_p50_ms"] is None
     assert 0.0 < live["phone_delay_p50_ms"] < next_phone["phone_delay_p50_ms"]
     assert live["face_delay_ms"] == 60.0
     assert 0.5 < live["like_scheme_1"]["correlation"]["opening"] < 1.0

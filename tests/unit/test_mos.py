@@ -123,7 +123,7 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     assert result.exit_code == 0, result.output
     assert files[0].stat().st_size > 1000
     figures = json.loads(files[1].read_text())
-    means = {each["condition"]: each["of_all"]["value"] for each in figures["opinions"]}
+    means = {item["condition"]: item["of_all"]["value"] for item in figures["opinions"]}
     assert means == pytest.approx(given)
     exported = run(app, ["export", str(folder), "-o", str(folder / "scores.csv")])
     assert exported.stderr == f"wrote {folder / 'scores.csv'}\n"
