@@ -35,7 +35,7 @@ def families(system: System) -> dict[str, list[Metric]]:
     ports = [int(system.environment[variable(name, "metrics_port")]) for name in CHAIN]
     with Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)
-        session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz, paced=False)
+        session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz)
         output = session.results(FapFrame, keep_all=True)
         session.push(samples)
         session.finish()
