@@ -1,7 +1,9 @@
 """Reads recordings of speech that name an emotion.
 
 A folder has a ``manifest.tsv`` with the columns ``path``, ``speaker``, ``licence``, ``seconds`` and
-``note``. The note of such a recording contains ``emotion NAME``, for example *emotion anger*.
+``note``. The note of such a recording contains ``emotion NAME``, for example *emotion anger*. The
+optional column ``phones_path`` names a table with the columns ``start_s`` and ``marks``. The marks
+1, 2 and 3 are those of stressed vowels.
 """
 
 import csv
@@ -25,6 +27,7 @@ FEELINGS = {
     "boredom": (-0.6, -0.4),
 }
 _EMOTION = re.compile(r"emotion (\w+)")
+_STRESS_MARKS = {"1", "2", "3"}
 _MAX_BYTES = 16 << 20
 
 
@@ -37,6 +40,7 @@ class SpokenEmotion:
     license: str
     minutes: float
     emotion: str | None
+    stressed_s: tuple[float, ...] = ()  # starts of stressed vowels, if phone times are given
 
 
 def read_emotions(folder: Path, *, shipping: bool = False) -> list[SpokenEmotion]:
@@ -58,6 +62,7 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[SpokenEmotion
                 row["licence"],
                 float(row["seconds"]) / 60,
                 emotion,
+                _stressed(folder / row["phones_path"]) if row.get("phones_path") else (),
             )
             if may_ship(recording.license) or not shipping:
                 recordings.append(recording)
@@ -70,6 +75,14 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[SpokenEmotion
     if not any(recording.emotion for recording in recordings):
         raise UserError(f"{manifest} names no emotion; add notes such as 'emotion anger'")
     return recordings
+
+
+def _stressed(path: Path) -> tuple[float, ...]:
+    lines = split_lines(path, read_text(path, _MAX_BYTES))
+    rows = csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE)
+    return tuple(
+        float(row["start_s"]) for row in rows if _STRESS_MARKS & set(row["marks"].split(","))
+    )
 
 
 def speakers_of(recordings: Sequence[SpokenEmotion]) -> list[str]:

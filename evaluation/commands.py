@@ -145,6 +145,28 @@ def voice(
     write_json(json_file, results)
 
 
+@app.command()
+def face(
+    recordings: Annotated[
+        Path, typer.Option(help="Folder of speech whose manifest names emotions.")
+    ],
+    acoustic: Annotated[
+        str, typer.Option(help="Model: blocks, light, gmm or a file; it hardly matters.")
+    ] = "light",
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure the motion of a face apart from its lips: feeling, nods, brows, blinks, stillness."""
+    from kouxing.corpora.emotions import read_emotions
+    from kouxing.evaluation.face import measure_face, print_face
+    from kouxing.services.recognizer.acoustic.load import load_model
+
+    check_output(json_file, force=force)
+    figures = measure_face(load_model(acoustic), read_emotions(recordings))
+    print_face(figures, Console())
+    write_json(json_file, asdict(figures))
+
+
 def _read_sounds(folders: list[Path] | None) -> list[Sound]:
     from kouxing.corpora.sounds import read_sounds
 

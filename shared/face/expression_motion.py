@@ -36,6 +36,7 @@ JAW = 3 - 1
 UPPER = np.array([4, 8, 9, 51, 55, 56]) - 1  # positive is down
 LOWER = np.array([5, 10, 11, 52, 57, 58]) - 1  # positive is up; same points as in UPPER
 
+_VISIBLE = 0.01  # FAP units
 _EASE_S, _FADE_S = 0.09, 0.3  # time constants of each filter pole
 _FREE_S, _BIND_S = 0.15, 0.04  # time constant of freeing the lips; time for binding them
 _ARKIT_EXPRESSIONS = {
@@ -63,6 +64,7 @@ class ExpressionMotion:
         self._shown = TwoPoleFilter(self._goal)
         self._remaining_s = 0.0  # until the expressions fade
         self._free = 1.0
+        self._is_shown = False
 
     def show(self, strengths: Mapping[str, float], hold_s: float) -> None:
         """Replace the current expressions for a time; without strengths they fade now.
@@ -92,9 +94,11 @@ class ExpressionMotion:
             self._free = max(self._free - step_s / _BIND_S, 0.0)
         else:
             self._free += (1.0 - self._free) * smoothing_share(step_s, _FREE_S)
-        if is_held or self._shown.value.any():
+        if is_held or self._is_shown:
             goal = is_held * self._goal
-            mix(faps, self._shown.step(goal, step_s, _EASE_S if is_held else _FADE_S), self._free)
+            shown = self._shown.step(goal, step_s, _EASE_S if is_held else _FADE_S)
+            mix(faps, shown, self._free)
+            self._is_shown = bool(np.abs(shown).max() > _VISIBLE)
 
 
 def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:

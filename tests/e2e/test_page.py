@@ -247,6 +247,9 @@ def test_the_caption_shows_syllables_or_phones(
     for caption in ("yao", "iao"):
         page.wait_for(f"window.kouxing?.state.caption === '{caption}'")
         page.click("show-phones")
+    for is_shown in (False, True):
+        page.evaluate("document.getElementById('captions').click()")
+        assert page.evaluate("document.getElementById('spoken').offsetHeight > 0") is is_shown
 
 
 def test_sound_starts_with_a_click_and_waits_for_its_image(audible: Browser) -> None:

@@ -56,9 +56,16 @@ export class Caption {
   #phones = new PhoneTrack();
   #preferences;
 
-  /** @param {Preferences} preferences stores whether phones are shown */
+  /** @param {Preferences} preferences stores whether captions and phones are shown */
   constructor(preferences) {
     this.#preferences = preferences;
+    const switched = element("captions");
+    switched.checked = preferences.get("captions") ?? true;
+    switched.oninput = () => {
+      preferences.set("captions", switched.checked);
+      this.#showOrHide();
+    };
+    this.#showOrHide();
     const button = element("show-phones");
     button.setAttribute("aria-pressed", this.#showsPhones);
     button.onclick = () => {
@@ -97,6 +104,10 @@ export class Caption {
       element("past").dataset.key = key;
       element("past").replaceChildren(...past.map(listItem));
     }
+  }
+
+  #showOrHide() {
+    element("phones").hidden = !element("captions").checked;
   }
 
   get #showsPhones() {

@@ -124,6 +124,7 @@ export const TEXTS = {
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
+  captions: { en: "Captions", zh: "字幕" },
   still: { en: "Keep the head still", zh: "头部保持不动" },
   eye_contact: { en: "Keep eye contact", zh: "始终看着观众" },
   feeling: { en: "Feeling from the voice", zh: "随声音流露的情绪" },

@@ -19,6 +19,7 @@ from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _GAIN = 2.5  # usual voices differ from their mean by up to 0.4
 _FILTER_S = 0.4  # time constant of each filter pole
+_VISIBLE = 1e-3  # smaller feelings are not shown
 _SIZE = 0.25  # of the mouth's movements, at full arousal
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
@@ -66,18 +67,23 @@ class FeelingMotion:
 
     def __init__(self, amount: float) -> None:
         self.amount = amount
-        self._feeling = TwoPoleFilter(np.zeros(2, np.float32))
+        self._arousal, self._valence = TwoPoleFilter(0.0), TwoPoleFilter(0.0)
         self._size = Expressiveness(1.0)
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the feeling to a frame, FAPs (68,), in place."""
-        goal = np.zeros(2, np.float32)
-        if context.is_speaking:
-            goal += np.clip(_GAIN * np.array(context.feeling), -1.0, 1.0)
-        arousal, valence = self._feeling.step(
-            np.float32(self.amount) * goal, context.step_s, _FILTER_S
+        arousal, valence = (
+            motion.step(self._goal(value, context), context.step_s, _FILTER_S)
+            for motion, value in zip((self._arousal, self._valence), context.feeling, strict=True)
         )
-        self._size.amount = 1.0 + _SIZE * float(arousal)
-        self._size.apply(faps)
-        faps += abs(arousal) * (_AROUSED if arousal > 0.0 else _TIRED)
-        faps += abs(valence) * (_PLEASANT if valence > 0.0 else _UNPLEASANT)
+        if abs(arousal) > _VISIBLE:
+            self._size.amount = 1.0 + _SIZE * arousal
+            self._size.apply(faps)
+            faps += np.float32(abs(arousal)) * (_AROUSED if arousal > 0.0 else _TIRED)
+        if abs(valence) > _VISIBLE:
+            faps += np.float32(abs(valence)) * (_PLEASANT if valence > 0.0 else _UNPLEASANT)
+
+    def _goal(self, value: float, context: FrameContext) -> float:
+        if not context.is_speaking:
+            return 0.0
+        return self.amount * min(max(_GAIN * value, -1.0), 1.0)

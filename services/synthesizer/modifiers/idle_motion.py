@@ -43,6 +43,7 @@ _MIN_SIZE = 0.5  # of the weakest nod, relative to the largest one
 _STARTING_S = 0.9  # duration of speech after a pause
 _ENDING_S, _THINKING_S, _LISTENING_S = 0.2, 0.9, 2.5  # duration of silence
 _NOD_HOLD_S, _BROW_HOLD_S, _TILT_HOLD_S, _TURN_HOLD_S = 0.14, 0.22, 0.6, 0.7
+_VISIBLE = 1e-4  # degrees, or brow raises
 _FILTER_S, _SLOW_S = 0.08, 0.2  # time constant of each filter pole
 _BROW = {  # FAP units of a full movement
     f"raise_{side}_{part}_eyebrow": units
@@ -108,16 +109,19 @@ class SpeechIdleMotion:
             self._has_heard_pause = False
             self._idle.blink_slowly(now_s)
         self._idle.apply(faps, now_s, self._state(prosody.silence_s, now_s))
-        faps[_BROWS] += np.float32(self._brow.at(now_s, step_s)) * _BROW_UNITS
+        if brow := self._brow.at(now_s, step_s):
+            faps[_BROWS] += np.float32(brow) * _BROW_UNITS
         is_voiced = prosody.silence_s < step_s
         is_lifted = is_voiced and not self._is_still
         lift = self._lift.step(prosody.raised if is_lifted else 0.0, step_s, _SLOW_S)
+        lift = lift if abs(lift) > _VISIBLE else 0.0
         pitch = self._nod.at(now_s, step_s) - _LIFT_DEG * lift
         yaw, roll = self._turn.at(now_s, step_s), self._tilt.at(now_s, step_s)
-        faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(_DEGREE)
-        # the gaze target stays in place
-        faps[EYES_PITCH] -= np.float32(pitch * _DEGREE)
-        faps[EYES_YAW] -= np.float32(yaw * _DEGREE)
+        if pitch or yaw or roll:
+            faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(_DEGREE)
+            # the gaze target stays in place
+            faps[EYES_PITCH] -= np.float32(pitch * _DEGREE)
+            faps[EYES_YAW] -= np.float32(yaw * _DEGREE)
 
     def _start_movements(self, prosody: Prosody, now_s: float, *, starts: bool) -> None:
         may_nod = now_s - self._nod_s > _MIN_NOD_INTERVAL_S
@@ -163,4 +167,5 @@ class _Movement:
 
     def at(self, now_s: float, step_s: float) -> float:
         goal = self._size if now_s < self._until_s else 0.0
-        return self._value.step(goal, step_s, self._filter_s)
+        value = self._value.step(goal, step_s, self._filter_s)
+        return value if goal or abs(value) > _VISIBLE else 0.0

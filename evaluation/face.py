@@ -1,0 +1,273 @@
+"""Measures the motion of a live face apart from its lips: feeling, nods, brows, blinks, stillness.
+
+The recordings of each speaker are one session, with pauses between them. The folder names their
+emotions (:mod:`kouxing.corpora.emotions`), and may have the times of stressed vowels. A second face
+is at rest for a minute.
+
+- Rank correlations (Spearman), mean over speakers: the estimated arousal and valence, the size of
+  the mouth's motion and the height of the brows, each with the feeling of the named emotion.
+- Nods and brow raises: peaks of the head's pitch and of the brows. Those during a recording match a
+  stressed vowel if the last one started 0.1 to 0.3 s before the peak. The chance is the share of
+  all times that match. Movements within 0.6 s after a recording mark the end of the phrase.
+- Blinks per minute and their median duration.
+- Still frames: no FAP moves by more than 0.01 degrees or 0.5 FAP units.
+
+The actors of the shipped readout are not unseen speakers. Its card has the correlations of unseen
+ones.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from scipy.signal import find_peaks
+from scipy.stats import spearmanr
+
+from kouxing.corpora.emotions import FEELINGS, SpokenEmotion, speakers_of
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.evaluation.lips.effort import opening_range
+from kouxing.evaluation.tables import format_number, percent
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.phones.events import Progress
+from kouxing.shared.terminal import CONSOLE, print_table
+
+Floats = NDArray[np.float32]
+Times = NDArray[np.float64]  # (n,) media times, seconds
+
+_PAUSE_S = 0.6  # between recordings
+_CHUNK = MEDIA_RATE_HZ // 10
+_REST_S = 60.0
+_MATCH_S = (0.1, 0.3)  # from a stressed vowel to the peak of its movement
+_NOD_DEG, _BROW_UNITS = 0.5, 15.0  # prominence of peaks
+_CLOSED_LID = 450.0  # FAP units, half of a closed lid
+_STILL_DEG, _STILL_UNITS = 0.01, 0.5
+_DEGREE = np.deg2rad(1.0) / RADIANS_PER_ANGLE_UNIT
+_BROW, _LID, _PITCH, _UPPER, _LOWER = (
+    FAP_NUMBER[name] - 1
+    for name in (
+        "raise_l_m_eyebrow",
+        "close_t_l_eyelid",
+        "head_pitch",
+        "lower_t_midlip",
+        "raise_b_midlip",
+    )
+)
+_ANGLES = [
+    number - 1
+    for name, number in FAP_NUMBER.items()
+    if name.startswith("head_") or ("eyeball" in name and not name.startswith("thrust"))
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Movements:
+    """How often a movement occurs, and how often it matches a stressed vowel."""
+
+    per_minute: float  # of speech
+    at_end: float  # share after a phrase
+    matched: float | None  # share of the others; None without any or without stressed vowels
+
+
+@dataclass(frozen=True, slots=True)
+class FaceFigures:
+    """The figures of a face."""
+
+    correlations: Mapping[str, float]
+    nods: Movements
+    brow_raises: Movements
+    chance: float | None  # of matching a stressed vowel
+    blinks_per_minute: float
+    blink_s: float  # median duration
+    still_speaking: float  # shares of frames
+    still_at_rest: float
+    longest_still_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """The face of one speaker."""
+
+    faps: Floats  # (frames, 68)
+    spans: Sequence[tuple[float, float]]  # of the recordings
+    feelings: Sequence[tuple[float, float]]  # estimated at the end of each recording
+    stressed_s: Times
+
+
+def measure_face(model: AcousticModel, recordings: Sequence[SpokenEmotion]) -> FaceFigures:
+    """Animate all recordings that name an emotion, and a face at rest."""
+    config = SynthesizerConfig()
+    spoken = [recording for recording in recordings if recording.emotion]
+    by_speaker = [
+        [recording for recording in spoken if recording.speaker == speaker]
+        for speaker in speakers_of(spoken)
+    ]
+    sessions = [
+        _animate(model, own, config)
+        for own in track(by_speaker, "speakers", console=CONSOLE, transient=True)
+    ]
+    labels = [np.array([FEELINGS[one.emotion or ""] for one in own]) for own in by_speaker]
+    frames = np.concatenate([session.faps for session in sessions])
+    minutes = sum(end - start for one in sessions for start, end in one.spans) / 60
+    face = FaceAnimator(
+        load_lip_model(name=config.lips),
+        frame_rate_hz=config.frame_rate_hz,
+        delay_s=config.delay_ms / 1e3,
+        idle_motion_seed=config.idle_motion_seed,
+    )
+    rest = np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
+    blinks_s = _blinks(frames, config.frame_rate_hz)
+    nods = [_peaks(one, _PITCH, _NOD_DEG * _DEGREE, config.frame_rate_hz) for one in sessions]
+    raises = [_peaks(one, _BROW, _BROW_UNITS, config.frame_rate_hz) for one in sessions]
+    grid = [np.concatenate([np.arange(*span, 0.02) for span in one.spans]) for one in sessions]
+    still = [_is_still(one.faps) for one in sessions]
+    return FaceFigures(
+        correlations=_correlations(sessions, labels, config.frame_rate_hz),
+        nods=_movements(nods, sessions, minutes),
+        brow_raises=_movements(raises, sessions, minutes),
+        chance=_matched(grid, sessions),
+        blinks_per_minute=60 * config.frame_rate_hz * len(blinks_s) / len(frames),
+        blink_s=float(np.median(blinks_s)) if len(blinks_s) else 0.0,
+        still_speaking=float(np.concatenate(still).mean()),
+        still_at_rest=float(_is_still(rest).mean()),
+        longest_still_s=max(map(_longest_run, [*still, _is_still(rest)])) / config.frame_rate_hz,
+    )
+
+
+def _animate(
+    model: AcousticModel, recordings: Sequence[SpokenEmotion], config: SynthesizerConfig
+) -> _Session:
+    """Stream the recordings of a speaker as one session."""
+    chain = LiveChain(model, load_lip_model(name=config.lips), synthesizer=config)
+    pause = np.zeros(round(_PAUSE_S * MEDIA_RATE_HZ), np.float32)
+    frames, spans, stressed = [], [], []
+    start = 0  # samples
+    for recording in recordings:
+        samples = read_audio(recording.path)
+        joined = np.concatenate([samples, pause])
+        for first in range(0, len(joined), _CHUNK):
+            frames += chain.accept_waveform(joined[first : first + _CHUNK])
+        start_s = start / MEDIA_RATE_HZ
+        spans.append((start_s, (start + len(samples)) / MEDIA_RATE_HZ))
+        stressed += [start_s + time_s for time_s in recording.stressed_s]
+        start += len(joined)
+    frames += chain.input_finished()
+    progress = [event for event in chain.events if isinstance(event, Progress)]
+    times_s = np.array([event.time_s for event in progress])
+    ends = np.searchsorted(times_s, [end_s for _, end_s in spans]) - 1
+    return _Session(
+        np.array([faps for _, faps in frames]),
+        spans,
+        [(progress[end].arousal, progress[end].valence) for end in ends],
+        np.array(stressed),
+    )
+
+
+def _correlations(
+    sessions: Sequence[_Session], labels: Sequence[NDArray[np.float64]], rate_hz: float
+) -> dict[str, float]:
+    found: dict[str, list[float]] = {}
+    for session, label in zip(sessions, labels, strict=True):
+        parts = [
+            session.faps[round(start * rate_hz) : round(end * rate_hz)]
+            for start, end in session.spans
+        ]
+        openings = [
+            opening_range(-(part[:, _UPPER] + part[:, _LOWER]).astype(np.float64)) for part in parts
+        ]
+        brows = [part[len(part) // 2 :, _BROW].mean() for part in parts]  # feelings act slowly
+        arousal, valence = np.array(session.feelings).T
+        for name, values, column in (
+            ("arousal", arousal, 0),
+            ("valence", valence, 1),
+            ("size of the mouth, with arousal", openings, 0),
+            ("height of the brows, with arousal", brows, 0),
+        ):
+            statistic = spearmanr(values, label[:, column]).statistic
+            found.setdefault(name, []).append(float(statistic))
+    return {name: float(np.nanmean(values)) for name, values in found.items()}
+
+
+def _peaks(session: _Session, fap: int, prominence: float, rate_hz: float) -> Times:
+    """Return the times of the peaks of a FAP while the speaker speaks."""
+    peaks, _ = find_peaks(session.faps[:, fap], prominence=prominence)
+    times_s = peaks / rate_hz
+    spoken = [(start <= times_s) & (times_s < end + _PAUSE_S) for start, end in session.spans]
+    chosen: Times = times_s[np.any(spoken, axis=0)]
+    return chosen
+
+
+def _movements(times: Sequence[Times], sessions: Sequence[_Session], minutes: float) -> Movements:
+    num_movements = sum(map(len, times))
+    within = [
+        one_s[np.any([(start <= one_s) & (one_s < end) for start, end in session.spans], axis=0)]
+        for one_s, session in zip(times, sessions, strict=True)
+    ]
+    at_end = 1.0 - sum(map(len, within)) / max(num_movements, 1)
+    return Movements(num_movements / minutes, at_end, _matched(within, sessions))
+
+
+def _matched(times: Sequence[Times], sessions: Sequence[_Session]) -> float | None:
+    """Return the share of times that follow the start of a stressed vowel."""
+    shortest_s, longest_s = _MATCH_S
+    lags_s = []
+    for one_s, session in zip(times, sessions, strict=True):
+        starts_s = np.array([-np.inf, *session.stressed_s])
+        if len(starts_s) > 1:
+            lags_s += (
+                one_s - starts_s[np.searchsorted(starts_s, one_s, side="right") - 1]
+            ).tolist()
+    lag_s = np.array(lags_s)
+    matches = (lag_s >= shortest_s) & (lag_s <= longest_s)
+    return float(matches.mean()) if len(matches) else None
+
+
+def _blinks(faps: Floats, rate_hz: float) -> Times:
+    """Return the durations of the blinks, seconds."""
+    closed = np.pad((faps[:, _LID] > _CLOSED_LID).astype(int), 1)
+    changes = np.diff(closed)
+    durations: Times = (np.flatnonzero(changes < 0) - np.flatnonzero(changes > 0)) / rate_hz
+    return durations
+
+
+def _is_still(faps: Floats) -> NDArray[np.bool_]:
+    """Return whether each frame but the first looks like the one before."""
+    limits = np.full(faps.shape[1], _STILL_UNITS)
+    limits[_ANGLES] = _STILL_DEG * _DEGREE
+    still: NDArray[np.bool_] = np.all(np.abs(np.diff(faps, axis=0)) <= limits, axis=1)
+    return still
+
+
+def _longest_run(mask: NDArray[np.bool_]) -> int:
+    changes = np.flatnonzero(~np.concatenate([[False], mask, [False]]))
+    return int(np.diff(changes).max() - 1)
+
+
+def print_face(figures: FaceFigures, console: Console) -> None:
+    """Print the figures as one table."""
+    rows = [
+        *(
+            [f"rank correlation: {name}", f"{value:.2f}"]
+            for name, value in figures.correlations.items()
+        ),
+        ["nods per minute of speech", f"{figures.nods.per_minute:.0f}"],
+        ["brow raises per minute of speech", f"{figures.brow_raises.per_minute:.0f}"],
+        ["nods at the end of a phrase, %", percent(figures.nods.at_end)],
+        ["other nods after a stressed vowel, %", percent(figures.nods.matched)],
+        ["brow raises after a stressed vowel, %", percent(figures.brow_raises.matched)],
+        ["any time after a stressed vowel, %", percent(figures.chance)],
+        ["blinks per minute", f"{figures.blinks_per_minute:.0f}"],
+        ["median duration of a blink, s", format_number(figures.blink_s)],
+        ["still frames while speaking, %", percent(figures.still_speaking)],
+        ["still frames at rest, %", percent(figures.still_at_rest)],
+        ["longest still time, s", format_number(figures.longest_still_s)],
+    ]
+    print_table(console, "motion of the face", ("figure", ""), rows)

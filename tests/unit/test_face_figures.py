@@ -1,0 +1,85 @@
+"""Figures of a face's motion."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from rich.console import Console
+
+from kouxing.corpora.emotions import read_emotions
+from kouxing.evaluation import face
+from kouxing.evaluation.face import measure_face, print_face
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.errors import UserError
+from tests.system import VOWELS_FILE
+
+COLUMNS = "path\tspeaker\tlicence\tseconds\tnote\tphones_path\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with one speaker's calm and loud vowels."""
+    samples, rate_hz = soundfile.read(VOWELS_FILE, dtype="float32")
+    rows = COLUMNS
+    for name, gain, emotion in (("calm", 0.1, "boredom"), ("loud", 0.9, "anger"), ("x", 0.3, "")):
+        soundfile.write(tmp_path / f"{name}.wav", gain * samples[:40_000], rate_hz)
+        rows += f"{name}.wav\tann\tCC0\t2.5\t{emotion and f'emotion {emotion}'}\tphones.tsv\n"
+    (tmp_path / "manifest.tsv").write_text(rows, encoding="utf-8")
+    (tmp_path / "phones.tsv").write_text(
+        "start_s\tmarks\n0.5\t2\n0.9\t+sth\n1.5\t+sth,3\n", encoding="utf-8"
+    )
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_measures_a_face_that_moves(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(face, "_REST_S", 4.0)
+    figures = measure_face(load_model("light"), read_emotions(folder))
+    assert set(figures.correlations) > {"arousal", "valence"}
+    assert figures.still_at_rest < 0.5
+    assert figures.longest_still_s < 2.0
+    assert 0.0 < (figures.chance or 0.0) < 0.5
+    output = io.StringIO()
+    print_face(figures, Console(file=output, width=80))
+    assert "nods per minute of speech" in output.getvalue()
+
+
+def test_movements_match_the_stressed_vowels_that_they_follow() -> None:
+    faps = np.zeros((200, 68), np.float32)
+    session = face._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([0.5, 1.5]))
+    nods = face._movements([np.array([0.2, 0.7, 1.4, 1.75, 2.4])], [session], minutes=0.5)
+    assert (nods.per_minute, nods.matched) == (10.0, 0.5)
+    assert nods.at_end == pytest.approx(0.2)
+    silent = face._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([]))
+    assert face._movements([np.array([1.0])], [silent], minutes=1.0).matched is None
+
+
+def test_counts_blinks_and_still_frames() -> None:
+    faps = np.zeros((100, 68), np.float32)
+    faps[20:28, face._LID] = 900.0
+    faps[60:, face._PITCH] = np.linspace(0.0, 1000.0, 40)
+    rate_hz = SynthesizerConfig().frame_rate_hz
+    np.testing.assert_allclose(face._blinks(faps, rate_hz), [8 / rate_hz])
+    still = face._is_still(faps)
+    assert np.count_nonzero(~still) == 2 + 39
+    assert face._longest_run(still) == 32
+    assert face._longest_run(np.array([True] * 5)) == 5
+
+
+def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
+    calm, loud, other = read_emotions(folder, shipping=True)
+    assert (calm.emotion, loud.emotion, other.emotion) == ("boredom", "anger", None)
+    assert calm.stressed_s == (0.5, 1.5)
+    manifest = folder / "manifest.tsv"
+    manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\t2.5\tcalm\t\n", encoding="utf-8")
+    with pytest.raises(UserError, match="names no emotion"):
+        read_emotions(folder)
+    manifest.write_text("path\tspeaker\ncalm.wav\tann\n", encoding="utf-8")
+    with pytest.raises(UserError, match="lacks the column 'note'"):
+        read_emotions(folder)
+    manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\tlong\temotion fear\t\n", encoding="utf-8")
+    with pytest.raises(UserError, match="give the seconds as a number"):
+        read_emotions(folder)
