@@ -9,35 +9,56 @@ import { readGraph } from "./onnx-file.js";
 
 const PRODUCT = "MatMulIntegerToFloat";
 
-const unary = (compute) => (_node, [x]) => {
-  const out = new Float32Array(x.length);
-  const run = () => {
-    for (let i = 0; i < out.length; i++) out[i] = compute(x[i]);
-  };
-  return { outputs: [out], run };
+// Each of these loops is a function of its own, so that JavaScript engines compile it for its operation.
+const UNARY = {
+  Abs(out, x) {
+    for (let i = 0; i < out.length; i++) out[i] = Math.abs(x[i]);
+  },
+  Relu(out, x) {
+    for (let i = 0; i < out.length; i++) out[i] = Math.max(x[i], 0);
+  },
+  Sigmoid(out, x) {
+    for (let i = 0; i < out.length; i++) out[i] = 1 / (1 + Math.exp(-x[i]));
+  },
+  Tanh(out, x) {
+    for (let i = 0; i < out.length; i++) out[i] = Math.tanh(x[i]);
+  },
+};
+// A single value applies to all: its step is 0.
+const BINARY = {
+  Add(out, x, y, xStep, yStep) {
+    for (let i = 0; i < out.length; i++) out[i] = x[i * xStep] + y[i * yStep];
+  },
+  Sub(out, x, y, xStep, yStep) {
+    for (let i = 0; i < out.length; i++) out[i] = x[i * xStep] - y[i * yStep];
+  },
+  Mul(out, x, y, xStep, yStep) {
+    for (let i = 0; i < out.length; i++) out[i] = x[i * xStep] * y[i * yStep];
+  },
+  Max(out, x, y, xStep, yStep) {
+    for (let i = 0; i < out.length; i++) out[i] = Math.max(x[i * xStep], y[i * yStep]);
+  },
 };
 
-const binary = (compute) => (_node, [x, y]) => {
+function unary({ type }, [x]) {
+  const out = new Float32Array(x.length);
+  const compute = UNARY[type];
+  return { outputs: [out], run: () => compute(out, x) };
+}
+
+function binary({ type }, [x, y]) {
   const out = new Float32Array(Math.max(x.length, y.length));
-  const [xStep, yStep] = [x.length > 1 ? 1 : 0, y.length > 1 ? 1 : 0]; // a single value applies to all
-  const run = () => {
-    for (let i = 0; i < out.length; i++) out[i] = compute(x[i * xStep], y[i * yStep]);
-  };
-  return { outputs: [out], run };
-};
+  const [xStep, yStep] = [x, y].map(({ length }) => (length > 1 ? 1 : 0));
+  const compute = BINARY[type];
+  return { outputs: [out], run: () => compute(out, x, y, xStep, yStep) };
+}
 
 const constant = (...outputs) => ({ outputs, run() {} });
 
 // Each takes a node and its inputs, and returns { outputs, run: computes them }.
 const OPERATORS = {
-  Abs: unary(Math.abs),
-  Relu: unary((x) => Math.max(x, 0)),
-  Sigmoid: unary((x) => 1 / (1 + Math.exp(-x))),
-  Tanh: unary(Math.tanh),
-  Add: binary((x, y) => x + y),
-  Sub: binary((x, y) => x - y),
-  Mul: binary((x, y) => x * y),
-  Max: binary(Math.max),
+  ...Object.fromEntries(Object.keys(UNARY).map((type) => [type, unary])),
+  ...Object.fromEntries(Object.keys(BINARY).map((type) => [type, binary])),
   ReduceMax(_node, [x]) {
     const out = new Float32Array(1);
     return { outputs: [out], run: () => (out[0] = largest(x)) };

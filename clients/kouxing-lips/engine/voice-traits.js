@@ -26,9 +26,11 @@ export class VoiceTraits {
   accept(state, voice) {
     const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_SHARE } = this.#c;
     const { values, shape } = this.#weights;
-    const outputs = Array.from(this.#bias, (bias, output) =>
-      state.reduce((sum, value, i) => sum + value * values[i * shape[1] + output], bias),
-    );
+    const outputs = Array.from(this.#bias, (bias, output) => {
+      let sum = bias;
+      for (let i = 0; i < state.length; i++) sum += state[i] * values[i * shape[1] + output];
+      return sum;
+    });
     const towards = (values_, share) => values_.map((value, i) => value + share * (outputs[i] - value));
     if (voice[this.#voices.SPEECH] + voice[this.#voices.SUNG] > MIN_VOICE) {
       this.#numVoiced++;
