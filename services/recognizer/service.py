@@ -47,9 +47,9 @@ READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, an
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # between ticks while a session is open
-STEP_S = 0.003  # between steps with several sessions, to process their audio together
+STEP_S = 0.002  # between steps with several sessions, to process their audio together
 MIN_TOGETHER, MAX_TOGETHER = 4, 4  # sessions
-NETWORK_WEIGHT = 0.5  # of the block network's time in the load of the service
+NETWORK_WEIGHT = 0.25  # of the block network's time in the load of the service
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
