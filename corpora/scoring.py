@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from operator import ne
 
 import numpy as np
 
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.universal.segments import features
 
 
 @dataclass(slots=True, kw_only=True)
@@ -79,6 +81,27 @@ def count_errors(reference: Sequence[str], recognized: Sequence[str]) -> ErrorCo
         elif reference[i] != recognized[j]:
             counts.substitutions += 1
     return counts
+
+
+def feature_errors(reference: Sequence[str], recognized: Sequence[str]) -> float:
+    """Return the feature edit distance between universal phones.
+
+    A substitution costs the share of panphon's features that differ; an insertion or a deletion
+    costs 1. Divided by the number of reference phones, it is the phonetic feature error rate.
+    Source: Mortensen et al. 2016, "PanPhon: a resource for mapping IPA segments to articulatory
+    feature vectors" (Hamming distance).
+    """
+    known = features()
+    costs = [
+        [sum(map(ne, known[wanted], known[found])) / len(known[found]) for found in recognized]
+        for wanted in reference
+    ]
+    row = np.arange(len(recognized) + 1.0)
+    for i in range(len(reference)):
+        before, row = row, row + 1
+        for j in range(len(recognized)):
+            row[j + 1] = min(before[j] + costs[i][j], before[j + 1] + 1, row[j] + 1)
+    return float(row[-1])
 
 
 def is_emitted(phone: Phone, after: StreamOutput | None) -> bool:

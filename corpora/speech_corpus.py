@@ -8,7 +8,8 @@ The files in the folder determine the layout:
   is that split.
 - AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
 
-The inventory of the corpus's language converts text to phones. Bad rows are reported, counted and
+The inventory of the corpus's language converts text to phones. For universal phones, each row has
+its own language (:mod:`kouxing.corpora.universal_phones`). Bad rows are reported, counted and
 skipped, because large corpora always contain some.
 
 Natural recordings are held out from all training, to measure recognizers on them.
@@ -26,9 +27,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from kouxing.corpora.universal_phones import has_labels, universal_words
 from kouxing.shared.audio_file import read_duration_s
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory, Syllable
+from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, Syllable
 from kouxing.shared.terminal import plural
 from kouxing.shared.user_file import check_content, read_text, split_lines
 
@@ -55,10 +57,12 @@ class Utterance:
     path: Path
     speaker: str = ""
     license: str = ""
+    language: str = ""  # ISO 639 code, if the corpus has several languages
     split: str = ""
     seconds: float = 0.0
     phones: tuple[int, ...] = ()  # indices into the inventory's phones
     syllables: tuple[int, ...] = ()  # number of phones in each syllable
+    labels: Path | None = None  # table of universal phones with times, made by hand
 
     @property
     def minutes(self) -> float:
@@ -157,7 +161,10 @@ def _utterance(
     try:
         if not path.is_file():
             raise ValueError(f"no audio file {path}")
-        syllables = inventory.pronounce(row.get("pinyin") or row["text"])
+        if inventory.language == UNIVERSAL:
+            syllables = universal_words(row)
+        else:
+            syllables = inventory.pronounce(row.get("pinyin") or row["text"])
         seconds = float(row.get("seconds") or duration_s(path))
     except (UserError, ValueError, OSError) as error:  # OSError: invalid file name
         errors.add(place, str(error))
@@ -174,10 +181,12 @@ def _utterance(
         path=path,
         speaker=row.get("speaker") or row["utt_id"],
         license=row.get("licence", ""),
+        language=row.get("language", ""),
         split=_split_of(row),
         seconds=seconds,
         phones=phones,
         syllables=tuple(len(syllable) for syllable in syllables),
+        labels=Path(row["phones_path"]) if has_labels(row) else None,
     )
 
 
@@ -200,7 +209,10 @@ def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[s
     for number, row in enumerate(reader, start=2):
         place = f"{path.name} row {number} ({row['utt_id']})"
         cells = {"text": "", **{key: value or "" for key, value in row.items() if key}}
-        yield place, {**cells, "path": str((audio or path.parent) / cells["path"])}
+        for name in ("path", "phones_path"):
+            if cells.get(name):
+                cells[name] = str((audio or path.parent) / cells[name])
+        yield place, cells
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:

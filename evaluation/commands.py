@@ -50,7 +50,8 @@ AudioFolder = Annotated[
 ]
 Split = Annotated[str, typer.Option(help="Split of the corpus.")]
 Acoustic = Annotated[
-    list[str] | None, typer.Option(help="Model: blocks, light, gmm or a file; repeatable.")
+    list[str] | None,
+    typer.Option(help="Model: blocks, light, gmm, universal or a file; repeatable."),
 ]
 Sounds = Annotated[
     list[Path] | None,

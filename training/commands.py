@@ -171,6 +171,43 @@ def blocks(
 
 
 @app.command()
+def universal(
+    corpus: Corpora,
+    output: Model,
+    learners: Annotated[
+        list[Path] | None,
+        typer.Option(help="Corpus of English by native speakers of Mandarin; repeatable."),
+    ] = None,
+    languages: Annotated[
+        list[Path] | None,
+        typer.Option(help="Corpus with a column of languages; repeatable."),
+    ] = None,
+    clips: Annotated[Path | None, typer.Option(help="Folder of clips of GRID.")] = None,
+    seed: Seed = 0,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Number of steps, each with 19 s of audio.")
+    ] = 1000,
+    force: Force = False,
+) -> None:
+    """Train the universal phones, a readout of the shipped block model, and write its model card.
+
+    Give Mandarin corpora with --corpus. Repeat the command to resume an interrupted run.
+    """
+    with _neural_training(output, force=force):
+        from kouxing.training.universal.recipe import train_universal
+
+    train_universal(
+        corpus,
+        output,
+        learners=learners or [],
+        languages=languages or [],
+        clips=clips,
+        seed=seed,
+        num_steps=steps,
+    )
+
+
+@app.command()
 def ear(
     corpus: Corpora,
     output: Model,

@@ -7,6 +7,8 @@ disturbed speech (:mod:`~kouxing.evaluation.recognizer.disturbances`):
   speaker, with a bootstrap interval over speakers;
 - viseme error rate: the same for mouth shapes (Li 2011, table 1). Compound vowels are split. Equal
   neighbors count once, because the mouth does not move between them;
+- phonetic feature error rate of universal phones
+  (:func:`~kouxing.corpora.scoring.feature_errors`);
 - labials: recall and precision of the consonants made with the lips;
 - emission delay: media time when a phone is first emitted, minus its onset by forced alignment.
 
@@ -28,6 +30,7 @@ from rich.progress import track
 from kouxing.corpora.scoring import (
     ErrorCounts,
     count_errors,
+    feature_errors,
     final_hypothesis,
     first_hypothesis,
     matched_pairs,
@@ -43,7 +46,7 @@ from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory
 from kouxing.shared.terminal import CONSOLE
 
 # the paper's rule and a rule with fewer errors, which are measured in clean speech
@@ -74,6 +77,7 @@ class Score:
             for hypothesis in HYPOTHESES
             for unit in ("phone", "viseme")
         }
+        self._feature_errors = dict.fromkeys(HYPOTHESES, 0.0)
         self._labials = {hypothesis: Labials(inventory) for hypothesis in HYPOTHESES}
         self._delays_s: list[float] = []
 
@@ -87,6 +91,8 @@ class Score:
             shapes = (mouth_shapes(phones, self._inventory) for phones in (truth, symbols))
             self._counts[hypothesis, "phone"][speaker] += count_errors(truth, symbols)
             self._counts[hypothesis, "viseme"][speaker] += count_errors(*shapes)
+            if self._inventory.language == UNIVERSAL:
+                self._feature_errors[hypothesis] += feature_errors(truth, symbols)
             self._labials[hypothesis].add(truth, symbols)
         self._delays_s += [
             recognition.emitted_s[j] - reference.phones[i].onset_s
@@ -110,6 +116,10 @@ class Score:
                     for speaker, counts in sorted(by_speaker.items())
                 },
             }
+        if self._inventory.language == UNIVERSAL:
+            for hypothesis, errors in self._feature_errors.items():
+                rate = errors / max(1, out[hypothesis]["phone_errors"]["reference"])
+                out[hypothesis]["feature_error_rate"] = rate
         if self._delays_s:
             p50, p95 = np.percentile(self._delays_s, [50, 95])
             out["delay_ms"] = {"p50": 1000 * float(p50), "p95": 1000 * float(p95)}
@@ -166,7 +176,7 @@ def evaluate_recognizer(
             recognition = _recognize(model, scored, rule)
             speech[name].add(reference, recognition)
             if name == CLEAN:
-                speech[reference.rate_name].add(reference, recognition)
+                speech[reference.group].add(reference, recognition)
                 for other in rules:
                     by_rule[_rule_name(other)].add(reference, _recognize(model, scored, other))
     rng = np.random.default_rng(0)
@@ -175,8 +185,7 @@ def evaluate_recognizer(
         "speakers": len({reference.utterance.speaker for reference in references}),
         "speech": {
             name: speech[name].summary(rng)
-            for name in (*disturbances, *RATE_NAMES)
-            if name in speech
+            for name in sorted(speech, key=[*disturbances, *RATE_NAMES, *speech].index)
         },
         "rules": {name: score.summary(rng) for name, score in by_rule.items()},
     }

@@ -40,8 +40,10 @@ class Reference:
         return read_audio(self.utterance.path)
 
     @property
-    def rate_name(self) -> str:
-        """The class of the speaking rate."""
+    def group(self) -> str:
+        """The class of the speaking rate, or the language in a corpus of several languages."""
+        if self.utterance.language:
+            return f"language {self.utterance.language}"
         seconds = sum(phone.duration_s for phone in self.phones)
         return RATE_NAMES[bisect(_RATES, len(self.utterance.syllables) / seconds)]
 

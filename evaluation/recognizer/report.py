@@ -20,7 +20,8 @@ def print_figures(results: Mapping[str, Figures], split: str, console: Console) 
         console,
         f"{split}: {plural(first['recordings'], 'recording')}, "
         f"{plural(first['speakers'], 'speaker')}. {legend}\n"
-        "phone/viseme errors, %; delay of the first hypothesis, p50/p95, ms;\n"
+        "phone/viseme errors, %, of universal phones also features;\n"
+        "delay of the first hypothesis, p50/p95, ms;\n"
         "p b m f of the final hypothesis, recall/precision, %; /s: clean, syllables/s",
         ("speech", "", "phones", *HYPOTHESES, "delay", "p b m f"),
         _rows(results, letters),
@@ -43,7 +44,9 @@ def _cells(score: Figures) -> list[str]:
         str(score["final"]["phone_errors"]["reference"]),
         *(
             "/".join(
-                percent(score[hypothesis][f"{unit}_error_rate"]) for unit in ("phone", "viseme")
+                percent(score[hypothesis][f"{unit}_error_rate"])
+                for unit in ("phone", "viseme", "feature")
+                if f"{unit}_error_rate" in score[hypothesis]
             )
             for hypothesis in HYPOTHESES
         ),

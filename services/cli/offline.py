@@ -34,7 +34,9 @@ from kouxing.shared.terminal import (
 )
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
-Acoustic = Annotated[str, typer.Option(help="Acoustic model: blocks, light, gmm, or a model file.")]
+Acoustic = Annotated[
+    str, typer.Option(help="Acoustic model: blocks, light, gmm, universal, or a model file.")
+]
 
 
 class PhoneFormat(StrEnum):

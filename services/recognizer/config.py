@@ -21,7 +21,8 @@ class RecognizerConfig(ServiceConfig):
     """Endpoint to which clients send the audio of sessions that are not paced. Live audio takes
     precedence."""
     acoustic: str = "blocks"
-    """Acoustic model: blocks (fewest errors), light (for weak machines), gmm, or a file."""
+    """Acoustic model: blocks (fewest errors), light (for weak machines), gmm, universal (phones of
+    all languages), or a file."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
         default_factory=DependentDefault(
             "acoustic",

@@ -10,6 +10,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lip_frames import LipFrameModel
@@ -18,6 +19,8 @@ from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import hear_streams, score_streams
 from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import UNIVERSAL
 
 _WARM_UP_S = 0.2
 
@@ -37,7 +40,25 @@ class Recognizer:
 
     def __init__(self, model: AcousticModel, rule: OutputRuleConfig | None = None) -> None:
         self.model = model
+        self._models = {model.inventory.language: model}
         self._rule = rule or OutputRuleConfig()
+
+    def model_of(self, language: str | None) -> AcousticModel:
+        """Return the model with the phones of a language; None is the recognizer's own language.
+
+        The universal model is loaded at its first use. Raises ``UserError`` if no model has the
+        language.
+        """
+        if language is None:
+            return self.model
+        if language == UNIVERSAL and language not in self._models:
+            self._models[language] = load_model(UNIVERSAL)
+        if language not in self._models:
+            raise UserError(
+                f"no acoustic model for {language}; choose {self.model.inventory.language} or "
+                f"{UNIVERSAL}, or set recognizer.acoustic to a model for {language}"
+            )
+        return self._models[language]
 
     def create_stream(
         self,
@@ -47,6 +68,7 @@ class Recognizer:
         lip_predictor: LipFrameModel | None = None,
         face_delay_s: float = 0.0,
         speech_time: int = 0,
+        language: str | None = None,
     ) -> SpeechStream:
         """Create the stream of one session.
 
@@ -62,11 +84,14 @@ class Recognizer:
         speech_time
             Media time at which current speech started, samples at 16 kHz, if another recognizer
             processed its start. The networks' blocks then align with those of the other one.
+        language
+            Name of the inventory of the phones, as for :meth:`model_of`.
 
-        Raises ``UserError`` if the rate or the channels are out of range.
+        Raises ``UserError`` if the rate or the channels are out of range, or no model has the
+        language.
         """
         return SpeechStream(
-            self.model,
+            self.model_of(language),
             self._rule,
             sample_rate_hz=sample_rate_hz,
             num_channels=num_channels,
@@ -77,8 +102,9 @@ class Recognizer:
 
     @property
     def network_s(self) -> float:
-        """Processor time spent in the block network so far, seconds."""
-        return self.model.session.run_s if isinstance(self.model, BlockModel) else 0.0
+        """Processor time spent in block networks so far, seconds."""
+        models = self._models.values()
+        return sum(model.session.run_s for model in models if isinstance(model, BlockModel))
 
     def is_ready(self, stream: SpeechStream) -> bool:
         """Return whether a stream has audio to score."""

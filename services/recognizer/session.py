@@ -79,6 +79,7 @@ class RecognizerSession:
             lip_predictor=lip_predictor,
             face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
             speech_time=start.speech_time or 0,
+            language=start.facts.language,
         )
         self.resumption: Resumption | None = None  # if another recognizer has lost the session
         if start.media_time:

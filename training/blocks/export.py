@@ -26,9 +26,11 @@ recurrent layer use floats. onnxruntime may sum a product with a single row in a
 recurrent layer has one row for each session, so the first session's row is repeated.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
@@ -39,6 +41,7 @@ from kouxing.training.networks.onnx_graph import DOMAIN, Floats, Graph, arrays_o
 from kouxing.training.networks.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")
+_LAST_OF_BLOCK = "last_of_block"
 
 
 def onnx_of(
@@ -49,119 +52,59 @@ def onnx_of(
     past: int = PAST,
 ) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
-    return _BlockGraph(encoder, readout, block_length, right_context, past).file_of_block()
+    return BlockGraph(encoder, readout, block_length, right_context, past).file_of_block()
 
 
-class _BlockGraph(Graph):
+def cache_names(num_layers: int) -> list[str]:
+    """Return the names of the cache inputs in order."""
+    return [f"{kind}_{layer}" for kind in _KINDS for layer in range(num_layers)]
+
+
+class ReadoutGraph(Graph):
+    """The graph of a readout. With ``readout`` None, the network has no readout.
+
+    With a prefix, it extends the graph of another readout: both keep equally many positions.
+    """
+
     def __init__(
-        self,
-        encoder: BlockEncoder,
-        readout: BlockReadout,
-        block_length: int,
-        right_context: int,
-        past: int,
+        self, readout: BlockReadout | None, block: int, length: int, prefix: str = ""
     ) -> None:
-        super().__init__()
-        self._shape = encoder.shape
-        self._size = encoder.shape.width // encoder.shape.heads
-        self._encoder, self._readout = arrays_of(encoder), arrays_of(readout, "readout.")
-        self._block, self._length, self._past = block_length, block_length + right_context, past
-        self._new: list[str] = []  # keys and values of the block
+        super().__init__(prefix)
+        self.block, self.length = block, length
+        self._readout = arrays_of(readout, "readout.") if readout else {}
 
-    def file_of_block(self) -> NDArray[np.uint8]:
-        """Add all nodes; return the ONNX file."""
-        shape, length = self._shape, self._length
-        gru = self._readout["readout.gru.weight_hh_l0"].shape[1]
-        self._log_posteriors(self._features())
-        order = [
-            self._new[layer + at] for at in range(2) for layer in range(0, 2 * shape.layers, 2)
-        ]
-        new = self.node("Concat", order, axis=1)
-        self.node("Cast", [new], "new", to=TensorProto.FLOAT16)
-        caches = [
-            halves(f"{kind}_{layer}", "sessions", shape.heads, self._past, self._size)
-            for kind in _KINDS
-            for layer in range(shape.layers)
-        ]
-        inputs = [
-            floats("frames", "sessions", 2 * length + 3, NUM_MELS),
-            floats("positions", "sessions", length, shape.width),
-            *(
-                helper.make_tensor_value_info(name, TensorProto.INT64, ["sessions"])
-                for name in ("num_positions", "num_cached")
-            ),
-            floats("state", "sessions", gru),
-            *caches,
-        ]
-        outputs = [
-            floats("log_posteriors", "sessions", 2 * length, shape.num_states),
-            floats("new_state", "sessions", gru),
-            halves("new", "sessions", 2 * shape.layers, shape.heads, self._block, self._size),
-        ]
-        return self.file("blocks", inputs, outputs)
+    @property
+    def state(self) -> onnx.ValueInfoProto:
+        """Describe the input of the recurrent layer's state."""
+        return floats(f"{self.prefix}state", "sessions", self._gru_width)
 
-    def _features(self) -> str:
-        """Run the encoder; the kept layers of all positions, (rows, features)."""
-        width = self._shape.width
-        hidden = self.convolutions("frames", self._encoder, self._length)
-        rows = self.node("Reshape", ["positions", self.integers("rows", -1, width)])
-        hidden = self.node("Add", [hidden, rows])
-        mask = self._mask()
-        after = []
-        for number in range(self._shape.layers):
-            attend = partial(self._attention, number, mask)
-            hidden = self.layer(hidden, self._encoder, f"layers.{number}", attend)
-            after.append(hidden)
-        return self.node("Concat", [after[place] for place in KEPT_LAYERS], axis=-1)
-
-    def _mask(self) -> str:
-        """Return the attention mask: of the cached positions, then of the block's."""
-        parts = []
-        for name, limit in (("num_cached", self._past), ("num_positions", self._length)):
-            count = self.node("Unsqueeze", [name, self.integers("three_axes", 1, 2, 3)])
-            there = self.node("Less", [self.integers(f"{name}.places", *range(limit)), count])
-            limits = [self.number("may", 0.0), self.number("may_not", -np.inf)]
-            parts.append(self.node("Where", [there, *limits]))
-        return self.node("Concat", parts, axis=-1)
-
-    def _attention(self, number: int, mask: str, joint: str) -> str:
-        """Attend to the cached positions and to the block's, (rows, width)."""
-        heads, size, width = self._shape.heads, self._size, self._shape.width
-        name = f"layers.{number}"
-        parts = self.split(joint, [f"{name}.{part}" for part in ("query", "key", "value")])
-        by_head = self.integers("by_head", -1, self._length, heads, size)
-        query, key, value = (
-            self.node("Transpose", [self.node("Reshape", [part, by_head])], perm=[0, 2, 1, 3])
-            for part in parts
-        )
-        ends = [self.integers("zero", 0), self.integers("block", self._block)]
-        for values in (key, value):
-            of_block = self.node("Slice", [values, *ends, self.integers("place_axis", 2)])
-            self._new.append(self.node("Unsqueeze", [of_block, self.integers("ring_axis", 1)]))
-        old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in _KINDS)
-        products = [
-            self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=size**-0.5)
-            for keys in (old_keys, key)
+    @property
+    def outputs(self) -> list[onnx.ValueInfoProto]:
+        """Describe the readout's outputs."""
+        rows = 2 * self.length
+        return [
+            floats(f"{self.prefix}log_posteriors", "sessions", rows, self._num_states),
+            floats(f"{self.prefix}new_state", "sessions", self._gru_width),
         ]
-        masked = self.node("Add", [self.node("Concat", products, axis=-1), mask])
-        weights = self.node("Softmax", [masked], axis=-1)
-        names = [f"{name}.{part}_weights" for part in ("past", "block")]
-        past, block = self.split(weights, names, self._past, self._length)
-        pairs = ((past, old_values), (block, value))
-        attended = self.node("Add", [self.node("MatMul", pair) for pair in pairs])
-        attended = self.node("Transpose", [attended], perm=[0, 2, 1, 3])
-        return self.node("Reshape", [attended, self.integers("rows", -1, width)])
 
-    def _log_posteriors(self, features: str) -> None:
+    @property
+    def _gru_width(self) -> int:
+        return int(self._readout["readout.gru.weight_hh_l0"].shape[1])
+
+    @property
+    def _num_states(self) -> int:
+        return len(self._readout["readout.output.bias"]) // 2
+
+    def log_posteriors(self, features: str) -> None:
         """Run the readout on (rows, features)."""
-        parameters, length, states = self._readout, self._length, self._shape.num_states
+        parameters, length, states = self._readout, self.length, self._num_states
         inner = self._inner(features)
         context = self._context(inner)
         both = self.node("Concat", [context, inner], axis=-1)
         logits = self.product(both, parameters, "readout.output")
         by_frame = self.integers("by_frame", -1, 2 * length, states)
         logits = self.node("Reshape", [logits, by_frame])
-        self.node("LogSoftmax", [logits], "log_posteriors", axis=-1)
+        self.node("LogSoftmax", [logits], f"{self.prefix}log_posteriors", axis=-1)
 
     def _inner(self, features: str) -> str:
         """Compute the recurrent layer's input: (rows, features) to (rows, inner)."""
@@ -175,14 +118,14 @@ class _BlockGraph(Graph):
 
     def _context(self, inner: str) -> str:
         """Run the recurrent layer both ways: (rows, inner) to (rows, 2 width)."""
-        parameters, length = self._readout, self._length
-        width = parameters["readout.gru.weight_hh_l0"].shape[1]
+        parameters, length = self._readout, self.length
+        width = self._gru_width
         by_session = self.integers("by_session", -1, length, len(parameters["readout.inner.bias"]))
         of_sessions = self.node("Reshape", [inner, by_session])
         in_order = self.node("Transpose", [of_sessions], perm=[1, 0, 2])
         zero, one = self.integers("zero", 0), self.integers("one_row", 1)
         repeated = []  # with the first session's row once more
-        for values, axis in ((in_order, 1), ("num_positions", 0), ("state", 0)):
+        for values, axis in ((in_order, 1), ("num_positions", 0), (f"{self.prefix}state", 0)):
             first = self.node("Slice", [values, zero, one, self.integers(f"axis_{axis}", axis)])
             repeated.append(self.node("Concat", [values, first], axis=axis))
         inputs, num_positions, state = repeated
@@ -200,9 +143,12 @@ class _BlockGraph(Graph):
         sessions = [zero, self.integers("before_last", -1), self.integers("place_axis", 2)]
         context = self.node("Slice", [context, *sessions])
         context = self.node("Transpose", [context], perm=[2, 0, 1, 3])  # sessions, n, directions
-        last = self.constant("last_of_block", np.array(self._block - 1))
+        last = _LAST_OF_BLOCK
+        if not self.prefix:
+            self.constant(last, np.array(self.block - 1))
         state = self.node("Gather", [context, last], axis=1)
-        self.node("Gather", [state, self.constant("first", np.array(0))], "new_state", axis=1)
+        first = self.constant("first", np.array(0))
+        self.node("Gather", [state, first], f"{self.prefix}new_state", axis=1)
         return self.node("Reshape", [context, self.integers("both", -1, 2 * width)])
 
     def _recurrent_weights(self) -> list[str]:
@@ -217,6 +163,117 @@ class _BlockGraph(Graph):
             self.halves("readout.recurrent_weights", gates("weight_hh")),
             self.constant("readout.biases", biases),
         ]
+
+
+class BlockGraph(ReadoutGraph):
+    """The graph of the encoder, and of its readout."""
+
+    def __init__(
+        self,
+        encoder: BlockEncoder,
+        readout: BlockReadout | None,
+        block_length: int,
+        right_context: int,
+        past: int,
+    ) -> None:
+        super().__init__(readout, block_length, block_length + right_context)
+        self._shape = encoder.shape
+        self._size = encoder.shape.width // encoder.shape.heads
+        self._encoder = arrays_of(encoder)
+        self._past = past
+        self._new: list[str] = []  # keys and values of the block
+
+    def file_of_block(self) -> NDArray[np.uint8]:
+        """Add all nodes; return the ONNX file."""
+        self.log_posteriors(self.features(KEPT_LAYERS))
+        self.new_caches()
+        return self.file("blocks", self.inputs(self.state), [*self.outputs, self.new])
+
+    def inputs(self, *more: onnx.ValueInfoProto) -> list[onnx.ValueInfoProto]:
+        """Describe the inputs; ``more`` precede the caches."""
+        shape, length = self._shape, self.length
+        caches = [
+            halves(name, "sessions", shape.heads, self._past, self._size)
+            for name in cache_names(shape.layers)
+        ]
+        return [
+            floats("frames", "sessions", 2 * length + 3, NUM_MELS),
+            floats("positions", "sessions", length, shape.width),
+            *(
+                helper.make_tensor_value_info(name, TensorProto.INT64, ["sessions"])
+                for name in ("num_positions", "num_cached")
+            ),
+            *more,
+            *caches,
+        ]
+
+    def new_caches(self) -> None:
+        """Output the block's keys and values."""
+        order = [
+            self._new[layer + at]
+            for at in range(2)
+            for layer in range(0, 2 * self._shape.layers, 2)
+        ]
+        new = self.node("Concat", order, axis=1)
+        self.node("Cast", [new], "new", to=TensorProto.FLOAT16)
+
+    @property
+    def new(self) -> onnx.ValueInfoProto:
+        """Describe the output of keys and values."""
+        rings = 2 * self._shape.layers
+        return halves("new", "sessions", rings, self._shape.heads, self.block, self._size)
+
+    def features(self, kept_layers: Sequence[int]) -> str:
+        """Run the encoder; the kept layers of all positions, (rows, features)."""
+        width = self._shape.width
+        hidden = self.convolutions("frames", self._encoder, self.length)
+        rows = self.node("Reshape", ["positions", self.integers("rows", -1, width)])
+        hidden = self.node("Add", [hidden, rows])
+        mask = self._mask()
+        after = []
+        for number in range(self._shape.layers):
+            attend = partial(self._attention, number, mask)
+            hidden = self.layer(hidden, self._encoder, f"layers.{number}", attend)
+            after.append(hidden)
+        return self.node("Concat", [after[place] for place in kept_layers], axis=-1)
+
+    def _mask(self) -> str:
+        """Return the attention mask: of the cached positions, then of the block's."""
+        parts = []
+        for name, limit in (("num_cached", self._past), ("num_positions", self.length)):
+            count = self.node("Unsqueeze", [name, self.integers("three_axes", 1, 2, 3)])
+            there = self.node("Less", [self.integers(f"{name}.places", *range(limit)), count])
+            limits = [self.number("may", 0.0), self.number("may_not", -np.inf)]
+            parts.append(self.node("Where", [there, *limits]))
+        return self.node("Concat", parts, axis=-1)
+
+    def _attention(self, number: int, mask: str, joint: str) -> str:
+        """Attend to the cached positions and to the block's, (rows, width)."""
+        heads, size, width = self._shape.heads, self._size, self._shape.width
+        name = f"layers.{number}"
+        parts = self.split(joint, [f"{name}.{part}" for part in ("query", "key", "value")])
+        by_head = self.integers("by_head", -1, self.length, heads, size)
+        query, key, value = (
+            self.node("Transpose", [self.node("Reshape", [part, by_head])], perm=[0, 2, 1, 3])
+            for part in parts
+        )
+        ends = [self.integers("zero", 0), self.integers("block", self.block)]
+        for values in (key, value):
+            of_block = self.node("Slice", [values, *ends, self.integers("place_axis", 2)])
+            self._new.append(self.node("Unsqueeze", [of_block, self.integers("ring_axis", 1)]))
+        old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in _KINDS)
+        products = [
+            self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=size**-0.5)
+            for keys in (old_keys, key)
+        ]
+        masked = self.node("Add", [self.node("Concat", products, axis=-1), mask])
+        weights = self.node("Softmax", [masked], axis=-1)
+        names = [f"{name}.{part}_weights" for part in ("past", "block")]
+        past, block = self.split(weights, names, self._past, self.length)
+        pairs = ((past, old_values), (block, value))
+        attended = self.node("Add", [self.node("MatMul", pair) for pair in pairs])
+        attended = self.node("Transpose", [attended], perm=[0, 2, 1, 3])
+        return self.node("Reshape", [attended, self.integers("rows", -1, width)])
 
 
 def _gates(stacked: Floats) -> Floats:

@@ -33,9 +33,13 @@ Floats = NDArray[np.float32]
 
 
 class Graph:
-    """Collects the nodes and constants of a network in the order of computation."""
+    """Collects the nodes and constants of a network in the order of computation.
 
-    def __init__(self) -> None:
+    ``prefix`` precedes the names of nodes and constants.
+    """
+
+    def __init__(self, prefix: str = "") -> None:
+        self.prefix = prefix
         self._nodes: list[onnx.NodeProto] = []
         self._num_nodes = 0  # including those of branches
         self._tensors: dict[str, onnx.TensorProto] = {}
@@ -48,18 +52,33 @@ class Graph:
         outputs: Sequence[onnx.ValueInfoProto],
     ) -> NDArray[np.uint8]:
         """Return the bytes of an ONNX file."""
-        tensors = list(self._tensors.values())
-        graph = helper.make_graph(self._nodes, name, inputs, outputs, initializer=tensors)
+        graph = self._graph(name, inputs, outputs)
         imports = [helper.make_opsetid("", _OPERATORS), helper.make_opsetid(DOMAIN, 1)]
         model = helper.make_model(graph, opset_imports=imports)
         model.ir_version = _FORMAT
         onnx.checker.check_model(model)
         return np.frombuffer(model.SerializeToString(), dtype=np.uint8)
 
+    def extension(
+        self, inputs: Sequence[onnx.ValueInfoProto], outputs: Sequence[onnx.ValueInfoProto]
+    ) -> NDArray[np.uint8]:
+        """Return bytes that add the nodes to the ONNX file to which they are appended."""
+        model = onnx.ModelProto(graph=self._graph("", inputs, outputs))
+        return np.frombuffer(model.SerializeToString(), dtype=np.uint8)
+
+    def _graph(
+        self,
+        name: str,
+        inputs: Sequence[onnx.ValueInfoProto],
+        outputs: Sequence[onnx.ValueInfoProto],
+    ) -> onnx.GraphProto:
+        tensors = list(self._tensors.values())
+        return helper.make_graph(self._nodes, name, inputs, outputs, initializer=tensors)
+
     def node(self, kind: str, inputs: Sequence[str], output: str = "", **settings: Any) -> str:
         """Add a node with one output, and return the output's name."""
         self._num_nodes += 1
-        output = output or f"{kind}_{self._num_nodes}"
+        output = output or f"{self.prefix}{kind}_{self._num_nodes}"
         self._nodes.append(helper.make_node(kind, inputs, [output], **settings))
         return output
 
@@ -85,6 +104,7 @@ class Graph:
 
     def constant(self, name: str, array: NDArray[Any] | np.generic | float) -> str:
         """Store a constant once, and return its name."""
+        name = self.prefix + name
         if name not in self._tensors:
             self._tensors[name] = numpy_helper.from_array(np.array(array, order="C"), name)
         return name

@@ -76,6 +76,7 @@ _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # bef
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 # Constants of the file that become inputs: the number of kept positions, and the last of them.
 _KEPT = integer_inputs({"block": 1, "last_of_block": 0})
+EXTENSION = "universal_"  # before the names of a second readout's input and outputs
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
@@ -175,8 +176,11 @@ class BlockRunner:
     def __init__(self, file: NDArray[np.uint8]) -> None:
         self.run_s = 0.0  # processor time spent in the network so far
         self._session = open_session(file, _KEPT)
-        self.sizes = _sizes_of(self._session)
+        self.sizes, self._first_state = _sizes_of(self._session)
         self._names = _cache_names(self.sizes.layers)
+        prefix = EXTENSION if self._first_state else ""
+        self._state = f"{prefix}state"
+        self._outputs = [f"{prefix}{name}" for name in _OUTPUTS[:2]] + _OUTPUTS[2:]
         unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
 
@@ -197,15 +201,17 @@ class BlockRunner:
             "positions": np.stack([self._positions[b.row : b.row + length] for b in blocks]),
             "num_positions": np.array([block.num_positions for block in blocks]),
             "num_cached": np.array([block.past.num_cached for block in blocks]),
-            "state": np.stack([block.past.state for block in blocks]),
+            self._state: np.stack([block.past.state for block in blocks]),
             "block": np.array([num_kept]),
             "last_of_block": np.array(num_kept - 1),
         }
         for ring, name in enumerate(self._names):
             of_sessions = [block.past.rings[ring] for block in blocks]
             inputs[name] = of_sessions[0][np.newaxis] if len(blocks) == 1 else np.stack(of_sessions)
+        if self._first_state:  # of the readout that is not used
+            inputs["state"] = np.zeros((len(blocks), self._first_state), np.float32)
         start_s = time.thread_time()
-        log_posteriors, state, new = run_session(self._session, _OUTPUTS, inputs)
+        log_posteriors, state, new = run_session(self._session, self._outputs, inputs)
         self.run_s += time.thread_time() - start_s
         return log_posteriors, state, new
 
@@ -327,12 +333,20 @@ class BlockStream(AcousticStream):
         return rows
 
 
-def _sizes_of(session: Any) -> BlockSizes:
-    """Read a network's sizes from its inputs and outputs; a run checks the other shapes."""
+def _sizes_of(session: Any) -> tuple[BlockSizes, int]:
+    """Read a network's sizes from its inputs and outputs; a run checks the other shapes.
+
+    Also returns the width of the first readout's state if a second readout is used, otherwise 0.
+    """
     shapes = {node.name: list(node.shape[1:]) for node in session.get_inputs()}
     outputs = {node.name: list(node.shape[1:]) for node in session.get_outputs()}
     num_layers = sum(name.startswith("keys_") for name in shapes)
-    if list(shapes) != [*_INPUTS, *_cache_names(num_layers)] or list(outputs) != _OUTPUTS:
+    is_extended = f"{EXTENSION}state" in shapes
+    more_inputs = [f"{EXTENSION}state"] * is_extended
+    more_outputs = [f"{EXTENSION}{name}" for name in _OUTPUTS[:2]] * is_extended
+    if list(shapes) != [*_INPUTS, *_cache_names(num_layers), *more_inputs] or (
+        list(outputs) != [*_OUTPUTS, *more_outputs]
+    ):
         raise ValueError(f"its network has the inputs {', '.join(shapes)}")
     try:
         length, width = shapes["positions"]
@@ -342,7 +356,7 @@ def _sizes_of(session: Any) -> BlockSizes:
             length=length,
             past=shapes["keys_0"][1],
             width=width,
-            state=shapes["state"][0],
+            state=shapes[f"{EXTENSION if is_extended else ''}state"][0],
             layers=rings // 2,
             heads=heads,
             head_size=head_size,
@@ -358,7 +372,7 @@ def _sizes_of(session: Any) -> BlockSizes:
         or 2 * math.prod(sizes.rings) > _MAX_CACHE_BYTES
     ):
         raise ValueError(f"its network has the sizes {sizes}")
-    return sizes
+    return sizes, int(shapes["state"][0]) if is_extended else 0
 
 
 def _cache_names(num_layers: int) -> list[str]:
@@ -368,10 +382,15 @@ def _cache_names(num_layers: int) -> list[str]:
 
 def block_model_from(archive: Archive) -> BlockModel:
     """Build the model after checking every size; ``ValueError`` if something does not fit."""
+    return model_of(archive, archive.array("network", None).astype(np.uint8))
+
+
+def model_of(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
+    """Build the model of a file with this network; errors as of :func:`block_model_from`."""
     topology = topology_from(archive)
     model = BlockModel(
         topology=topology,
-        network=archive.array("network", None).astype(np.uint8),
+        network=network,
         log_prior=archive.floats("log_prior", topology.num_states),
         acoustic_scale=float(archive.floats("acoustic_scale")),
     )

@@ -3,17 +3,18 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from kouxing.services.recognizer.acoustic import blocks, gmm, light
+from kouxing.services.recognizer.acoustic import blocks, gmm, light, universal
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive
 from kouxing.shared.errors import UserError
 
 MODELS = Path(__file__).parents[1] / "models"
-SHIPPED = ("blocks", "light", "gmm")
+SHIPPED = ("blocks", "light", "gmm", "universal")
 DEFAULT_MODEL = "blocks"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_model_from,
     blocks.FORMAT: blocks.block_model_from,
+    universal.FORMAT: universal.universal_model_from,
 }
 
 

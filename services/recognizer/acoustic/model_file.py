@@ -57,7 +57,8 @@ def read_archive(path: Path) -> Archive:
     """Read a model file; ``UserError`` if it is missing or is not one."""
     if not path.exists():
         raise UserError(
-            f"there is no acoustic model at {path}; use blocks, light, gmm, or a model file"
+            f"there is no acoustic model at {path}; use blocks, light, gmm, universal, or a model"
+            " file"
         )
     return Archive(read_arrays(path, MAX_BYTES, "an acoustic model; reinstall or train one"))
 

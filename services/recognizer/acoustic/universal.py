@@ -1,0 +1,51 @@
+"""Universal phones: a second readout of the block network, for all languages.
+
+The file has an extension of the shipped block network instead of a network
+(:mod:`kouxing.training.universal.export`). Its phones are those of the universal inventory.
+"""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.recognizer.acoustic.blocks import BlockModel, model_of
+from kouxing.services.recognizer.acoustic.model_file import (
+    Archive,
+    read_archive,
+    write_model,
+)
+
+FORMAT = "universal 1"
+_BLOCKS = Path(__file__).parents[1] / "models" / "blocks.npz"
+
+
+def universal_model_from(archive: Archive) -> BlockModel:
+    """Build the model after checking every size; ``ValueError`` if something does not fit."""
+    network = _block_network()
+    if str(archive.array("block_network", ())) != _hash_of(network):
+        raise ValueError("it extends another version of the block model")
+    extension = archive.array("extension", None).astype(np.uint8)
+    return model_of(archive, np.concatenate([network, extension]))
+
+
+def save_universal(path: Path, model: BlockModel, extension: NDArray[np.uint8]) -> None:
+    """Write a model whose network is that of the shipped block model with an extension."""
+    write_model(
+        path,
+        FORMAT,
+        model.topology,
+        block_network=_hash_of(_block_network()),
+        extension=extension,
+        log_prior=model.log_prior,
+        acoustic_scale=model.acoustic_scale,
+    )
+
+
+def _block_network() -> NDArray[np.uint8]:
+    return read_archive(_BLOCKS).array("network", None).astype(np.uint8)
+
+
+def _hash_of(network: NDArray[np.uint8]) -> str:
+    return hashlib.sha256(network.tobytes()).hexdigest()

@@ -1,0 +1,132 @@
+"""A second readout of the block network: its scores, and what the first readout keeps."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from kouxing.services.recognizer.acoustic import universal
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.universal import save_universal
+from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.training.blocks.network import BlockReadout, layout
+from kouxing.training.networks.network import ReadoutShape
+from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
+from kouxing.training.universal.export import extension_of
+from tests.live_streams import LiveStream
+from tests.unit.test_block_model import (
+    BLOCK,
+    FRAMES,
+    HELLO,
+    SCALE,
+    blocks,
+    networks,
+    scores_of,
+)
+
+pytestmark = [pytest.mark.usefixtures("one_thread")]
+
+LAYERS = (-3, -1)
+SHAPE = ReadoutShape(inner=40, gru=24, dropout=0.0, noise=0.0)
+
+
+@cache
+def readout() -> BlockReadout:
+    torch.manual_seed(1)
+    return BlockReadout(64, 180, SHAPE).eval()
+
+
+@cache
+def extended() -> BlockModel:
+    extension = extension_of(readout(), blocks(), LAYERS)
+    return replace(blocks(), network=np.concatenate([blocks().network, extension]))
+
+
+def test_the_second_readout_agrees_with_pytorch() -> None:
+    encoder, _ = networks()
+    laid = layout(len(FRAMES) // 2, BLOCK)
+    repeated = torch.from_numpy(np.concatenate([FRAMES, FRAMES[-1:]]))[None]
+    with torch.no_grad():
+        hidden = encoder(repeated, laid)
+        features = torch.cat([hidden[..., :32], hidden[..., -32:]], dim=-1)
+        expected = readout().read(features, laid)[0, : len(FRAMES) // 2].flatten(0, 1).numpy()
+    scores = scores_of(extended(), FRAMES)
+    num_alike = len(FRAMES) - 2 * (BLOCK + 10)  # with a complete right context
+    wanted = SCALE * (expected - blocks().log_prior)
+    np.testing.assert_allclose(scores[:num_alike], wanted[:num_alike], atol=0.05)
+
+
+def test_the_first_readout_and_the_caches_do_not_change() -> None:
+    model, both = blocks(), extended()
+    stream, other = model.create_stream(), both.create_stream()
+    for frames in np.split(FRAMES, 5):
+        stream.append_frames(frames)
+        other.append_frames(frames)
+        while stream.is_due:
+            alone, of_both = (
+                of.session.run([one.block()]) for of, one in ((model, stream), (both, other))
+            )
+            np.testing.assert_array_equal(alone[2], of_both[2])
+            assert not np.array_equal(alone[0], of_both[0])
+            for one, outputs in ((stream, alone), (other, of_both)):
+                one.append_outputs(*(output[0] for output in outputs))
+
+
+def test_features_for_training_are_those_of_the_network() -> None:
+    encoder, _ = networks()
+    laid = layout(len(FRAMES) // 2, BLOCK_LENGTH, RIGHT_CONTEXT)
+    repeated = np.concatenate([FRAMES, FRAMES[-1:]])
+    with torch.no_grad():
+        hidden = encoder(torch.from_numpy(repeated)[None], laid)[0, :, -32:].numpy()
+    first, second = FeatureEncoder(blocks(), (-1,)).encode([FRAMES, FRAMES[:75]])
+    assert first.shape == (17, BLOCK_LENGTH + RIGHT_CONTEXT, 32)
+    assert len(second) == 4
+    rows = hidden[laid.blocks.numpy()]
+    exists = laid.exists.numpy()
+    exists[-4:] = False  # they lack positions here
+    error = np.abs(first[exists] - rows[exists]).mean()  # of 8-bit integers
+    assert error < 0.02 * rows[exists].std()
+
+
+def test_a_file_belongs_to_one_block_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "universal.npz"
+    monkeypatch.setattr(universal, "_block_network", lambda: blocks().network)
+    extension = extension_of(readout(), blocks(), LAYERS)
+    save_universal(path, extended(), extension)
+    model = load_model(path)
+    assert isinstance(model, BlockModel)
+    np.testing.assert_array_equal(scores_of(model, FRAMES), scores_of(extended(), FRAMES))
+    monkeypatch.setattr(universal, "_block_network", lambda: blocks().network[:-1])
+    with pytest.raises(UserError, match="another version of the block model"):
+        load_model(path)
+
+
+def phones_of(results: list[StreamOutput]) -> list[Phone]:
+    return [result for result in results if isinstance(result, Phone)]
+
+
+def test_sessions_of_two_languages_share_a_recognizer() -> None:
+    recognizer = Recognizer(load_model())
+    streams = [recognizer.create_stream(language=name) for name in ("mandarin", "universal")]
+    for stream in streams:
+        stream.accept_waveform(HELLO)
+        stream.input_finished()
+    recognizer.decode_streams(streams)
+    mandarin, other = (phones_of(recognizer.get_result(stream)) for stream in streams)
+    alone = LiveStream(load_model())
+    assert mandarin == phones_of(alone.feed(HELLO) + alone.finish())
+    symbols = {phone.symbol for phone in other}
+    assert len(symbols) > 5
+    assert symbols <= {*load_inventory("universal").phones}
+    with pytest.raises(UserError, match="no acoustic model for tlh"):
+        recognizer.create_stream(language="tlh")

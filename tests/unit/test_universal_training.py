@@ -1,0 +1,98 @@
+"""Training of the universal readout: the recordings, their alignment, the recipe."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from kouxing.services.recognizer.acoustic.acoustic_model import score_segment
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.errors import UserError
+from kouxing.training.blocks.network import layout
+from kouxing.training.networks import optimizer
+from kouxing.training.universal import alignment, recipe, trainer
+from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, RIGHT_CONTEXT
+from kouxing.training.universal.features import WIDTH, Features
+from kouxing.training.universal.recipe import train_universal
+from tests.unit.test_block_model import HELLO
+from tests.unit.test_block_training import interrupt
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+COLUMNS = "utt_id path language speaker licence split seconds text ipa phones_path".split()
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(alignment, "_STEPS", 20)
+    monkeypatch.setattr(alignment, "_MIN_LABELED", 1)
+    monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
+    monkeypatch.setattr(trainer, "_NUM_CROPS", 2)
+
+
+def write_corpus(folder: Path, *, with_labels: bool = True) -> Path:
+    folder.mkdir()
+    soundfile.write(folder / "a.wav", HELLO, 16_000)
+    labels = [("0", "0.2", "<p:>"), ("0.2", "0.6", "a"), ("0.6", "1.4", "aI"), ("1.4", "1.5", "n")]
+    table = ["start_s\tend_s\tsymbol", *map("\t".join, labels)]
+    (folder / "labels.tsv").write_text("\n".join(table) + "\n")
+    common = {"path": "a.wav", "licence": "CC0", "seconds": "1.5", "text": "-"}
+    rows: list[dict[str, str]] = [
+        {"utt_id": "b", "language": "fr", "speaker": "b", "ipa": "nina sa"},
+        {"utt_id": "c", "language": "it", "speaker": "c", "ipa": "mama"},  # held out
+        {"utt_id": "d", "language": "de", "speaker": "emodb_03", "ipa": "mama"},  # held out
+    ]
+    if with_labels:
+        row = {"utt_id": "emodb_a", "language": "de", "speaker": "emodb_08"}
+        rows.append(row | {"phones_path": "labels.tsv"})
+    lines = ["\t".join((common | row).get(name, "") for name in COLUMNS) for row in rows]
+    (folder / "manifest.tsv").write_text("\n".join(["\t".join(COLUMNS), *lines]) + "\n")
+    return folder
+
+
+@pytest.mark.slow
+def test_trains_resumes_and_writes_model_and_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "universal.npz"
+    lines: list[str] = []
+    languages = [write_corpus(tmp_path / "corpus")]
+    train = partial(train_universal, [], output, languages=languages, report=lines.append)
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "extension_of", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(num_steps=1)
+    train(num_steps=2)
+    assert "resuming after step 1" in lines
+    assert lines.count("2 of 2 recordings aligned, round 1") == 1
+    model = load_model(output)
+    assert model.inventory.language == "universal"
+    frames = WhisperMel().accept_waveform(HELLO)
+    assert len(score_segment(model, frames)) == len(frames)
+    card = output.with_suffix(".md").read_text()
+    assert "| CC0 | 2 | 2 | 0.1 |" in card
+    assert {path.name for path in tmp_path.iterdir()} == {"universal.npz", "universal.md", "corpus"}
+
+
+@pytest.mark.slow
+def test_needs_labels_made_by_hand(tmp_path: Path) -> None:
+    languages = [write_corpus(tmp_path / "corpus", with_labels=False)]
+    with pytest.raises(UserError, match="no recording has labels made by hand"):
+        train_universal([], tmp_path / "universal.npz", languages=languages, report=print)
+
+
+def test_crops_have_the_layout_of_the_network() -> None:
+    laid = layout(trainer._CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
+    num_blocks = 3
+    positions = BLOCK_LENGTH * np.arange(num_blocks)[:, None] + np.arange(LENGTH)
+    rows = np.repeat(positions[..., None], WIDTH, axis=-1).astype(np.int8)
+    stored = Features(name="a", num_frames=57, rows=rows)
+    states = np.arange(58) // 2
+    features, targets = trainer._crop(stored, states, laid, np.random.default_rng(0))
+    is_known = (targets != -1).all(axis=1) & (features[:, 0] > 0)
+    assert is_known.sum() > 40
+    np.testing.assert_array_equal(features[is_known, 0], targets[is_known, 0])
+    np.testing.assert_array_equal(features[is_known, 5], targets[is_known, 1])

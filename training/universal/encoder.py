@@ -1,0 +1,133 @@
+"""The block network's encoder in longer blocks, which computes features of recordings quickly.
+
+Its weights are the block model's 8-bit integers. Live, blocks have 2 positions and the same right
+context; the network does not depend on the length of a block.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.network import (
+    FRAMES_PER_POSITION,
+    open_session,
+    position_table,
+)
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
+from kouxing.training.blocks.export import BlockGraph, cache_names
+from kouxing.training.blocks.network import BlockEncoder
+from kouxing.training.networks.network import PADDING_FRAMES, Shape
+from kouxing.training.networks.onnx_graph import halves
+
+BLOCK_LENGTH, RIGHT_CONTEXT, PAST = 10, 14, 120  # positions
+LENGTH = BLOCK_LENGTH + RIGHT_CONTEXT
+MAX_FRAMES = 2980  # of a recording: the table of positions ends after 30 s
+
+
+class FeatureEncoder:
+    """Computes hidden layers of recordings, in blocks with their right contexts."""
+
+    def __init__(self, model: BlockModel, layers: Sequence[int]) -> None:
+        encoder = _encoder_of(model)
+        self._shape = encoder.shape
+        self._session = open_session(_FeatureGraph(encoder, layers).file_of_features())
+        unused = np.zeros((LENGTH, self._shape.width), np.float32)
+        self._positions = np.concatenate([position_table(self._shape.width), unused])
+
+    def encode(self, recordings: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float16]]:
+        """Encode log-mel frames, (n, 80) each, to (blocks, B + R, layers * width) each.
+
+        The rows of positions that a block lacks are undefined.
+        """
+        shape, num_sessions = self._shape, len(recordings)
+        num_positions = [-(-len(frames) // FRAMES_PER_POSITION) for frames in recordings]
+        num_blocks = -(-max(num_positions) // BLOCK_LENGTH)
+        padded = [_padded(frames, num_blocks) for frames in recordings]
+        size = shape.width // shape.heads
+        rings = np.zeros((2 * shape.layers, num_sessions, shape.heads, PAST, size), np.float16)
+        blocks = []
+        for start in range(0, num_blocks * BLOCK_LENGTH, BLOCK_LENGTH):
+            first = FRAMES_PER_POSITION * start
+            window = slice(first, first + FRAMES_PER_POSITION * LENGTH + 3)
+            positions = self._positions[start : start + LENGTH]
+            features, new = self._session.run(
+                ["features", "new"],
+                {
+                    "frames": np.stack([frames[window] for frames in padded]),
+                    "positions": np.repeat(positions[None], num_sessions, axis=0),
+                    "num_positions": np.clip(np.array(num_positions) - start, 1, LENGTH),
+                    "num_cached": np.full(num_sessions, min(start, PAST)),
+                    **dict(zip(cache_names(shape.layers), rings, strict=True)),
+                },
+            )
+            blocks.append(features)
+            slot = start % PAST
+            rings[:, :, :, slot : slot + BLOCK_LENGTH] = new.swapaxes(0, 1)
+        of_sessions = np.stack(blocks, axis=1)
+        return [
+            rows[: -(-number // BLOCK_LENGTH)]
+            for rows, number in zip(of_sessions, num_positions, strict=True)
+        ]
+
+
+def _padded(frames: NDArray[np.float32], num_blocks: int) -> NDArray[np.float32]:
+    """Floor the bands as the recognizer does, and repeat the last frame."""
+    num_frames = PADDING_FRAMES + FRAMES_PER_POSITION * (num_blocks * BLOCK_LENGTH + LENGTH) + 3
+    padded = np.zeros((num_frames, NUM_MELS), np.float32)
+    loudest = np.maximum.accumulate(frames.max(axis=1))
+    end = PADDING_FRAMES + len(frames)
+    padded[PADDING_FRAMES:end] = np.maximum(frames, (loudest - np.float32(FLOOR_BANDS))[:, None])
+    padded[end : end + 2] = padded[end - 1]
+    return padded
+
+
+class _FeatureGraph(BlockGraph):
+    """A block graph whose outputs are hidden layers."""
+
+    def __init__(self, encoder: BlockEncoder, layers: Sequence[int]) -> None:
+        super().__init__(encoder, None, BLOCK_LENGTH, RIGHT_CONTEXT, PAST)
+        self._layers = layers
+        self._width = encoder.shape.width * len(layers)
+
+    def file_of_features(self) -> NDArray[np.uint8]:
+        """Add all nodes; return the ONNX file."""
+        rows = self.features(self._layers)
+        shape = self.integers("by_block", -1, self.length, self._width)
+        hidden = self.node("Reshape", [rows, shape])
+        self.node("Cast", [hidden], "features", to=onnx.TensorProto.FLOAT16)
+        self.new_caches()
+        outputs = [halves("features", "sessions", self.length, self._width), self.new]
+        return self.file("features", self.inputs(), outputs)
+
+
+def _encoder_of(model: BlockModel) -> BlockEncoder:
+    """Rebuild the encoder of a trained model."""
+    network = onnx.load_from_string(model.network.tobytes())
+    arrays = {one.name: numpy_helper.to_array(one) for one in network.graph.initializer}
+    sizes = model.session.sizes
+    shape = Shape(
+        num_states=model.topology.num_states,
+        width=sizes.width,
+        heads=sizes.heads,
+        layers=sizes.layers,
+        inner=len(arrays["layers.0.inner.bias"]),
+    )
+    encoder = BlockEncoder(shape)
+    state = encoder.state_dict()
+    for name, tensor in state.items():
+        integers = name.removesuffix(".weight") + ".integers"
+        if integers not in arrays:
+            state[name] = torch.from_numpy(arrays[name].copy())
+            continue
+        scales = arrays[integers.replace("integers", "scales")]
+        weight = torch.from_numpy((arrays[integers].astype(np.float32) * scales).T.copy())
+        if tensor.ndim == 3:  # a convolution, place by place
+            weight = weight.view(len(weight), tensor.shape[2], -1).transpose(1, 2)
+        state[name] = weight
+    encoder.load_state_dict(state)
+    return encoder.eval()

@@ -1,0 +1,173 @@
+"""From corpora to the universal readout with its card."""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kouxing.corpora.speech_corpus import RowErrors, Utterance
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.universal import save_universal
+from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
+from kouxing.training.model_card import write_card
+from kouxing.training.networks.labels import (
+    STATES_PER_PHONE,
+    AlignedExample,
+    statistics_of,
+)
+from kouxing.training.phone_lm.recipe import estimate_phone_lm, stream_of
+from kouxing.training.training_set import Example, Report
+from kouxing.training.universal.alignment import Aligner
+from kouxing.training.universal.encoder import FeatureEncoder
+from kouxing.training.universal.export import extension_of
+from kouxing.training.universal.features import LAYERS, FeatureStore
+from kouxing.training.universal.recordings import TrainingSet, read_training_set
+from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
+
+_ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE = 0.7, 6.0, 1.0  # chosen on held-out recordings
+_LM_ORDER, _LM_NGRAMS = 3, 20_000
+_NO_LOG_MEL = np.empty((0, 0), np.float16)
+
+
+def train_universal(
+    mandarin: Sequence[Path],
+    output: Path,
+    *,
+    learners: Sequence[Path] = (),
+    languages: Sequence[Path] = (),
+    clips: Path | None = None,
+    seed: int = 0,
+    num_steps: int = 1000,
+    report: Report = print,
+) -> None:
+    """Train the universal readout of the shipped block model, and write it with its card.
+
+    The arguments are the options of ``kouxing train universal``. Raises UserError if there is
+    nothing to train on, or a file cannot be read.
+    """
+    model = load_model()
+    if not isinstance(model, BlockModel):
+        raise UserError("the shipped model is not a block model; reinstall kouxing")
+    torch.set_num_threads(1)  # reproducible sums on every machine
+    torch.manual_seed(seed)
+    errors = RowErrors()
+    inventory = load_inventory(UNIVERSAL)
+    data = read_training_set(mandarin, learners, languages, clips, errors)
+    folder, states_file, checkpoint = (
+        output.with_suffix(end) for end in (".features", ".states.npz", ".readout.pt")
+    )
+    store = FeatureStore(folder, FeatureEncoder(model, LAYERS))
+    store.standardize(data.recordings)
+    stored = list(store.read(data.recordings, report))
+    by_name = {one.utterance_id: one for one in data.recordings}
+    weight_of = {
+        one.utterance_id: weight for one, weight in zip(data.recordings, data.weights, strict=True)
+    }
+    aligner = Aligner(by_name, inventory)
+    states = _saved(output.with_suffix(".states.npz"), partial(aligner.align, stored, seed, report))
+    aligned = [one for one in stored if one.name in states]
+    readout = train_readout(
+        new_readout(STATES_PER_PHONE * len(inventory)),
+        aligned,
+        states,
+        [weight_of[one.name] for one in aligned],
+        seed=seed,
+        num_steps=num_steps,
+        checkpoint=checkpoint,
+        report=report,
+    )
+    topology, log_prior = _statistics(by_name, states, weight_of, inventory)
+    readout.mean[:] = torch.from_numpy(store.mean)
+    readout.deviation[:] = torch.from_numpy(store.deviation)
+    extension = extension_of(readout, model, LAYERS)
+    universal = replace(
+        model,
+        topology=replace(topology, lm_scale=_LM_SCALE, phone_penalty=_PHONE_PENALTY),
+        network=np.concatenate([model.network, extension]),
+        log_prior=log_prior,
+        acoustic_scale=_ACOUSTIC_SCALE,
+    )
+    save_universal(output, universal, extension)
+    _write_card(output, data, seed, num_steps, errors)
+    errors.report_to(report)
+    for path in (states_file, checkpoint):
+        path.unlink()
+    shutil.rmtree(folder)
+
+
+def _saved(
+    path: Path, compute: Callable[[], dict[str, NDArray[np.int64]]]
+) -> dict[str, NDArray[np.int64]]:
+    """Read the states of the frames by recording, or compute and write them."""
+    if not path.exists():
+        unfinished = path.with_suffix(".part.npz")
+        states = compute()
+        lengths = np.array([len(one) for one in states.values()])
+        joined = np.concatenate(list(states.values())).astype(np.int16)
+        np.savez(unfinished, names=np.array(list(states)), lengths=lengths, states=joined)
+        unfinished.replace(path)
+    with np.load(path, allow_pickle=False) as file:
+        pieces = np.split(file["states"].astype(np.int64), np.cumsum(file["lengths"])[:-1])
+        return dict(zip(file["names"].tolist(), pieces, strict=True))
+
+
+def _statistics(
+    recordings: Mapping[str, Utterance],
+    states: Mapping[str, NDArray[np.int64]],
+    weight_of: Mapping[str, float],
+    inventory: PhoneInventory,
+) -> tuple[Topology, NDArray[np.float32]]:
+    """Count transitions, durations and n-grams of phones; return the states' log priors too."""
+    aligned = [
+        AlignedExample(_example(recordings[name], weight_of[name]), path, _phones_of(path))
+        for name, path in states.items()
+    ]
+    stream = stream_of([one.example.phones for one in aligned], inventory)
+    phone_lm = estimate_phone_lm([stream], inventory, order=_LM_ORDER, max_ngrams=_LM_NGRAMS)
+    weights = [weight_of[name] for name in states]
+    return statistics_of(aligned, list(np.array(weights) / sum(weights)), phone_lm)
+
+
+def _example(recording: Utterance, weight: float) -> Example:
+    return Example(
+        log_mel=_NO_LOG_MEL,
+        phones=recording.phones,
+        syllables=recording.syllables,
+        weight=weight,
+        license=recording.license,
+        speaker=recording.speaker,
+    )
+
+
+def _phones_of(states: NDArray[np.int64]) -> list[Segment]:
+    """Return the phones of aligned frames. Equal neighbors differ in their states' order."""
+    starts = np.flatnonzero(
+        np.diff(states // STATES_PER_PHONE, prepend=-1) | (np.diff(states, prepend=0) < 0)
+    )
+    ends = np.append(starts[1:], len(states))
+    return [
+        Segment(int(states[start]) // STATES_PER_PHONE, int(start), int(end))
+        for start, end in zip(starts, ends, strict=True)
+    ]
+
+
+def _write_card(
+    output: Path, data: TrainingSet, seed: int, num_steps: int, errors: RowErrors
+) -> None:
+    write_card(
+        output,
+        title="Universal phones: a second readout of the block network",
+        details=f"on layers of `blocks.npz`, which is not changed, seed {seed}, "
+        f"{num_steps} steps of {CROPS_S:.0f} s of audio, on the recordings below",
+        recordings=data.recordings,
+        errors=errors,
+    )

@@ -1,0 +1,159 @@
+"""The recordings that the universal readout is trained on.
+
+Whole speakers and two languages are held out, to measure unseen speakers and unknown languages.
+"""
+
+import random
+import zlib
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from kouxing.corpora.lip_clips import read_clips
+from kouxing.corpora.speech_corpus import (
+    RowErrors,
+    Utterance,
+    is_synthetic,
+    may_ship,
+    read_corpus,
+)
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import UNIVERSAL, load_inventory
+from kouxing.training.training_set import MAX_WORD_PHONES
+
+_MANDARIN_LIMITS = {"sentence": 560, "word": 350, "synthetic": 450}  # of a corpus
+_MAX_OF_SPEAKER = 13  # recordings of a speaker of English by native speakers of Mandarin
+_LEARNERS_LICENSE = "CC BY 4.0"  # of speechocean762, whose manifest has no licenses
+_MAX_S = 25.0
+_HELD_OUT_LANGUAGES = ("it", "ko")
+_HELD_OUT_SPEAKERS = frozenset(
+    "emodb_03 emodb_13 vctk_p226 lj_linda_johnson "
+    "grid_s31 grid_s33 grid_s5 grid_m_lbax grid_f_lbbc".split()
+)
+_HELD_OUT_SHARE = 10  # one in 10 speakers of English by native speakers of Mandarin
+# share of each group in training; synthetic speech other than Mandarin has _SYNTHETIC_SHARE
+_SHARES = {"learners": 0.27, "mandarin": 0.15, "en": 0.10, "emodb": 0.10, "grid": 0.08, "fr": 0.07,
+           "es": 0.06, "ru": 0.06, "de": 0.04, "yue": 0.04, "pt": 0.03}  # fmt: skip
+_SYNTHETIC_SHARE = 0.16
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSet:
+    """Recordings with the phones of their words, and their sampling weights."""
+
+    recordings: list[Utterance]
+    weights: list[float]
+
+
+def read_training_set(
+    mandarin: Sequence[Path],
+    learners: Sequence[Path],
+    languages: Sequence[Path],
+    clips: Path | None,
+    errors: RowErrors,
+) -> TrainingSet:
+    """Read the recordings that are not held out and whose license allows distribution.
+
+    ``mandarin`` are Mandarin corpora, ``learners`` English by native speakers of Mandarin,
+    ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. Raises
+    UserError if nothing can be used.
+    """
+    groups: dict[str, list[Utterance]] = defaultdict(list)
+    for corpus in mandarin:
+        groups["mandarin"] += _some_mandarin(corpus, errors)
+    for corpus in learners:
+        groups["learners"] += _some_of_each_speaker(corpus, errors)
+    universal = load_inventory(UNIVERSAL)
+    for corpus in languages:
+        for one in read_corpus(corpus, errors, universal):
+            groups["emodb" if one.speaker.startswith("emodb_") else _group_of(one)].append(one)
+    if clips:
+        groups["grid"] += _grid_clips(clips, errors)
+    recordings, weights = [], []
+    for name, group in sorted(groups.items()):
+        kept = [one for one in group if _may_train(one)]
+        minutes = sum(one.seconds for one in kept)
+        recordings += kept
+        share = _SHARES.get(name, _SYNTHETIC_SHARE)
+        weights += [share * one.seconds / minutes for one in kept]
+    if not recordings:
+        raise errors.no_recording_error("in the corpora")
+    return TrainingSet(recordings, weights)
+
+
+def _group_of(recording: Utterance) -> str:
+    return "synthetic" if is_synthetic(recording.license) else recording.language
+
+
+def _may_train(recording: Utterance) -> bool:
+    return (
+        may_ship(recording.license)
+        and recording.seconds <= _MAX_S
+        and recording.language not in _HELD_OUT_LANGUAGES
+        and recording.speaker not in _HELD_OUT_SPEAKERS
+        and recording.split != "test"
+    )
+
+
+def _some_mandarin(corpus: Path, errors: RowErrors) -> list[Utterance]:
+    """Draw some recordings of each kind, with universal phones."""
+    mandarin, universal = load_inventory(), load_inventory(UNIVERSAL)
+    rows = [
+        one for one in read_corpus(corpus, errors, mandarin, split="train") if may_ship(one.license)
+    ]
+    random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
+    by_kind: dict[str, list[Utterance]] = defaultdict(list)
+    for row in rows:
+        kind = "word" if len(row.phones) <= MAX_WORD_PHONES else "sentence"
+        by_kind["synthetic" if is_synthetic(row.license) else kind].append(row)
+    drawn = [row for kind, some in by_kind.items() for row in some[: _MANDARIN_LIMITS[kind]]]
+    converted = []
+    for row in drawn:
+        units = iter(mandarin.phones[phone] for phone in row.phones)
+        words = [
+            mandarin.in_universal_phones([next(units) for _ in range(length)])
+            for length in row.syllables
+        ]
+        phones = tuple(universal.index[phone] for word in words for phone in word)
+        converted.append(replace(row, phones=phones, syllables=tuple(map(len, words))))
+    return converted
+
+
+def _some_of_each_speaker(corpus: Path, errors: RowErrors) -> list[Utterance]:
+    by_speaker: dict[str, list[Utterance]] = defaultdict(list)
+    for row in read_corpus(corpus, errors, load_inventory(UNIVERSAL)):
+        by_speaker[row.speaker].append(row)
+    drawn = []
+    for speaker, rows in sorted(by_speaker.items()):
+        random.Random(speaker).shuffle(rows)  # noqa: S311 - reproducible
+        if zlib.crc32(speaker.encode()) % _HELD_OUT_SHARE:
+            chosen = rows[:_MAX_OF_SPEAKER]
+            drawn += [replace(row, license=row.license or _LEARNERS_LICENSE) for row in chosen]
+    return drawn
+
+
+def _grid_clips(folder: Path, errors: RowErrors) -> list[Utterance]:
+    english, universal = load_inventory("english"), load_inventory(UNIVERSAL)
+    clips = []
+    for clip in read_clips(folder, language="en"):
+        if clip.source != "grid" or not clip.transcript:
+            continue
+        try:
+            words = english.pronounce(clip.transcript)
+        except UserError as error:
+            errors.add(clip.name, str(error))
+            continue
+        clips.append(
+            Utterance(
+                utterance_id=clip.name,
+                path=folder / f"{clip.name}.flac",
+                speaker=clip.speaker,
+                license=clip.license,
+                language=clip.language,
+                seconds=60 * clip.minutes,
+                phones=tuple(universal.index[phone] for word in words for phone in word),
+                syllables=tuple(map(len, words)),
+            )
+        )
+    return clips

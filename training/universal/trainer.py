@@ -1,0 +1,117 @@
+"""Train the universal readout on stored features.
+
+The readout is that of the block network (:mod:`kouxing.training.blocks.network`). Its loss is the
+cross-entropy with the aligned states, of a block's own positions and, with half the weight, of its
+right context. The encoder is not trained.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import nll_loss
+
+from kouxing.training.blocks.network import BlockReadout, Layout, layout
+from kouxing.training.networks.network import ReadoutShape
+from kouxing.training.networks.optimizer import Optimizer, warm_up_and_decay_factor
+from kouxing.training.training_set import Report
+from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, RIGHT_CONTEXT
+from kouxing.training.universal.features import STEP, WIDTH, Features
+
+READOUT = ReadoutShape(
+    inner=288,
+    gru=160,
+    dropout=0.15,
+    noise=0.15,
+    constant_noise=0.2,
+    feature_dropout=0.05,
+    num_masks=1,
+)
+_NUM_CROPS, _CROP_BLOCKS = 8, 12  # in a batch, in a crop
+_CROP_POSITIONS = _CROP_BLOCKS * BLOCK_LENGTH
+CROPS_S = _NUM_CROPS * _CROP_POSITIONS * 0.02
+_RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 40, 0.6
+_RIGHT_WEIGHT = 0.5
+_NO_STATE = -1
+
+
+def train_readout(
+    readout: BlockReadout,
+    recordings: Sequence[Features],
+    states: Mapping[str, NDArray[np.int64]],
+    weights: Sequence[float],
+    *,
+    seed: int,
+    num_steps: int,
+    checkpoint: Path,
+    report: Report,
+) -> BlockReadout:
+    """Train a readout; return one with the running mean of its weights.
+
+    ``states`` are those of the frames of each recording, by its name. ``weights`` are the relative
+    sampling weights of the recordings.
+    """
+    probs = np.cumsum(weights) / np.sum(weights)
+    laid = layout(_CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
+    groups = [{"params": list(readout.parameters()), "lr": _RATE}]
+    optimizer = Optimizer(readout, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=8)
+    readout.train()
+
+    def loss(step: int) -> Tensor:
+        rng = np.random.default_rng([seed, step])
+        drawn = [recordings[int(np.searchsorted(probs, rng.random()))] for _ in range(_NUM_CROPS)]
+        crops = [_crop(one, states[one.name], laid, rng) for one in drawn]
+        features, targets = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
+        with torch.autocast("cpu", torch.bfloat16):
+            log_posteriors = readout.read(features.float() * STEP, laid).float()
+        losses = [
+            nll_loss(
+                log_posteriors[:, part].flatten(0, 2),
+                targets[:, part].flatten(),
+                ignore_index=_NO_STATE,
+            )
+            for part in (slice(_CROP_POSITIONS), slice(_CROP_POSITIONS, None))
+        ]
+        result: Tensor = losses[0] + _RIGHT_WEIGHT * losses[1]
+        return result
+
+    return optimizer.train(
+        loss,
+        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
+        num_steps=num_steps,
+        seed=seed,
+        report=report,
+        checkpoint=checkpoint,
+    )
+
+
+def new_readout(num_states: int) -> BlockReadout:
+    """Return an untrained readout of standardized features."""
+    return BlockReadout(WIDTH, num_states, READOUT)
+
+
+def _crop(
+    recording: Features, states: NDArray[np.int64], laid: Layout, rng: np.random.Generator
+) -> tuple[NDArray[np.int8], NDArray[np.int64]]:
+    """Draw blocks of a recording; return features, (n, 1024), and states, (n, 2)."""
+    num_more = len(recording.rows) - _CROP_BLOCKS
+    first = int(rng.integers(num_more + 1)) if num_more > 0 and rng.random() < 0.5 else 0
+    rows = np.zeros((_CROP_BLOCKS, LENGTH, WIDTH), np.int8)
+    some = recording.rows[first : first + _CROP_BLOCKS]
+    rows[: len(some)] = some
+    targets = np.full(2 * _CROP_POSITIONS, _NO_STATE)
+    kept = states[2 * BLOCK_LENGTH * first :][: len(targets)]
+    targets[: len(kept)] = kept
+    by_place = targets.reshape(-1, 2)[laid.places.numpy()]
+    return rows.reshape(-1, WIDTH)[_in_cache(laid)], by_place
+
+
+def _in_cache(laid: Layout) -> NDArray[np.int64]:
+    """Return the row of each place in the stored blocks, (n,)."""
+    own = np.arange(laid.num_positions)
+    rows = own // BLOCK_LENGTH * LENGTH + own % BLOCK_LENGTH
+    copied = (laid.blocks >= laid.num_positions).numpy().flatten().nonzero()[0]
+    return np.concatenate([rows, copied])
