@@ -11,6 +11,7 @@ export class Expressions {
   #goal;
   #halfway; // of the two-pole filter
   #shown;
+  #isShown = false;
   #remainingS = 0;
   #free = 1;
 
@@ -44,11 +45,12 @@ export class Expressions {
     this.#remainingS -= stepS;
     if (isSpeaking) this.#free = Math.max(this.#free - stepS / BIND_S, 0);
     else this.#free += (1 - this.#free) * smoothingShare(stepS, FREE_S);
-    if (!isHeld && !this.#shown.some((x) => x !== 0)) return;
+    if (!isHeld && !this.#isShown) return;
     const share = smoothingShare(stepS, isHeld ? EASE_S : FADE_S);
     this.#halfway = this.#halfway.map((x, i) => x + share * ((isHeld ? this.#goal[i] : 0) - x));
     this.#shown = this.#shown.map((x, i) => x + share * (this.#halfway[i] - x));
     this.#mix(faps);
+    this.#isShown = this.#shown.some((x) => Math.abs(x) > this.#c.VISIBLE);
   }
 
   #mix(faps) {
