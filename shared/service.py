@@ -93,6 +93,7 @@ class Service(MessageLoop):
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # that it provides, by name
         self.facts = SessionFacts()  # about the sessions that it serves
+        self.languages: list[str] = []  # that its sessions may have besides that of ``facts``
         self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
         self._hand_over_end_s = 0.0
@@ -365,6 +366,7 @@ class Service(MessageLoop):
                 role=self.kind.role,
                 needs=list(self.kind.needs),
                 facts=self.facts,
+                languages=self.languages,
                 state="draining" if self._exit_requested else "ready",
                 sent_ns=self._sent_ns,
                 endpoints=self.endpoints,

@@ -35,17 +35,17 @@ export class Speaker {
    *
    * @param gateway address of the gateway
    * @param options { sampleRateHz, numChannels, encoding: "s16le" or "f32le", ahead: whether audio may
-   *   come faster than real time, mouthProfile: in base64, token, closed: called with an
+   *   come faster than real time, mouthProfile: in base64, language, token, closed: called with an
    *   error or null when the session has ended }
    * @returns a promise of a Speaker; it is rejected if the gateway refuses the session
    */
   static open(gateway, options = {}) {
     const { sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "" } = options;
-    const { ahead = false, mouthProfile, closed = () => {} } = options;
+    const { ahead = false, mouthProfile, language, closed = () => {} } = options;
     const format = { sample_rate_hz: sampleRateHz, num_channels: numChannels, encoding };
     const socket = new WebSocket(socketUrl(gateway, "/microphone", { token }));
     return new Promise((resolve, reject) => {
-      socket.onopen = () => socket.send(JSON.stringify({ ...format, ahead, mouth_profile: mouthProfile }));
+      socket.onopen = () => socket.send(JSON.stringify({ ...format, ahead, mouth_profile: mouthProfile, language }));
       socket.onmessage = ({ data }) => {
         const { type, session, text } = JSON.parse(data);
         if (type === "opened") resolve(new Speaker(socket, session, encoding, closed));

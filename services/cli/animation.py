@@ -18,7 +18,7 @@ from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.alignment import align_syllables
 from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
@@ -30,6 +30,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
 
 T = TypeVar("T", Phone, TimedSyllable)
@@ -94,22 +95,23 @@ def animate(
     mouth: Path | None,
     expressiveness: float | None,
     track: int | None = None,
+    language: str = DEFAULT_LANGUAGE,
 ) -> Motion:
     """Animate a face from a sound file.
 
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
     are those of the live services with their default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
-    it, if given.
+    it, if given. ``language`` is that of the speech.
 
     Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """
     reading = progress.add_task("reading", total=None)
-    model, predictor = _load_models(mouth)
+    model, predictor = _load_models(mouth, language)
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
-    models = [load_lip_model(name=name) for name in lip_models]
+    models = [load_lip_model(model.inventory.language, name) for name in lip_models]
     settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
-    transcript = None if text is None else read_text(text, model.inventory)
+    transcript = None if text is None else read_text(text, load_inventory(language))
     samples = read_mono_16k(source, track)
     progress.remove_task(reading)
     events: Sequence[SoundEvent]
@@ -158,9 +160,9 @@ def animate(
 
 
 @lru_cache(maxsize=1)
-def _load_models(mouth: Path | None) -> tuple[AcousticModel, LipPredictor | None]:
+def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipPredictor | None]:
     """Load the models once for all files of a command."""
-    model = load_model()
+    model = model_of_language(language)
     return model, _load_lip_predictor(mouth)
 
 

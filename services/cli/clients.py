@@ -13,6 +13,7 @@ from rich.console import Console
 from kouxing.services.cli.options import (
     AudioTrack,
     CurveForm,
+    Language,
     ListenOutput,
     MouthFile,
     PhoneAlphabet,
@@ -82,6 +83,7 @@ def speak(
     ] = None,
     track: AudioTrack = None,
     mouth: MouthFile = None,
+    language: Language = None,
     control: Control = "",
 ) -> None:
     """Stream a file, standard input, a microphone or this machine's sound to a running system."""
@@ -117,6 +119,7 @@ def speak(
         record=record,
         paced=not fast,
         mouth_profile=profile,
+        language=language,
     )
     print_message(
         f"session {summary.session}: {plural(summary.num_phones, 'phone')} in"

@@ -20,7 +20,7 @@ from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import DrawnLips, Timing
 from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
-from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
@@ -49,7 +49,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 from kouxing.shared.terminal import open_progress, plural, print_message, write_error, write_text
 
@@ -75,7 +75,7 @@ class _Mouth:
     syllables: Sequence[TimedSyllable]
     key_frames: KeyFrames
     widths: tuple[Array, Array]  # times, and the width at each, relative to the mouth at rest
-    silence: str
+    inventory: PhoneInventory
     smooth: bool  # whether the velocity of the opening is continuous
     num_points: int  # of each line of the contour, in a table
 
@@ -109,6 +109,7 @@ def draw_mouth(
     num_points: int | None = None,
     speech_to_text: Path | None = None,
     track: int | None = None,
+    language: str = DEFAULT_LANGUAGE,
 ) -> None:
     """Draw the mouth of a sound file, in the format of the output's suffix.
 
@@ -132,16 +133,16 @@ def draw_mouth(
     if text is None and speech_to_text is None and timing is not None:
         raise UserError("--timing needs a text; give the spoken text before the output file")
     samples = read_mono_16k(source, track)
-    inventory = load_inventory()
+    inventory = load_inventory(language)
     if speech_to_text is not None:
         text = SherpaTranscriber(speech_to_text).transcribe(samples) or None
         print_message(f"{source}: {text or 'no words were recognized'}")
     transcript = None if text is None else read_text(text, inventory)
     with open_progress() as progress:
         with_progress = partial(progress.track, description="timing")
-        timed = _time_phones(source, samples, transcript, timing, with_progress)
+        timed = _time_phones(source, samples, transcript, timing, inventory, with_progress)
         with_progress = partial(progress.track, description="finding the lips")
-        widths = _widths(lips, samples, timed, with_progress)
+        widths = _widths(lips, samples, timed, inventory, with_progress)
     phones = spoken(timed, inventory)
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
@@ -151,7 +152,7 @@ def draw_mouth(
         syllables=write_syllables(phones, transcript, inventory),
         key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
         widths=widths,
-        silence=inventory.silence,
+        inventory=inventory,
         smooth=smooth,
         num_points=num_points or DEFAULT_NUM_POINTS,
     )
@@ -163,19 +164,20 @@ def _time_phones(
     samples: NDArray[np.float32],
     transcript: Transcript | None,
     timing: Timing | None,
+    inventory: PhoneInventory,
     with_progress: WithProgress,
 ) -> list[Phone]:
     if transcript is not None and timing is None:
         is_long = len(transcript.syllables) > MAX_SYLLABLES
         timing = Timing.ALIGN if is_long else Timing.ENDPOINTS
     if transcript is not None and timing is Timing.ENDPOINTS:
-        recording = progress_of(samples), transcript.phones, load_table(load_inventory())
+        recording = progress_of(samples), transcript.phones, load_table(inventory)
         phones = time_text(*recording)
         ratio = speech_ratio(*recording)
         if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
             print_mismatch(source, f"the speech is {ratio:.1f} times the text's usual duration")
         return phones
-    model = load_model()
+    model = model_of_language(inventory.language)
     if transcript is None:
         return recognize(model, samples, MEDIA_RATE_HZ, with_progress)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
@@ -187,6 +189,7 @@ def _widths(
     lips: DrawnLips,
     samples: NDArray[np.float32],
     timed: Sequence[Phone],
+    inventory: PhoneInventory,
     with_progress: WithProgress,
 ) -> tuple[Array, Array]:
     """Return times, and the distance of the corners at each, relative to the mouth at rest."""
@@ -194,8 +197,9 @@ def _widths(
         return np.zeros(1), np.ones(1)
     predictor = load_lip_predictor() if lips is DrawnLips.LEARNT else None
     recording = analyze_recording(samples, timed, predictor, with_progress=with_progress)
+    lip_model = load_lip_model(inventory.language, lips)
     frames = animate_recording(
-        recording, load_lip_model(name=lips), SynthesizerConfig(lips=lips, expressiveness=1.0)
+        recording, lip_model, SynthesizerConfig(lips=lips, expressiveness=1.0)
     )
     stretch = [faps[_STRETCH].sum() / FAP_UNITS_PER_FAPU for _, faps in frames]
     return np.array([time_s for time_s, _ in frames]), 1.0 + np.array(stretch)
@@ -222,15 +226,15 @@ def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
 def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledMouth]:
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
-    anchors = anchors_of(mouth.phones, mouth.silence) or [(0.0, mouth.silence)]
-    write = load_inventory().write
+    anchors = anchors_of(mouth.phones, mouth.inventory.silence) or [(0.0, mouth.inventory.silence)]
+    write = mouth.inventory.write
     middles_s = {phone.onset_s: phone.onset_s + phone.duration_s / 2 for phone in mouth.phones}
     widths = mouth.widths_at([middles_s.get(time_s, time_s) for time_s, _ in anchors])
     return [
         drawing.LabeledMouth(
             time_s,
             float(opening),
-            "" if phone == mouth.silence else write(phone),
+            "" if phone == mouth.inventory.silence else write(phone),
             syllables.get(time_s, ""),
             float(width),
         )
@@ -259,7 +263,7 @@ def _write_picture(output: Path, mouth: _Mouth) -> str:
 
 def _write_video(output: Path, mouth: _Mouth) -> str:
     labels = _labels(mouth, are_pixels=True)
-    write = load_inventory().write
+    write = mouth.inventory.write
     symbols = [(start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.symbols]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
     with (

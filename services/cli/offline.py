@@ -16,6 +16,7 @@ from kouxing.services.cli.options import (
     DrawnLips,
     ExportOptions,
     HeadName,
+    Language,
     MouthFile,
     Output,
     PhoneAlphabet,
@@ -24,6 +25,7 @@ from kouxing.services.cli.options import (
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 from kouxing.shared.terminal import (
     Force,
     check_output,
@@ -35,7 +37,11 @@ from kouxing.shared.terminal import (
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
 Acoustic = Annotated[
-    str, typer.Option(help="Acoustic model: blocks, light, gmm, universal, or a model file.")
+    str | None,
+    typer.Option(
+        help="Acoustic model: blocks, light, gmm, universal, or a model file. Default: the one of"
+        " the language."
+    ),
 ]
 
 
@@ -94,10 +100,11 @@ def render(
     text: Annotated[
         str | None,
         typer.Option(
-            help="Spoken text, or a file that contains it, in Chinese characters or pinyin. It is"
+            help="Spoken text, or a file that contains it; Mandarin in characters or pinyin. It is"
             " aligned with the recording and improves the lips."
         ),
     ] = None,
+    language: Language = None,
     form: Annotated[
         CurveForm | None,
         typer.Option(
@@ -174,7 +181,7 @@ def render(
 
         if has_motion(source):
             _check_no_sound_options(
-                source, lips=lips, live=live or None, text=text, mouth=mouth,
+                source, lips=lips, live=live or None, text=text, mouth=mouth, language=language,
                 expressiveness=expressiveness, track=track, captions=captions,
             )  # fmt: skip
         elif sound is not None:
@@ -187,6 +194,7 @@ def render(
                 motion = animate(
                     source, models, progress, live=live, text=text, mouth=mouth,
                     expressiveness=expressiveness, track=track,
+                    language=language or DEFAULT_LANGUAGE,
                 )  # fmt: skip
             if not motion.frames:
                 raise UserError(f"{source}: the file contains no frames; export it again")
@@ -209,7 +217,8 @@ def phones(
     audio: Annotated[
         list[Path], typer.Argument(help="Audio or video files; '-' is standard input.")
     ],
-    acoustic: Acoustic = "blocks",
+    language: Language = None,
+    acoustic: Acoustic = None,
     alphabet: PhoneAlphabet = None,
     form: Form = None,
     output: Annotated[
@@ -220,7 +229,7 @@ def phones(
 ) -> None:
     """Recognize the phones of audio files, with their times."""
     from kouxing.services.cli.inputs import read_mono_16k
-    from kouxing.services.recognizer.acoustic.load import load_model
+    from kouxing.services.recognizer.acoustic.languages import model_of_language
     from kouxing.services.recognizer.offline import recognize
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.alphabets import respell
@@ -234,7 +243,7 @@ def phones(
     if is_folder:
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
     check_output(*(target for _, target in pairs), inputs=audio, force=force)
-    model = load_model(acoustic)
+    model = model_of_language(language, acoustic)
 
     def recognize_file(source: Path, target: Path | None) -> None:
         samples = read_mono_16k(source, track)
@@ -253,9 +262,10 @@ def phones(
 def align(
     audio: Audio,
     text: Annotated[
-        str, typer.Argument(help="Spoken text or a text file, in Chinese characters or pinyin.")
+        str, typer.Argument(help="Spoken text or a text file; Mandarin in characters or pinyin.")
     ],
-    acoustic: Acoustic = "blocks",
+    language: Language = None,
+    acoustic: Acoustic = None,
     alphabet: PhoneAlphabet = None,
     form: Form = None,
     output: Output = None,
@@ -265,16 +275,17 @@ def align(
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
     from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.cli.spoken_text import read_text, report_mismatch
-    from kouxing.services.recognizer.acoustic.load import load_model
+    from kouxing.services.recognizer.acoustic.languages import model_of_language
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ
     from kouxing.shared.phones.alphabets import respell
+    from kouxing.shared.phones.inventory import load_inventory
     from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
     check_output(output, inputs=[audio, Path(text)], force=force)
-    model = load_model(acoustic)
-    transcript = read_text(text, model.inventory)
+    model = model_of_language(language, acoustic)
+    transcript = read_text(text, load_inventory(language or model.inventory.language))
     samples = read_mono_16k(audio, track)
     with open_progress() as progress:
         with_progress = partial(progress.track, description="aligning")
@@ -294,7 +305,7 @@ def lips(
         list[str],
         typer.Argument(
             metavar="[TEXT] OUTPUT",
-            help="Spoken text in Chinese characters or pinyin, then the file to write: .svg or"
+            help="Spoken text (Mandarin in characters or pinyin), then the file to write: .svg or"
             " .png (the mouth at every key frame), .mp4, or .csv (the contour). Without a text,"
             " phones are recognized.",
         ),
@@ -306,6 +317,7 @@ def lips(
             " ferguson: always the same width."
         ),
     ] = DrawnLips.VISEMES,
+    language: Language = None,
     timing: Annotated[
         Timing | None,
         typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
@@ -344,6 +356,7 @@ def lips(
         num_points=points,
         speech_to_text=speech_to_text,
         track=track,
+        language=language or DEFAULT_LANGUAGE,
     )
 
 

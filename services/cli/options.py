@@ -11,8 +11,15 @@ from kouxing.services.driver.config import HEAD_NAMES, DriverConfig, Framing
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 from kouxing.shared.phones.alphabets import Alphabet
+from kouxing.shared.phones.inventory import codes, find_language
 
 DEFAULT_HEAD = DriverConfig().head
+
+
+def _find_language(name: str | None) -> str | None:
+    return None if name is None else find_language(name)
+
+
 HeadName = Annotated[
     str,
     typer.Option(
@@ -23,12 +30,21 @@ AudioTrack = Annotated[
     int | None,
     typer.Option("--track", metavar="N", help="Audio track of the file. Default: the first."),
 ]
+Language = Annotated[
+    str | None,
+    typer.Option(
+        "--language",
+        callback=_find_language,
+        help=f"Language of the speech: {', '.join(codes())}, or an installed language. auto: any"
+        " language, with universal phones. Default: zh.",
+    ),
+]
 PhoneAlphabet = Annotated[
     Alphabet | None,
     typer.Option(
         "--alphabet",
-        help="own (symbols of the language), ipa, or arpabet (English). Default: own, but ipa for"
-        " universal phones.",
+        help="own (symbols of the language), ipa, or arpabet, for English. Default: own for zh, ipa"
+        " for other languages.",
     ),
 ]
 Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]

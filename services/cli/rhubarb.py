@@ -19,6 +19,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
+from kouxing.shared.phones.inventory import AUTO, find_language
 from kouxing.shared.terminal import write_text
 from kouxing.shared.user_file import read_text
 
@@ -56,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     add("-f", "--exportFormat", choices=("tsv", "xml", "json", "dat"), default="tsv")
     add("-o", "--output", type=Path, help="file to write, which may exist")
     add("-d", "--dialogFile", type=Path, help="file with the spoken text")
+    add("--language", default=AUTO, help="of the speech, such as en or zh; not in Rhubarb")
     add("--extendedShapes", default="GHX", help="which of the mouths G, H and X are drawn")
     add("--datFrameRate", type=float, default=24.0, help="10 to 100 images per second")
     add("--datUsePrestonBlair", action="store_true", help="other names of the mouths in dat")
@@ -78,6 +80,7 @@ def _animate(options: argparse.Namespace) -> Motion:
             text=text.strip() or None,
             mouth=None,
             expressiveness=None,
+            language=find_language(options.language),
         )
 
 

@@ -43,15 +43,20 @@ def stream(
     record: bool = False,
     paced: bool = True,
     mouth_profile: bytes = b"",
+    language: str | None = None,
 ) -> StreamSummary:
     """Stream a source through a running system and wait for its last FAP frame.
 
-    ``mouth_profile`` is the speaker's, if any. Raises ``UserError`` if the system does not answer,
-    refuses the session or stops answering.
+    ``mouth_profile`` is the speaker's, if any, and ``language`` that of the speech. Raises
+    ``UserError`` if the system does not answer, refuses the session or stops answering.
     """
     with connect(control) as client:
         return _Streaming(client, source, console).run(
-            record=record, name=session, paced=paced, mouth_profile=mouth_profile or None
+            record=record,
+            name=session,
+            paced=paced,
+            mouth_profile=mouth_profile or None,
+            language=language,
         )
 
 

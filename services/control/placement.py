@@ -30,9 +30,9 @@ class Placement:
         """Return a worker for each endpoint that a client or a chosen worker needs.
 
         A worker that is chosen for one endpoint also serves its other endpoints. Workers in
-        ``kept`` stay. A session that moves needs a worker of its ``language``, but no room. Raises
-        ``Refusal`` if no ready worker provides one of the endpoints, or none has room for
-        ``min_room`` sessions.
+        ``kept`` stay. A session needs workers of its ``language``, if it has one. A session that
+        moves needs no room. Raises ``Refusal`` if no ready worker provides one of the endpoints, or
+        none has room for ``min_room`` sessions.
         """
         workers: dict[str, str] = {}
         needed = list(CLIENT_NEEDS)
@@ -63,6 +63,9 @@ class Placement:
             if instance in names:
                 return instance
         kind = PROVIDERS.get(endpoint)
+        if not names and providers and language is not None:
+            text = f"no {kind} has the language {language}; choose another one"
+            raise Refusal(ErrorCode.BAD_LANGUAGE, text)
         if not names:
             missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
             start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
@@ -87,5 +90,6 @@ class Placement:
 
 
 def _can_serve(record: ServiceRecord, language: str | None) -> bool:
-    stated = record.heartbeat.facts.language
-    return record.state == "ready" and (language is None or stated in (None, language))
+    stated, others = record.heartbeat.facts.language, record.heartbeat.languages
+    is_known = language is None or stated in (None, language) or language in others
+    return record.state == "ready" and is_known

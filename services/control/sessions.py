@@ -13,7 +13,9 @@ from kouxing.services.control.placement import Placement
 from kouxing.services.control.refusal import Refusal
 from kouxing.services.control.registry import Registry
 from kouxing.services.control.session_record import SessionRecord
+from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
+from kouxing.shared.phones.inventory import find_language
 from kouxing.shared.wire.control import Heartbeat, StartSession
 from kouxing.shared.wire.face import CurrentFace, FaceSettings
 from kouxing.shared.wire.session import ErrorCode, OpenSession
@@ -114,8 +116,8 @@ class Sessions:
     def open(self, opening: OpenSession, client: Peer, now_s: float) -> SessionRecord:
         """Place a new session.
 
-        Raises ``Refusal`` if the name is taken, there are too many sessions, or a service is
-        missing or busy.
+        Raises ``Refusal`` if the name is taken, there are too many sessions, a service is missing
+        or busy, or none has the language.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:
@@ -129,8 +131,11 @@ class Sessions:
             text = f"your key has {num_of_key} open sessions, the maximum; close one first"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
         leaves_room = client.key and num_of_key and not opening.paced  # for another client
-        workers = self._placement.place({}, now_s, min_room=2 if leaves_room else 1)
+        language = _language_of(opening)
+        workers = self._placement.place({}, now_s, language, min_room=2 if leaves_room else 1)
         facts = self._registry.facts(workers.values())
+        if language is not None:
+            facts = replace(facts, language=language)
         record = SessionRecord(
             name=name,
             number=next(self._numbers),
@@ -296,3 +301,13 @@ class Sessions:
         for instance in after - before:
             self._of_worker.setdefault(instance, {})[record.name] = record
             self._registry.load(instance).add_session(now_s, paced=record.opening.paced)
+
+
+def _language_of(opening: OpenSession) -> str | None:
+    """Return the language that a client chose, by its name; None if it chose none."""
+    if opening.language is None:
+        return None
+    try:
+        return find_language(opening.language)
+    except UserError as error:
+        raise Refusal(ErrorCode.BAD_LANGUAGE, str(error)) from None

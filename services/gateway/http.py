@@ -17,6 +17,7 @@ from kouxing.services.lip_models import lip_models
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
 from kouxing.shared.page_heads import page_heads_folder
+from kouxing.shared.phones.inventory import language_titles
 
 PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
@@ -188,11 +189,11 @@ def _modules_folder() -> Path | None:
 
 
 async def _serve_offers(_request: web.Request) -> web.StreamResponse:
-    """Answer with the heads' names and the lip models' titles that the page's settings offer."""
+    """Answer with the names of heads, and the titles of lip models and of languages."""
     heads = sorted(path.stem.removeprefix("head-") for path in PAGE.glob("head-*.webp"))
     names = sorted(lip_models(), key=lambda name: name != DEFAULT_LIP_MODEL)
     lips = {name: dict(lip_models()[name].titles) for name in names}
-    return web.json_response({"heads": heads, "lips": lips})
+    return web.json_response({"heads": heads, "lips": lips, "languages": language_titles()})
 
 
 def _find(folder: Path, name: str, suffixes: Collection[str]) -> Path:

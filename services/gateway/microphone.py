@@ -70,6 +70,7 @@ class Microphones:
             sample_rate_hz=hello.pcm_format.sample_rate_hz,
             num_channels=hello.pcm_format.num_channels,
             mouth_profile=hello.mouth_profile or None,
+            language=hello.language or None,
         ) as session:
             self._session_names[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})

@@ -33,6 +33,7 @@ SHAPES_TYPE = 4  # payload: float32 weights of a shape set, for a frame
 REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at rest
 
 SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 
 
@@ -59,6 +60,7 @@ class Hello:
     pcm_format: PcmFormat
     is_ahead: bool  # audio may arrive faster than real time
     mouth_profile: bytes  # of the speaker; empty: the average speaker
+    language: str  # of the speech; empty: that of the recognizer
 
 
 def parse_hello(message: str) -> Hello:
@@ -76,7 +78,14 @@ def parse_hello(message: str) -> Hello:
         pcm_format=pcm_format,
         is_ahead=bool(fields.get("ahead")),
         mouth_profile=_parse_mouth_profile(fields.get("mouth_profile", "")),
+        language=_parse_language(fields.get("language", "")),
     )
+
+
+def _parse_language(field: object) -> str:
+    if not isinstance(field, str) or len(field) > MAX_LANGUAGE_LETTERS:
+        raise UserError("language must be auto, or the code of a language such as de")
+    return field
 
 
 def _parse_mouth_profile(field: object) -> bytes:

@@ -10,7 +10,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lip_frames import LipFrameModel
@@ -19,8 +19,6 @@ from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import hear_streams, score_streams
 from kouxing.services.recognizer.stream import SpeechStream
-from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import UNIVERSAL
 
 _WARM_UP_S = 0.2
 
@@ -46,18 +44,13 @@ class Recognizer:
     def model_of(self, language: str | None) -> AcousticModel:
         """Return the model with the phones of a language; None is the recognizer's own language.
 
-        The universal model is loaded at its first use. Raises ``UserError`` if no model has the
+        Other models are loaded at their first use. Raises ``UserError`` if no model has the
         language.
         """
         if language is None:
             return self.model
-        if language == UNIVERSAL and language not in self._models:
-            self._models[language] = load_model(UNIVERSAL)
         if language not in self._models:
-            raise UserError(
-                f"no acoustic model for {language}; choose {self.model.inventory.language} or "
-                f"{UNIVERSAL}, or set recognizer.acoustic to a model for {language}"
-            )
+            self._models[language] = model_of_language(language)
         return self._models[language]
 
     def create_stream(
@@ -85,7 +78,7 @@ class Recognizer:
             Media time at which current speech started, samples at 16 kHz, if another recognizer
             processed its start. The networks' blocks then align with those of the other one.
         language
-            Name of the inventory of the phones, as for :meth:`model_of`.
+            Name of the language of the phones, as for :meth:`model_of`.
 
         Raises ``UserError`` if the rate or the channels are out of range, or no model has the
         language.
@@ -103,8 +96,8 @@ class Recognizer:
     @property
     def network_s(self) -> float:
         """Processor time spent in block networks so far, seconds."""
-        models = self._models.values()
-        return sum(model.session.run_s for model in models if isinstance(model, BlockModel))
+        models = [model for model in self._models.values() if isinstance(model, BlockModel)]
+        return sum(session.run_s for session in {model.session for model in models})
 
     def is_ready(self, stream: SpeechStream) -> bool:
         """Return whether a stream has audio to score."""

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+from kouxing.services.recognizer.acoustic.languages import LANGUAGES_OF_MODELS
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
@@ -88,6 +89,7 @@ class RecognizerService(Service):
             model = loading.result()
         self._recognizer = Recognizer(model, config.output_rule)
         self.facts = SessionFacts(language=model.inventory.language)
+        self.languages = [*LANGUAGES_OF_MODELS]
         self._lip_predictor = lip_predictor or load_lip_predictor()
         self._recognizer.warm_up()
         self._network = NetworkThread(self._recognizer, self.waker.wake)

@@ -46,10 +46,14 @@ from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
-_NAMES = "english french german italian japanese mandarin portuguese russian spanish universal"
-BUILT_IN = {name: f"kouxing.shared.phones.{name}" for name in _NAMES.split()}
+TABLE_LANGUAGES = "english french german italian japanese portuguese russian spanish".split()
 DEFAULT_LANGUAGE = "mandarin"
 UNIVERSAL = "universal"  # the phones of all languages
+AUTO = "auto"  # a user's name for it
+BUILT_IN = {
+    name: f"kouxing.shared.phones.{name}"
+    for name in (DEFAULT_LANGUAGE, UNIVERSAL, *TABLE_LANGUAGES)
+}
 ENTRY_POINTS = "kouxing.languages"
 KINDS = ("initial", "vowel", "silence")
 MAX_PHONES = 255  # model files count phones in 8 bits
@@ -151,6 +155,30 @@ class PhoneInventory:
 
 
 @lru_cache
+def codes() -> dict[str, str]:
+    """Return the languages by what a user may call them: codes of ``BUILT_IN``, and ``auto``."""
+    of_tables = {load_table_language(BUILT_IN[name]).code: name for name in TABLE_LANGUAGES}
+    return {AUTO: UNIVERSAL, "zh": DEFAULT_LANGUAGE} | dict(sorted(of_tables.items()))
+
+
+def language_titles() -> dict[str, Mapping[str, str]]:
+    """Return the names for users of the languages in ``codes``, in "en" and "zh"; zh first."""
+    of_tables = {code: BUILT_IN[name] for code, name in codes().items() if name in TABLE_LANGUAGES}
+    return {
+        "zh": {"en": "Mandarin", "zh": "普通话"},
+        AUTO: {"en": "any language", "zh": "任何语言"},
+    } | {code: load_table_language(package).titles for code, package in of_tables.items()}
+
+
+def find_language(name: str) -> str:
+    """Return the language of a code such as ``de``, or of its name.
+
+    Raises ``UserError`` if it is not installed.
+    """
+    return load_inventory(codes().get(name, name)).language
+
+
+@lru_cache
 def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
     """Read the inventory of a language in ``BUILT_IN`` or of an entry point.
 
@@ -161,7 +189,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
         installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         package = installed.get(language)
         if package is None:
-            known = ", ".join(sorted({*BUILT_IN, *installed}))
+            known = ", ".join([*codes(), *sorted({*BUILT_IN, *installed})])
             raise UserError(f"language {language!r} is not installed; choose from: {known}")
     try:
         if resources.files(package).joinpath(SETTINGS).is_file():

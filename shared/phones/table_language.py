@@ -19,6 +19,7 @@ are for readers. A phone that espeak-ng takes from another language becomes the 
 import re
 import tomllib
 import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -42,6 +43,7 @@ class TableLanguage:
     """The texts of a language."""
 
     code: str
+    titles: Mapping[str, str]
     voice: str
     scripts: tuple[str, ...]
     rules: tuple[tuple[str, str], ...]
@@ -109,6 +111,7 @@ def load_table_language(package: str) -> TableLanguage:
     settings = tomllib.loads(resources.files(package).joinpath(SETTINGS).read_text("utf-8"))
     return TableLanguage(
         code=settings["code"],
+        titles=settings["titles"],
         voice=settings["voice"],
         scripts=tuple(settings["scripts"]),
         rules=tuple((pattern, replacement) for pattern, replacement in settings.get("rules", ())),

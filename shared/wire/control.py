@@ -75,6 +75,9 @@ class Heartbeat(Message):
         default_factory=list
     )  # names of the endpoints that it connects to
     facts: SessionFacts = field(default_factory=SessionFacts)
+    languages: Annotated[list[Name], Meta(max_length=64)] = field(
+        default_factory=list
+    )  # that its sessions may have instead of the one in facts
     build: Text = ""  # version of kouxing
     load: Probability = 0.0  # share of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)

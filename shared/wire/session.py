@@ -36,6 +36,7 @@ class ErrorCode(StrEnum):
     BAD_MESSAGE = "bad-message"
     BAD_AUDIO = "bad-audio"
     BAD_FACE = "bad-face"
+    BAD_LANGUAGE = "bad-language"
     BAD_MOUTH_PROFILE = "bad-mouth-profile"
     BAD_TOKEN = "bad-token"  # noqa: S105 - no password
     BUSY = "busy"
@@ -81,6 +82,7 @@ class OpenSession(Message):
     record: bool = False  # the driver writes a video named after the session
     paced: bool = True  # audio arrives in real time; false: as fast as the services accept it
     mouth_profile: MouthProfile | None = None  # of the speaker, for a lip model that uses the audio
+    language: Name | None = None  # of the speech: "auto", a code or a name; None: the recognizer's
     face: FaceSettings = field(default_factory=FaceSettings)
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.wire.face import FaceSettings, SetFace
+from kouxing.shared.wire.session import OpenSession
 from tests.browser import SIZE_PX, Browser
 from tests.e2e.page_control import LOOK_AHEAD_MS, PageControl
 from tests.system import ROOT, Gateway, wait_until
@@ -363,6 +364,7 @@ def test_settings_apply_at_once_and_to_later_sessions(
     page.wait_for(f"{STATE}.lips === 'dynamic-visemes'")
     choose(page, "lips", "ferguson")
     page.wait_for(f"{STATE}.lips === 'ferguson'")
+    assert control.of(OpenSession)[-1].language == "zh"
     choose(page, "expressiveness", 0.7)
     wait_until(lambda: len(amounts(control)) == 1)
     page.click("open-settings")

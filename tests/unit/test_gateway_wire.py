@@ -19,7 +19,9 @@ def test_hello_describes_the_audio() -> None:
     assert hello.pcm_format == PcmFormat(sample_rate_hz=44100, num_channels=2, encoding="f32le")
     assert hello.pcm_format.frame_bytes == 8
     assert hello.mouth_profile == b""
-    hello = wire.parse_hello('{"sample_rate_hz": 8000, "mouth_profile": "YWJj"}')
+    assert hello.language == ""
+    hello = wire.parse_hello('{"sample_rate_hz": 8000, "mouth_profile": "YWJj", "language": "de"}')
+    assert hello.language == "de"
     assert hello.mouth_profile == b"abc"
 
 
@@ -31,6 +33,7 @@ def test_hello_describes_the_audio() -> None:
         ({"sample_rate_hz": 96000}, "sample_rate_hz"),
         ({"sample_rate_hz": 16000, "num_channels": 3}, "num_channels"),
         ({"sample_rate_hz": 16000, "encoding": "opus"}, "encoding"),
+        ({"sample_rate_hz": 16000, "language": 1}, "language must be auto"),
         ({"sample_rate_hz": 16000, "mouth_profile": "no base64!"}, "mouth_profile"),
         ({"sample_rate_hz": 16000, "mouth_profile": LONG_PROFILE}, "mouth_profile"),
         ([1], "object"),

@@ -50,7 +50,7 @@ def test_rejects_bad_phones(changes: dict[str, object], message: str) -> None:
 
 
 def test_rejects_an_unknown_language() -> None:
-    error = "language 'klingon' is not installed; choose from: english, .*mandarin, "
+    error = "language 'klingon' is not installed; choose from: auto, zh, .*de, .*mandarin, "
     with pytest.raises(UserError, match=error):
         load_inventory("klingon")
 

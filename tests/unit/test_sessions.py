@@ -86,6 +86,35 @@ def refused(code: str, text: str | None = None) -> Iterator[None]:
     assert caught.value.code == code
 
 
+def test_a_client_may_choose_a_language_of_the_recognizer(system: System) -> None:
+    system.lose("recognizer-1")
+    heartbeat = worker("recognizer", "recognizer-2")
+    system.add(replace(heartbeat, languages=["universal", "german"]))
+    assert system.open("a", language="de").facts.language == "german"
+    record = system.open("b", language="auto")
+    assert record.facts.language == record.start_message(0.0).facts.language == "universal"
+    assert system.open("c", language="zh").facts.language == "mandarin"
+    assert system.open("d").facts.language == "mandarin"
+    with refused("bad-language", "no recognizer has the language french"):
+        system.open("e", language="fr")
+    with refused("bad-language", "'klingon' is not installed; choose from: auto, zh"):
+        system.open("f", language="klingon")
+
+
+def test_a_session_of_a_chosen_language_moves_only_to_a_worker_that_has_it(
+    system: System,
+) -> None:
+    languages = ["universal"]
+    system.add(replace(worker("recognizer", "recognizer-2"), languages=languages))
+    record = system.open("a", language="auto")
+    assert "recognizer-2" in record.workers.values()
+    system.lose("recognizer-2")
+    assert not system.sessions.move(record, 1.0)  # recognizer-1 has only Mandarin
+    system.add(replace(worker("recognizer", "recognizer-3"), languages=languages))
+    assert system.sessions.move(record, 1.0)
+    assert record.facts.language == "universal"
+
+
 def test_a_new_session_waits_for_its_workers_and_all_observers(system: System) -> None:
     system.add(observer("lamp-1"))
     record = system.open()

@@ -84,7 +84,7 @@ class Client(BaseClient):
             Sets of blend shapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``.
         options
             Other fields of ``open-session``, such as ``paced=False`` for audio that arrives faster
-            than real time.
+            than real time, or ``language="de"``.
         """
         fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
         core = self._thread.submit(lambda core: core.open_session(fields)).result()

@@ -27,6 +27,7 @@ const meter = new LevelMeter();
 const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {
   heads: (name) => stage.load(name),
+  speechLanguage: () => speech.restart(),
   lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLipModel(name)),
   motion: sendMotions,
   express: (strengths) => socket.send({ express: strengths }),
@@ -35,6 +36,7 @@ const caption = new Caption(preferences);
 const sound = new Sound(() => speech.showSound());
 const speech = new SpeechControls(sound, {
   mouthProfile: () => mouthProfiles.current?.profile ?? "",
+  language: () => element("speech-language").value,
   lips: chosenLipModel,
   level: (value) => meter.raise(value),
   error: showError,

@@ -21,7 +21,7 @@ export class Microphone {
   #giveUpMs = null; // when to stop reconnecting; null before it has streamed
 
   /**
-   * @param handlers { mouthProfile(): base64 or "", lips(): lip model to start with or null,
+   * @param handlers { mouthProfile(): base64 or "", language(): of the speech, lips(): lip model to start with or null,
    *   state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
    *   fileEnded(name), error({ code, text }) }
    */
@@ -118,7 +118,8 @@ export class Microphone {
     socket.onopen = () => {
       const { sampleRate } = this.#context;
       const format = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
-      socket.send(JSON.stringify({ ...format, mouth_profile: this.#handlers.mouthProfile() }));
+      const [profile, language] = [this.#handlers.mouthProfile(), this.#handlers.language()];
+      socket.send(JSON.stringify({ ...format, mouth_profile: profile, language }));
     };
     socket.onmessage = (event) => {
       if (this.#socket !== socket) return;

@@ -15,8 +15,9 @@ export class Settings {
 
   /**
    * @param preferences Preferences
-   * @param offers { heads: names, lips: { name: title by language } } of the gateway
-   * @param handlers { heads(name), lips(name), motion(), express(strengths by name) },
+   * @param offers { heads: names, lips: { name: title by language }, languages: { code: title by
+   *   language } } of the gateway
+   * @param handlers { heads(name), lips(name), speechLanguage(code), motion(), express(strengths by name) },
    *   called when the user changes a setting
    */
   constructor(preferences, offers, handlers) {
@@ -25,9 +26,11 @@ export class Settings {
     const order = Object.keys(TEXTS);
     offers.heads.sort((a, b) => order.indexOf(`head.${a}`) - order.indexOf(`head.${b}`));
     for (const [name, title] of Object.entries(offers.lips)) TEXTS[`lips.${name}`] = title;
+    for (const [code, title] of Object.entries(offers.languages)) TEXTS[`speech.${code}`] = title;
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);
     this.#bind("lips", handlers.lips);
+    this.#bind("speech-language", handlers.speechLanguage);
     for (const id of MOTIONS) this.#bind(id, handlers.motion);
     for (const id of AMOUNTS) {
       element(id).addEventListener("input", () => showAmount(id));
@@ -64,6 +67,7 @@ export class Settings {
     fill("heads", "option", "head", ["", ...this.#offers.heads]);
     showPictures(this.#offers.heads);
     fill("lips", "option", "lips", Object.keys(this.#offers.lips));
+    fill("speech-language", "option", "speech", Object.keys(this.#offers.languages));
     fill("expressions", "button", "expression", EXPRESSIONS);
   }
 }

@@ -13,7 +13,7 @@ export class SpeechControls {
 
   /**
    * @param {Sound} sound the session's sound
-   * @param handlers { mouthProfile(), lips(), level(rms), fileEnded(name), error({ code, text }): as
+   * @param handlers { mouthProfile(), language(), lips(), level(rms), fileEnded(name), error({ code, text }): as
    *   of Microphone,
    *   news(text), session(name): the microphone's session, null when it ends }
    */
@@ -47,6 +47,13 @@ export class SpeechControls {
       if (sound.state === "on") sound.turnOff();
       else sound.turnOn();
     };
+  }
+
+  /** Restart the microphone, if it is on, in another session. */
+  restart() {
+    if (!this.microphone.isActive || this.microphone.isFile) return;
+    this.microphone.stop();
+    this.microphone.start();
   }
 
   /** Stop the microphone and mute the sound, for a lesson. */

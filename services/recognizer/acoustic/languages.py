@@ -1,0 +1,63 @@
+"""The acoustic model of a language, for commands and services."""
+
+import copy
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import (
+    DEFAULT_LANGUAGE,
+    TABLE_LANGUAGES,
+    UNIVERSAL,
+    load_inventory,
+)
+
+LANGUAGES_OF_MODELS = (DEFAULT_LANGUAGE, UNIVERSAL, *TABLE_LANGUAGES)  # shipped models
+_EXCLUDED = np.float32(-1e3)  # log-probability of a phone that the language lacks
+
+
+@cache
+def model_of_language(language: str | None = None, acoustic: str | None = None) -> AcousticModel:
+    """Return the acoustic model with the phones of a language; by default Mandarin.
+
+    Mandarin has a model of its own. The universal model serves all other languages; it then uses
+    only the phones of the language. ``acoustic`` names another model, or its file. Without a
+    language, it is that of the model.
+
+    Raises ``UserError`` if the language is not installed, or the model has other phones.
+    """
+    is_default = language in (None, DEFAULT_LANGUAGE)
+    model = _load(acoustic or (DEFAULT_MODEL if is_default else UNIVERSAL))
+    of_model = model.inventory.language
+    if language in (None, of_model):
+        return model
+    inventory = load_inventory(language)
+    if of_model != UNIVERSAL or not inventory.has_universal_phones:
+        raise UserError(
+            f"the acoustic model {acoustic or UNIVERSAL} has the phones of {of_model}; choose this"
+            f" language, or a model for {language}"
+        )
+    return limit_phones(model, inventory.phones)
+
+
+@cache
+def _load(acoustic: str) -> AcousticModel:
+    return load_model(acoustic)
+
+
+def limit_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticModel:
+    """Return a model that recognizes only some of its phones. Both share the network."""
+    language_model = model.topology.phone_lm
+    kept = np.array([phone in phones for phone in model.inventory.phones])
+    log_prob = np.where(kept[language_model.phone], language_model.log_prob, _EXCLUDED)
+    if isinstance(model, BlockModel):
+        model.session  # noqa: B018 - opens the network before the copy
+    limited = copy.copy(model)
+    topology = replace(model.topology, phone_lm=replace(language_model, log_prob=log_prob))
+    object.__setattr__(limited, "topology", topology)
+    return limited

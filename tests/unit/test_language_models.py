@@ -1,0 +1,84 @@
+"""The acoustic model of a language, and commands in other languages than Mandarin."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from kouxing.services.cli.mouth_drawing import draw_mouth
+from kouxing.services.cli.options import DrawnLips
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.languages import limit_phones, model_of_language
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import codes, find_language, language_titles, load_inventory
+from tests.system import ROOT, VOWELS_FILE
+
+SAMPLES = read_audio(VOWELS_FILE)[0][:, 0]
+SOUND = ROOT / "shared" / "demo" / "hello-female.wav"
+
+
+def test_mandarin_has_a_model_of_its_own() -> None:
+    models = (
+        model_of_language(),
+        model_of_language("mandarin", "gmm"),
+        model_of_language(None, "gmm"),
+    )
+    assert [model.inventory.language for model in models] == ["mandarin"] * 3
+    assert model_of_language() is model_of_language("mandarin") is not models[1]
+
+
+def test_other_languages_use_their_phones_of_the_universal_model() -> None:
+    english, universal = model_of_language("english"), model_of_language("universal")
+    assert english.inventory is universal.inventory is load_inventory("universal")
+    assert isinstance(english, BlockModel)
+    assert isinstance(universal, BlockModel)
+    assert english.session is universal.session  # in memory once
+    symbols = {phone.symbol for phone in recognize(english, SAMPLES, 16_000)}
+    assert symbols & load_inventory("english").vowels
+    assert symbols <= {*load_inventory("english").phones}
+
+
+def test_a_model_of_other_phones_is_an_error() -> None:
+    with pytest.raises(UserError, match="the acoustic model gmm has the phones of mandarin"):
+        model_of_language("english", "gmm")
+    with pytest.raises(UserError, match="'klingon' is not installed"):
+        model_of_language("klingon")
+
+
+def test_limits_the_phones_of_a_model() -> None:
+    model = load_model("gmm")
+    limited = limit_phones(model, ("sil", "i", "u"))
+    assert {phone.symbol for phone in recognize(limited, SAMPLES, 16_000)} <= {"sil", "i", "u"}
+    assert "ao" in {phone.symbol for phone in recognize(model, SAMPLES, 16_000)}
+
+
+def test_a_recognizer_has_models_for_all_languages() -> None:
+    recognizer = Recognizer(load_model("gmm"))
+    assert recognizer.model_of(None) is recognizer.model_of("mandarin") is recognizer.model
+    assert recognizer.model_of("german") is model_of_language("german")
+
+
+def test_languages_have_codes_and_titles() -> None:
+    assert codes()["auto"] == "universal"
+    assert [find_language(name) for name in ("zh", "de", "german")] == [
+        "mandarin",
+        "german",
+        "german",
+    ]
+    assert {*language_titles()} == {*codes()}
+    assert all({*titles} == {"en", "zh"} for titles in language_titles().values())
+
+
+def test_draws_the_mouth_of_an_english_text(tmp_path: Path) -> None:
+    output = tmp_path / "mouth.csv"
+    text = "Six spoons of peas, and 5 men"
+    draw_mouth(SOUND, text, output, num_points=2, lips=DrawnLips.FERGUSON, language="english")
+    with output.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    closed = {row["phone"] for row in rows if row["opening"] == "0.0000"}
+    assert "m" in closed
+    assert {"ih", "u", "th", "ae"} & {row["phone"] for row in rows if float(row["opening"]) > 0.5}
