@@ -18,11 +18,16 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_IND
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
 
 Float32 = NDArray[np.float32]
 
-_TURNS_DEG = (0.0, 40.0)
+_TURNS_DEG, _PROFILE_DEG = (0.0, 40.0), 80.0
 _HEAD_PX, _VISEME_PX, _CHOICE_PX = (240, 200), (160, 160), (160, 160)
+_MOUTH_PX, _FACE_PX = (176, 132), (272, 204)
+_MOUTHS = ("a", "i", "u", "o", "e", "v", "f", "b", "d", "g")
+_EXPRESSIONS = ("joy", "sadness", "anger", "surprise")
+_AMOUNTS = (0.5, 1.0, 1.4, 2.0)  # of the expressiveness
 _VISEMES_A_ROW = 9
 _REST = np.zeros(NUM_FAPS, np.float32)
 _SCALE = 2  # pictures are drawn larger and reduced, for smooth edges
@@ -35,8 +40,12 @@ def _head_names() -> list[str]:
 
 
 def sheets(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
-    """Return the functions that draw the files for the docs, ``heads.webp`` and ``faces.webp``."""
-    return {folder / "heads.webp": _draw_heads, folder / "faces.webp": _draw_visemes}
+    """Return the functions that draw the files for the docs."""
+    drawn = {
+        "heads": _draw_heads, "faces": _draw_visemes, "mouths": _draw_mouths,
+        "expressions": _draw_expressions, "expressiveness": _draw_expressiveness,
+    }  # fmt: skip
+    return {folder / f"{name}.webp": draw for name, draw in drawn.items()}
 
 
 def choices(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
@@ -78,17 +87,65 @@ def _draw_visemes() -> Image.Image:
     return _sheet(rows)
 
 
-def _spoken(viseme: str) -> Float32:
-    """Return the FAPs (68,) of a viseme's target with the default expressiveness."""
+def _draw_mouths() -> Image.Image:
+    poses = {"rest": _REST} | {viseme: _spoken(viseme) for viseme in _MOUTHS}
+    views = [(name, turn) for name in _head_names() for turn in _TURNS_DEG]
+    views.insert(len(_TURNS_DEG), (DEFAULT_HEAD, _PROFILE_DEG))
+    return _sheet(
+        [
+            [
+                _labelled(_picture(name, faps, _MOUTH_PX, turn, Framing.MOUTH), label)
+                for label, faps in poses.items()
+            ]
+            for name, turn in views
+        ]
+    )
+
+
+def _draw_expressions() -> Image.Image:
+    poses = {"rest": _REST} | {
+        name: EXPRESSIONS[EXPRESSION_NAMES.index(name)] for name in _EXPRESSIONS
+    }
+    return _sheet(
+        [
+            [_labelled(_picture(name, faps, _FACE_PX), label) for label, faps in poses.items()]
+            for name in _head_names()
+        ]
+    )
+
+
+def _draw_expressiveness() -> Image.Image:
+    return _sheet(
+        [
+            [
+                _labelled(
+                    _picture(DEFAULT_HEAD, _spoken(viseme, amount), _FACE_PX),
+                    f"{viseme} {amount:g}",
+                )
+                for viseme in _MOUTHS[:6]
+            ]
+            for amount in _AMOUNTS
+        ]
+    )
+
+
+def _spoken(viseme: str, expressiveness: float = SynthesizerConfig().expressiveness) -> Float32:
+    """Return the FAPs (68,) of a viseme's target."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
-    Expressiveness(SynthesizerConfig().expressiveness).apply(faps)
+    Expressiveness(expressiveness).apply(faps)
     return faps
 
 
-def _picture(name: str, faps: Float32, size: tuple[int, int], yaw_deg: float = 0.0) -> Image.Image:
+def _picture(
+    name: str,
+    faps: Float32,
+    size: tuple[int, int],
+    yaw_deg: float = 0.0,
+    framing: Framing = Framing.FACE,
+) -> Image.Image:
     head = Head.load(name)
-    view = camera(head, Framing.FACE, yaw_deg)
+    view = camera(head, framing, yaw_deg)
     renderer = Renderer(head, _SCALE * size[0], _SCALE * size[1], camera=view)
     drawn = Image.fromarray(renderer.draw(faps))
     renderer.close()

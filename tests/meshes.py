@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kouxing.services.driver.head.head import Head
 from tests.glb_writer import Mesh
 
-STIFF = ("hair_tips", "lashes")  # transparent parts, which these meshes omit
+STIFF = ("brows", "lashes")  # transparent parts that move, which these meshes omit
 
 
 def meshes(head: Head, shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:

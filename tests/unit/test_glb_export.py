@@ -92,7 +92,7 @@ def vrm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = tmp_path_factory.mktemp("vrm") / "woman.vrm"
     export_glb(heads.load("woman", "coarse"), path)
     document, _ = read_chunks(path)
-    assert document["extensionsUsed"] == ["VRMC_vrm"]
+    assert document["extensionsUsed"] == ["VRMC_vrm", "KHR_materials_clearcoat"]
     avatar = document["extensions"]["VRMC_vrm"]
     assert avatar["specVersion"] == "1.0"
     return {**document, "avatar": avatar}
@@ -125,3 +125,17 @@ def test_every_sent_weight_has_an_expression(vrm: dict[str, Any]) -> None:
             mesh = vrm["meshes"][vrm["nodes"][bind["node"]]["mesh"]]
             assert mesh["extras"]["targetNames"][bind["index"]] == name
         assert expression["morphTargetBinds"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", heads.NAMES)
+def test_a_head_is_small_and_has_soft_hair_and_fine_skin(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "head.glb"
+    export_glb(heads.load(name), path)
+    assert path.stat().st_size < 5_000_000
+    document, _ = read_chunks(path)
+    materials = {material["name"]: material for material in document["materials"]}
+    assert materials["hair"]["alphaMode"] == "MASK"
+    assert materials["lashes"]["alphaMode"] == materials["brows"]["alphaMode"] == "BLEND"
+    relief = document["textures"][materials["skin"]["normalTexture"]["index"]]
+    assert document["images"][relief["source"]]["name"] == "skin_normal"

@@ -1,8 +1,12 @@
-"""The geometry that builds the head: subdivision, zones, interpolation, clipping."""
+"""The geometry that builds the head: subdivision, and parts fitted to a head."""
+
+from pathlib import Path
 
 import numpy as np
+import pytest
 
-from kouxing.training.heads import subdivision
+from kouxing.shared.errors import UserError
+from kouxing.training.heads import fitted, subdivision
 
 CUBE = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
@@ -23,3 +27,50 @@ def test_catmull_clark_of_a_cube() -> None:
     np.testing.assert_allclose(np.abs(fine[:8]), 5 / 9)
     np.testing.assert_allclose(sorted(np.abs(fine[8])), [0, 0.75, 0.75])
     np.testing.assert_allclose(sorted(np.abs(fine[-1])), [0, 0, 1])
+
+
+OBJ = """v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+f 1/1 2/2 3/3 4/4
+f 2/2 3/1 4/4
+"""
+MHCLO = """x_scale 0 1 2.0
+y_scale 0 2 2.0
+z_scale 0 3 2.0
+verts 0
+material any.mhmat
+0
+1
+2
+0 1 2 0.5 0.25 0.25 0.5 0.0 -0.25
+"""
+
+
+def test_a_part_follows_the_head_that_it_is_fitted_to(tmp_path: Path) -> None:
+    (tmp_path / "part.obj").write_text(OBJ, encoding="utf-8")
+    (tmp_path / "part.mhclo").write_text(MHCLO, encoding="utf-8")
+    part = fitted.read(tmp_path, "part")
+    head = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0], [0, 0, 1]])
+    corners = part.fit(head)
+    assert len(corners) == 5  # the third vertex is split by the seam of the texture
+    assert len(np.unique(part.welds)) == 4
+    weighted = [1.0 + 0.5 * 4 / 2, 0.5, -0.25 * 1 / 2]
+    np.testing.assert_allclose(corners[np.argmin(part.weights[:, 0])], weighted)
+    shift = np.zeros((4, 3))
+    shift[2] = [0, 1, 0]
+    moved = part.carry(shift)[:, 1]
+    np.testing.assert_allclose(sorted(moved), [0, 0, 0.25, 1, 1])
+    triangle = part.only(np.array([False, True, False]))
+    assert len(triangle.triangles) == 1
+    assert len(triangle.fit(head)) == 3
+
+
+def test_a_missing_part_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"hair\.obj is missing"):
+        fitted.read(tmp_path, "hair")

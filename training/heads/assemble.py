@@ -1,20 +1,20 @@
 """Assemble a head.
 
-Every head is a shape of one mesh. Zones, texture, teeth, tongue and hair are laid out by hand on
-the reference head, in dm, and transferred to the same vertices of the other heads.
+Every head is a shape of one mesh. Zones, texture, teeth and tongue are laid out on the reference
+head, in dm, and transferred to the same vertices of the other heads. Hair, brows and lashes are
+fitted to each head.
 """
 
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import interpolate
+from scipy import interpolate, ndimage, spatial
 
-from kouxing.training.heads import paint, paint_parts, parts, subdivision
-from kouxing.training.heads.hair import coarse_locks, join
-from kouxing.training.heads.hair_styles import Crop
-from kouxing.training.heads.makehuman import FEATURE_POINTS, PIVOT, MakeHuman
+from kouxing.training.heads import fitted, paint, parts, subdivision, textures
+from kouxing.training.heads.makehuman import PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
+    eye_centers,
     eye_sockets,
     head_weight,
     lip_outline,
@@ -23,9 +23,9 @@ from kouxing.training.heads.measures import (
     neckline_height,
 )
 from kouxing.training.heads.occlusion import shade
-from kouxing.training.heads.paint_parts import encode
 from kouxing.training.heads.parts import HeadPiece, eye_pieces, teeth_pieces, tongue_piece, write
 from kouxing.training.heads.people import REFERENCE, Person, Shape
+from kouxing.training.heads.textures import encode
 from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivided
 
 Float = NDArray[np.float64]
@@ -49,13 +49,22 @@ LEFT_LOWER_LID = (
 
 
 _SIDES = ("Left", "Right")
+_PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
+_HAIR_TEXTURES = {"afro01": "afro"}
+# styles with a fringe over the right eye, and its distance from the head's axis at the side, dm
+_FRINGES = {"bob01": 0.73, "bob02": 0.73, "short03": 0.69}
+_SWEEP = 0.62  # share of the angle to the right ear by which it is turned
+_BROW_RAISE = 0.018  # of their inner ends, dm
+_HAIR_HEIGHT = 0.45  # above the scalp, dm
+_LASH_COLOR = (0.09, 0.07, 0.065)
 
 
 class Builder:
-    """Makes heads from MakeHuman's data."""
+    """Makes heads from MakeHuman's data; ``folder`` has its hair, brows, lashes, eyes and teeth."""
 
-    def __init__(self, source: MakeHuman) -> None:
+    def __init__(self, source: MakeHuman, folder: Path) -> None:
         self._source = source
+        self._folder = folder
         self._mesh = mesh = source.base_mesh()
         self._plain = self._shaped(*REFERENCE)
         middle = self._plain[mesh.quads].mean(axis=1)
@@ -69,6 +78,8 @@ class Builder:
         self._cavity = mouth_cavity(mesh, subdivided(self._plain, self._face))
         self.reference = self._skin(self._plain)
         self._map = self._face_map()
+        self._scalp = paint.scalp(self._map, textures.load(folder, _PAINTED_HAIR))
+        self._teeth = fitted.read(folder, "teeth/teeth_base/teeth_base")
 
     def _shaped(self, targets: Shape, face_units: Shape) -> Float:
         """Shape the mesh (19158, 3), and move its pivot to the common place."""
@@ -101,22 +112,31 @@ class Builder:
             for unit in ("eyeBlink", "eyeSquint")
         )
         face = FaceFields(self.reference, self._cavity, blink, squint, fapu).fields
+        hair = self._hair(vertices, person)
         pieces = [
-            self._skin_piece(skin, person, face),
+            self._skin_piece(skin, face),
             self._garment(vertices),
             *eye_pieces(vertices, self._mesh, fapu),
             *self._mouth_pieces(skin, fapu, person.raised),
-            *self._hair(skin, person),
-            self._lashes(skin, face, person.lashes),
+            self._brows(vertices, skin, face, person),
+            self._lashes(vertices, skin, face, person),
+            hair,
         ]
-        shade(pieces, self.reference.vertices, self._cavity, person.hair)
+        shade(pieces, self.reference.vertices, self._cavity)
         output.parent.mkdir(parents=True, exist_ok=True)
-        write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
+        write(
+            output,
+            pieces,
+            self._textures(person, skin, hair),
+            skin,
+            self._tongue,
+            fapu,
+            cel=person.look.cel,
+        )
 
-    def _skin_piece(self, skin: Skin, person: Person, fields: Fields) -> HeadPiece:
+    def _skin_piece(self, skin: Skin, fields: Fields) -> HeadPiece:
         layout = self.reference.vertices
-        covered = person.hair.hidden(layout) & ~self._cavity
-        covered |= layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
+        covered = layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
 
         def visible(quads: Index) -> Index:
             triangles = subdivision.triangles_of(quads)
@@ -176,69 +196,86 @@ class Builder:
         )
         corners = self.reference.points("8.3", "8.4")
         size = np.ptp(skin.vertices[corners, 0]) / np.ptp(self.reference.vertices[corners, 0])
-        pieces = [*teeth_pieces(fapu), tongue_piece(self._tongue, fapu)]
+        pieces = [*teeth_pieces(self._teeth, self._plain, fapu), tongue_piece(self._tongue, fapu)]
         for piece in pieces:
             piece.part.vertices = (piece.part.vertices - middle) * size + target
             if piece.name != "teeth_upper":
                 piece.part.vertices[:, 1] += raised
         return pieces
 
-    def _hair(self, skin: Skin, person: Person) -> list[HeadPiece]:
-        layout = self.reference.vertices
-        outer = np.flatnonzero((layout[:, 1] > 4.7) & ~self._cavity)[::5]
-        warp = interpolate.RBFInterpolator(
-            layout[outer], skin.vertices[outer] - layout[outer], neighbors=60, smoothing=1e-3,
-            kernel="linear",
-        )  # fmt: skip
-        pieces = []
-        for name, part in person.hair.parts(layout).items():
-            part.vertices = part.vertices + warp(part.vertices)
-            count = len(part.vertices)
-            # long locks need all their rows
-            is_short = name == "hair_tips" and isinstance(person.hair, Crop)
-            coarse = coarse_locks(count) if is_short else None
-            pieces.append(
-                HeadPiece(name, part, "hair", 0.7, np.ones(count), coarse_triangles=coarse)
-            )
-        return pieces
+    def _hair(self, vertices: Float, person: Person) -> HeadPiece:
+        """Fit the hair; its triangles run from the inside outward and from the back to the front.
 
-    def _lashes(self, skin: Skin, fields: Fields, length: float) -> HeadPiece:
-        """Make two ribbons of lashes along the edges of the upper eyelids."""
-        columns, rows = 25, 4
-        layout = self.reference.vertices[: len(skin.base)]
-        ribbons: list[parts.Geometry] = []
-        shifts: dict[int, list[Float]] = {fap: [] for fap in fields}
-        for side in (1.0, -1.0):
-            lid = skin.number[np.array(LEFT_LID)]
-            if side < 0:
-                mirror = layout[lid] * [-1, 1, 1]
-                lid = np.array([np.argmin(((layout - p) ** 2).sum(1)) for p in mirror])
-            edge = skin.vertices[lid]
-            length_along = np.concatenate(
-                [[0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))]
-            )
-            at = np.linspace(0.06, 1.0, columns) * length_along[-1]
-            root = interpolate.make_interp_spline(length_along, edge, 3)(at)
-            sideways = (np.linspace(-0.55, 1.0, columns) * side)[:, None] * [1.0, 0, 0]
-            out = np.array([0.0, 0.0, 1.0]) + 0.75 * sideways
-            grow = np.sin(np.pi * np.linspace(0.12, 0.80, columns))[:, None] * 0.060 * length
-            points = np.concatenate([
-                root
-                + grow * (t * out * 0.85 + np.array([0.0, 1.0, 0.0]) * (0.75 * t**2 - 0.10 * t))
-                for t in np.linspace(0, 1, rows)
-            ])  # fmt: skip
-            u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(1, 0, rows))
-            uv = np.stack([u.ravel(), v.ravel()], axis=1)
-            triangles = parts.grid_triangles(rows, columns)
-            ribbons.append(parts.Geometry(points, triangles, uv, np.ones_like(points)))
-            for fap, shift in fields.items():
-                moved = np.zeros((columns, 3))
-                if np.abs(shift[lid]).max() > 1e-6:
-                    moved = interpolate.make_interp_spline(length_along, shift[lid], 3)(at)
-                shifts[fap].append(np.tile(moved, (rows, 1)))
-        both = {fap: np.concatenate(halves) for fap, halves in shifts.items() if np.any(halves)}
-        part = join(ribbons)
-        return HeadPiece("lashes", part, "lashes", 0.9, np.ones(len(part.vertices)), both)
+        Outer strands therefore blend over inner ones.
+        """
+        hair = fitted.read(self._folder, f"hair/{person.hair}/{person.hair}")
+        points = hair.fit(vertices)
+        if person.hair in _FRINGES:
+            points = self._swept_aside(points, vertices, _FRINGES[person.hair])
+        middle = points[hair.triangles].mean(axis=1) - PIVOT
+        order = np.argsort(np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2])
+        color = textures.tint(person.look.hair)
+        part = parts.Geometry(
+            points, hair.triangles[order], hair.uv, np.tile(color, (len(points), 1)), hair.welds
+        )
+        return HeadPiece("hair", part, "hair", 0.6, np.ones(len(points)))
+
+    def _swept_aside(self, points: Float, vertices: Float, width: float) -> Float:
+        """Turn a fringe that covers the right eye to the side of the head."""
+        eye = eye_centers(vertices, self._mesh)[1]
+        x, y, z = points.T
+        depth = z - paint.AXIS_Z
+        turn = np.arctan2(x, depth)
+        low = np.clip((eye[1] + 0.55 - y) / 0.5, 0, 1)
+        low = low * low * (3 - 2 * low)
+        share = np.clip(turn + np.pi / 2, 0, None) * np.clip((0.6 - turn) / 0.6, 0, 1) * low
+        turned = turn - _SWEEP * share
+
+        def reach(angle: Float) -> Float:
+            return 1 / np.hypot(np.sin(angle) / width, np.cos(angle) / 1.0)
+
+        radius = np.hypot(x, depth) * reach(turned) / reach(turn)
+        swept = np.stack([radius * np.sin(turned), y, paint.AXIS_Z + radius * np.cos(turned)], 1)
+        return np.where((share > 0)[:, None], swept, points)
+
+    def _brows(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
+        """Fit the brows, and raise their inner ends; they follow the skin below them."""
+        brows = fitted.read(self._folder, f"eyebrows/{person.brows}/{person.brows}")
+        points = brows.fit(vertices)
+        inward = np.abs(points[:, 0])
+        inward = (inward.max() - inward) / np.ptp(inward)
+        raised = points + [0, 1, 0] * (_BROW_RAISE * inward[:, None])
+        front = skin.vertices[self._outer]
+        front = front[front[:, 2] > 0.6]
+        surface = interpolate.LinearNDInterpolator(front[:, :2], front[:, 2])
+        before, after = (surface(np.abs(at[:, 0]), at[:, 1]) for at in (points, raised))
+        points = raised + [0, 0, 1] * (after - before)[:, None]
+        rows = self.reference.number[brows.base]
+        shifts = {
+            fap: np.einsum("vk,vkd->vd", brows.weights, shift[rows])
+            for fap, shift in fields.items()
+            if np.abs(shift[rows]).max() > 1e-6
+        }
+        color = np.tile(textures.tint(person.look.brow), (len(points), 1))
+        part = parts.Geometry(points, brows.triangles, brows.uv, color, brows.welds)
+        return HeadPiece("brows", part, "brows", 0.9, np.ones(len(points)), shifts)
+
+    def _lashes(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
+        """Fit the lashes; they follow the face units of the eyelids, and the skin."""
+        lashes = fitted.read(self._folder, f"eyelashes/{person.lashes}/{person.lashes}")
+        points = lashes.fit(vertices)
+        shifts = {}
+        for unit, faps in (("eyeBlink", (19, 20)), ("eyeSquint", (21, 22))):
+            for side, fap in zip(_SIDES, faps, strict=True):
+                moved = self._source.face_unit(unit + side)
+                face = self.reference.carry(moved)
+                scale = (fields[fap] * face).sum() / (face * face).sum()
+                shifts[fap] = scale * lashes.carry(moved)
+        near = spatial.cKDTree(skin.vertices).query(points)[1]
+        shifts |= {fap: fields[fap][near] for fap in (27, 28)}
+        color = np.tile(textures.tint(_LASH_COLOR), (len(points), 1))
+        part = parts.Geometry(points, lashes.triangles, lashes.uv, color, lashes.welds)
+        return HeadPiece("lashes", part, "lashes", 0.9, np.ones(len(points)), shifts)
 
     def _face_map(self) -> paint.FaceMap:
         skin = self.reference
@@ -247,23 +284,56 @@ class Builder:
         outward = skin.vertices - [0, 0, paint.AXIS_Z]
         outward[:, 1] = 0
         outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6)
-        outer &= ~self._cavity
-        return paint.face_map(skin.vertices[outer], uv[outer])
+        self._outer = np.flatnonzero(outer & ~self._cavity)
+        return paint.face_map(skin.vertices[self._outer], uv[self._outer], self._skin_source())
 
-    def _textures(self, person: Person) -> dict[str, bytes]:
+    def _skin_source(self) -> Float:
+        """Return the coordinates (V, 2) of the outer vertices in MakeHuman's skin, v downward."""
+        mesh, skin = self._mesh, self.reference
+        is_left = self._plain[mesh.quads].mean(axis=1)[:, 0] > 0
+        body = mesh.group("body") & is_left
+        source = np.full((len(mesh.vertices), 2), np.nan)
+        source[mesh.quads[body]] = mesh.uv[mesh.uv_quads[body]]
+        coarse = source[skin.base]
+        known = np.isfinite(coarse[:, 0])
+        weight = skin.matrix[:, known]
+        rows = weight[self._outer]
+        values = (rows @ coarse[known]) / rows.sum(axis=1)[:, None]
+        return np.asarray(values * [1, -1] + [0, 1])
+
+    def _textures(self, person: Person, skin: Skin, hair: HeadPiece) -> dict[str, bytes]:
         look, plain = person.look, self._plain
-        brow = plain[[FEATURE_POINTS[name] for name in ("4.1", "4.3", "4.5")]][:, :2]
         upper, lower = (plain[np.array(edge)] for edge in (LEFT_LID, LEFT_LOWER_LID))
         low = np.interp(upper[:, 0], lower[:, 0], lower[:, 1])
         lid = np.stack([upper[:, 0], upper[:, 1], low], axis=1)
         lips = lip_outline(self.reference)
+
+        def load(name: str, size: int = 0) -> Float:
+            return textures.load(self._folder, name, size)
+
+        complexion = paint.resample(self._map, load(f"skins/textures/{person.skin}.png"), 3)
+        painted = paint.skin(self._map, lid, lips, look, complexion, self._roots(skin, hair))
+        brows, lashes, style = person.brows, person.lashes, person.hair
+        strands = load(f"hair/{style}/{_HAIR_TEXTURES.get(style, style)}_diffuse.png")
         return {
-            "skin": encode(paint.skin(self._map, brow, lid, lips, look, person.hair)),
-            "eye": encode(paint_parts.eye(look.iris, look.iris_size)),
-            "teeth_upper": encode(paint_parts.teeth(parts.UPPER_TEETH)),
-            "teeth_lower": encode(paint_parts.teeth(parts.LOWER_TEETH)),
-            "tongue": encode(paint_parts.tongue()),
-            "cloth": encode(paint_parts.cloth(look.cloth)),
-            "hair": encode(paint_parts.hair(look.hair)),
-            "lashes": encode(paint_parts.lashes()),
+            "skin": encode(painted),
+            "skin_normal": encode(textures.relief(painted)),
+            "eye": encode(textures.eye(load("large/brown_eye.png"), look.iris, look.iris_size)),
+            "teeth": encode(textures.teeth(load("large/teeth.png", 512))),
+            "tongue": encode(textures.tongue()),
+            "cloth": encode(textures.cloth(look.cloth)),
+            "hair": encode(textures.strands(strands, 0.5 if look.cel else 1.4)),
+            "brows": encode(
+                textures.hairs(load(f"eyebrows/{brows}/{brows}.png"), look.brow_strength)
+            ),
+            "lashes": encode(textures.hairs(load(f"eyelashes/{lashes}/{lashes}.png", 256), 1.0)),
         }
+
+    def _roots(self, skin: Skin, hair: HeadPiece) -> Float:
+        """Return the amount of hair on the scalp (H, W): where hair grows, and under the hair."""
+        strands = hair.part.vertices
+        points = np.concatenate([strands, strands[hair.part.triangles].mean(axis=1)])
+        tree = spatial.cKDTree(np.concatenate([points, points * [-1, 1, 1]]))
+        away, _ = tree.query(skin.vertices[self._outer])
+        near = np.clip((_HAIR_HEIGHT - away) / 0.15, 0, 1)
+        return np.asarray(self._scalp * ndimage.gaussian_filter(near[self._map.vertex], 8))

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.render.renderer import standalone_context
 from kouxing.training.heads import subdivision
-from kouxing.training.heads.hair_styles import Hair
 from kouxing.training.heads.measures import neckline_height
-from kouxing.training.heads.parts import HeadPiece
+from kouxing.training.heads.parts import Geometry, HeadPiece
 
 Float = NDArray[np.float64]
 
+_SKULL = np.array([0.0, 5.93, 0.42])  # its middle, dm
+_HIDDEN = 0.002  # fraction of the sphere that is visible from a hidden vertex, at most
 _SIZE = 512  # px
 _NUM_DIRECTIONS = 160
 _VERTEX = """
@@ -93,61 +94,76 @@ def _opened(piece: HeadPiece) -> Float:
     return vertices
 
 
-def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_], hair: Hair) -> None:
-    """Bake the ambient occlusion into the vertex colors of a head's pieces; the first is the skin.
+def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> None:
+    """Bake the ambient occlusion into the vertex colors of a head's pieces; skin is the first.
+
+    Hidden triangles of the teeth are removed.
 
     ``layout`` (V, 3) are the skin's vertices on the reference head, dm. ``cavity`` (V,) are those
     that line the mouth.
     """
-    solid = [p for p in pieces if p.name != "lashes"]
+    solid = [p for p in pieces if p.name not in ("lashes", "brows")]
     offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
     vertices = np.concatenate([_opened(p) for p in solid])
-    normals = np.concatenate(
-        [subdivision.vertex_normals(_opened(p), p.part.triangles) for p in solid]
-    )
+    normals = np.concatenate([_outward(p) for p in solid])
 
     def unhidden(with_hair: bool) -> Float:
         triangles = [
             p.part.triangles + first
             for p, first in zip(solid, offsets, strict=False)
-            if p.name != "hair_tips" and (with_hair or p.name != "hair")
+            if with_hair or p.name != "hair"
         ]
         return openness(vertices, normals, np.concatenate(triangles))
 
-    # thin hair at the face would cast jagged shadows
-    seen, seen_with_hair = unhidden(False), unhidden(True)
+    # strands let some light through
+    seen = 0.5 * unhidden(False) + 0.5 * unhidden(True)
     for piece, first in zip(solid, offsets, strict=False):
         part = piece.part
-        rows = slice(first, first + len(part.vertices))
-        under_hair = np.full(len(part.vertices), float(piece.name.startswith("hair")))
-        if piece.name == "skin":
-            under_hair = hair.shaded(layout)
-        light = (1 - under_hair) * seen[rows] + under_hair * seen_with_hair[rows]
-        light = np.clip(light, 0, 1)[:, None]
+        light = np.clip(seen[first : first + len(part.vertices)], 0, 1)[:, None]
         if piece.name == "skin":
             # the vertices behind the neckband are too sparse
             bare = np.clip((layout[:, 1:2] - neckline_height(layout[:, 2:]) - 0.02) / 0.22, 0, 1)
             light = bare * light + (1 - bare) * 0.55
             shaded = np.clip(0.10 + 1.0 * light, 0, 1) ** np.array([0.90, 1.0, 1.04])
-            # ears under hair are darker than the sparse vertices suggest
-            ear = np.clip((np.abs(layout[:, :1]) - 0.645) / 0.04, 0, 1)
-            shaded *= 1 - 0.6 * ear * np.clip(2 * under_hair[:, None] - 1, 0, 1)
             lining = np.array([0.55, 0.17, 0.16]) * _into_mouth(layout[:, 2])
-            part.colors = np.where(cavity[:, None], lining * (0.5 + 0.5 * shaded), shaded)
+            shaded = np.where(cavity[:, None], lining * (0.5 + 0.5 * shaded), shaded)
         elif piece.name == "garment":
-            part.colors = np.repeat(0.6 + 0.4 * light, 3, axis=1)
+            shaded = 0.6 + 0.4 * light
         elif piece.name.startswith("eye"):
-            lit = np.clip(
+            shaded = np.clip(
                 0.95 - 2.2 * (part.vertices[:, 1:2] - part.vertices[0, 1] - 0.005) / 0.1, 0.45, 1.0
             )
-            part.colors = np.repeat(lit, 3, axis=1)
-        elif piece.name.startswith("hair"):
-            part.colors = part.colors * (0.45 + 0.55 * light)
+        elif piece.name == "hair":
+            shaded = 0.40 + 0.60 * light
         elif piece.name.startswith("teeth"):
-            part.colors = part.colors * (0.80 + 0.20 * np.clip(2 * light, 0, 1))
-        elif piece.name == "tongue":
+            shaded = (0.5 + 0.5 * np.clip(2 * light, 0, 1)) * _along_teeth(part)
+        else:
             lit = np.clip(0.5 + 1.5 * light, 0, 1) * _into_mouth(part.vertices[:, 2] + 0.22)
-            part.colors = lit * np.array([1.0, 0.85, 0.85])
+            shaded = lit * np.array([1.0, 0.85, 0.85])
+        part.colors = part.colors * shaded
+        if piece.name.startswith("teeth"):
+            visible = seen[first : first + len(part.vertices)] > _HIDDEN
+            piece.keep(np.asarray(visible[part.triangles].any(axis=1)))
+
+
+def _outward(piece: HeadPiece) -> Float:
+    """Return normals (V, 3); those of hair point away from the skull."""
+    points = _opened(piece)
+    if piece.name != "hair":
+        return subdivision.vertex_normals(points, piece.part.triangles)
+    away = points - _SKULL
+    return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
+
+
+def _along_teeth(part: Geometry) -> Float:
+    """Return the fraction (V, 1) of the light on a row of teeth: less at the back and inside."""
+    front = part.vertices[:, 2].max()
+    back = (front - part.vertices[:, 2:]) / 0.45
+    outward = (part.vertices - [0, 0, front - 0.4]) * [1, 0, 1]
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    normals = subdivision.vertex_normals(part.vertices, part.triangles)
+    inside = np.clip(-1.5 * (normals * outward).sum(axis=1, keepdims=True), 0, 1)
+    return np.asarray(np.clip(1.0 - 0.95 * back**1.2, 0.06, 1.0) * (1 - 0.6 * inside))
 
 
 def _into_mouth(z: Float) -> Float:

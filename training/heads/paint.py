@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
-from kouxing.training.heads.hair_styles import Hair
-from kouxing.training.heads.paint_parts import Color, mix, noise
+from kouxing.training.heads.textures import Color, mix, noise
 
 Float = NDArray[np.float64]
 
@@ -38,15 +37,20 @@ class FaceMap:
     y: Float
     z: Float
     angle: Float
+    source: Float  # (2, H, W) row and column in MakeHuman's skin, 0 to 1
+    vertex: NDArray[np.int64]  # (H, W) the nearest vertex
 
 
-def face_map(vertices: Float, uv: Float) -> FaceMap:
-    """Interpolate positions from the outer skin's vertices to the texels."""
+def face_map(vertices: Float, uv: Float, source: Float) -> FaceMap:
+    """Interpolate from the outer skin's vertices (V, 3) of the left half to the texels.
+
+    ``source`` (V, 2) are their coordinates in MakeHuman's skin, with v downward.
+    """
     rows, columns = SKIN_SIZE
     v, u = np.meshgrid(
         (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
     )
-    values = np.abs(vertices)
+    values = np.concatenate([np.abs(vertices), source[:, ::-1]], axis=1)
     nearest = interpolate.NearestNDInterpolator(uv, values)
     linear = interpolate.LinearNDInterpolator(uv, values)(u, v)
     values = np.where(np.isfinite(linear), linear, nearest(u, v))
@@ -58,7 +62,27 @@ def face_map(vertices: Float, uv: Float) -> FaceMap:
         y=TOP_Y - v * (TOP_Y - BOTTOM_Y),
         z=values[..., 2],
         angle=np.interp(u, _COLUMNS, _ANGLES),
+        source=np.moveaxis(values[..., 3:], 2, 0),
+        vertex=spatial.cKDTree(uv).query(np.stack([u, v], axis=-1))[1],
     )
+
+
+def resample(face: FaceMap, texture: Float, order: int) -> Float:
+    """Move one of MakeHuman's skins (H, W, 3) to this texture's coordinates."""
+    at = face.source * (np.array(texture.shape[:2]) - 1)[:, None, None]
+    bands = [ndimage.map_coordinates(texture[..., k], at, order=order) for k in range(3)]
+    return np.asarray(np.clip(np.stack(bands, axis=2), 0, 1))
+
+
+def scalp(face: FaceMap, texture: Float) -> Float:
+    """Return where hair grows (H, W), 0 to 1, from a skin with painted black hair."""
+    light = resample(face, texture, 1).mean(axis=2)
+    dark = np.clip((0.50 - light) / 0.25, 0, 1)
+    groups, _ = ndimage.label(dark > 0.4)
+    largest = np.bincount(groups.ravel())[1:].argmax() + 1
+    dark *= ndimage.binary_dilation(groups == largest, iterations=12)
+    parting = ndimage.grey_closing(dark, (61, 61))
+    return np.asarray(np.where(face.y > 6.5, parting, dark))
 
 
 def _spot(
@@ -76,10 +100,9 @@ class Look:
     skin: Color = (0.890, 0.725, 0.625)
     lip: Color = (0.720, 0.405, 0.385)
     lip_strength: float = 0.80
-    hair: Color = (0.175, 0.130, 0.112)
-    brow: Color = (0.23, 0.165, 0.14)
-    brow_width: float = 1.0
-    brow_strength: float = 1.0
+    hair: Color = (0.180, 0.135, 0.115)
+    brow: Color = (0.19, 0.140, 0.12)
+    brow_strength: float = 1.3
     blush: float = 1.0
     stubble: float = 0.0
     age: float = 0.0  # wrinkles and spots
@@ -90,44 +113,46 @@ class Look:
     cel: bool = False  # cel shading: plain colors, light and shade
 
 
-def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: Hair) -> Float:
+def skin(
+    face: FaceMap, lid: Float, lips: Float, look: Look, complexion: Float, roots: Float
+) -> Float:
     """Paint the skin, sRGB (H, W, 3).
 
-    ``brow`` is the middle line of a brow (3, 2), x and y. ``lid`` and ``lips`` are outlines (N, 3):
-    x, upper and lower height. All run outward, in dm.
+    ``lid`` and ``lips`` are outlines (N, 3): x, upper and lower height; both run outward, in dm.
+    ``complexion`` (H, W, 3) is one of MakeHuman's skins, whose tone changes to the look's.
+    ``roots`` (H, W) is the amount of hair on the scalp.
     """
     shape = face.x.shape
-    image = np.broadcast_to(np.array(look.skin), (*shape, 3)).copy()
 
     def tone(red: float, green: float, blue: float) -> Color:
         """Tint the skin."""
         return red * look.skin[0], green * look.skin[1], blue * look.skin[2]
 
+    usual = (face.x < 0.45) & (face.y > 5.3) & (face.y < 6.3) & (face.angle < 1.2)
+    tones = complexion / np.median(complexion[usual], axis=0)
+    # MakeHuman's skin has a seam below the jaw, and stubble on the scalp
+    jaw = np.interp(face.angle, [0.0, 0.8, 1.3, 1.5, 1.7, 2.0], [4.95, 5.05, 5.20, 5.28, 5.4, 6.0])
+    kept = np.clip((face.y - jaw) / 0.15, 0, 1) * np.clip((6.45 - face.y) / 0.2, 0, 1)
+    tones = 1 + (tones - 1) * kept[..., None]
+    # the nostrils of MakeHuman's skin are larger than those of the heads
+    nose = np.clip(1.5 * _spot(face, 0.10, 5.38, 0.17, 0.13), 0, 1)[..., None]
+    tones += (ndimage.gaussian_filter(np.maximum(tones, 0.85), (18, 18, 0)) - tones) * nose
+    image = np.array(look.skin) * tones ** np.where(look.cel, 0.3, 0.85)
     blotch = noise(shape, 26, 1)
     # the texture is squeezed at the thin neck, where grain would become streaks
     grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1) * (not look.cel)
-    image *= 1 + 0.010 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
-    fine = 0.010 * noise(shape, 1.1, 2) + 0.006 * noise(shape, 3.5, 3)
+    image *= 1 + 0.012 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
+    fine = 0.012 * noise(shape, 1.1, 2) + 0.008 * noise(shape, 3.5, 3)
     image *= 1 + (grain * fine)[..., None]
     rosy = tone(1.01, 0.77, 0.80)
-    image = mix(image, rosy, 0.30 * look.blush * _spot(face, 0.42, 5.42, 0.20, 0.17))
-    image = mix(image, rosy, 0.16 * _spot(face, 0.0, 5.46, 0.10, 0.10))
-    image = mix(image, rosy, 0.10 * _spot(face, 0.0, 4.92, 0.16, 0.10))
-    ear = _spot(face, 0.76, 5.60, 0.06, 0.25, until=2.0) * (face.angle > 1.3)
-    image = mix(image, rosy, 0.20 * ear)
-    image = mix(image, tone(0.90, 0.83, 0.85), 0.22 * _spot(face, 0.28, 5.70, 0.13, 0.035))
-    image = mix(image, tone(0.88, 0.79, 0.82), 0.18 * _spot(face, 0.27, 5.885, 0.14, 0.05))
-    image = mix(image, tone(1.07, 1.10, 1.12), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
+    image = mix(image, rosy, 0.26 * look.blush * _spot(face, 0.42, 5.42, 0.20, 0.17))
     if look.stubble:
         image = _paint_stubble(image, face, look.stubble, tone(0.74, 0.79, 0.86), lips)
     if look.age:
         image = _paint_age(image, face, look.age)
     image = _paint_lips(image, face, lips, look)
     image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2], look.lash_line)
-    image = _paint_brow(image, face, brow, look)
-    ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
-    roots = hair.roots(face.x, face.y, face.z) + ragged
-    return np.clip(mix(image, look.hair, np.clip(roots + 0.3, 0, 1) ** 1.6), 0, 1)
+    return np.clip(mix(image, look.hair, roots), 0, 1)
 
 
 def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
@@ -214,54 +239,6 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, widt
     fold = np.exp(-(((height - 0.052) / 0.010) ** 2)) * inside
     below = np.interp(face.x, lid[:, 0], lower)
     rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
-    image = mix(image, (0.52, 0.31, 0.28), 0.45 * rim)
+    image = mix(image, (0.80, 0.55, 0.52), 0.45 * rim)  # the wet line
     image = mix(image, (0.16, 0.10, 0.09), 0.80 * line)
     return mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
-
-
-# a calm, friendly brow, from the nose outward: fraction of its length, height relative to the mean
-# of its feature points and half of its breadth, both in dm, and direction of its hairs relative to
-# its line, rad
-_BROW = np.array(
-    [
-        [0.00, -0.031, 0.014, 1.20],
-        [0.12, -0.026, 0.025, 1.00],
-        [0.38, -0.009, 0.026, 0.55],
-        [0.68, 0.007, 0.021, 0.25],
-        [0.88, 0.001, 0.012, 0.05],
-        [1.00, -0.011, 0.004, 0.00],
-    ]
-)
-
-
-def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
-    nose, temple = brow[0, 0] - 0.012, brow[-1, 0] + 0.015
-    line = interpolate.PchipInterpolator(_BROW[:, 0], _BROW[:, 1:])
-    near = (face.x > nose - 0.05) & (face.x < temple + 0.08) & (face.angle < 1.4)
-    near &= np.abs(face.y - brow[:, 1].mean()) < 0.14
-    x, y = face.x[near], face.y[near] - brow[:, 1].mean()
-    along = (x - nose) / (temple - nose)
-    middle, half, _ = line(np.clip(along, 0, 1)).T
-    half = half * look.brow_width
-    ends = np.clip((along + 0.06) / 0.28, 0, 1) * np.clip((1.03 - along) / 0.15, 0, 1)
-    ground = np.clip(1.25 - np.abs(y - middle) / half, 0, 1) * ends
-    rng = np.random.default_rng(5)
-    hairs = np.zeros(len(x))
-    for root in rng.uniform(0.0, 0.97, 230):
-        height, reach, lean = line(root)
-        reach *= look.brow_width
-        off = rng.uniform(-0.9, 0.7) * reach
-        slope = float(line(root, 1)[0]) / (temple - nose)
-        # hairs lean toward the line from above and below
-        turn = np.arctan(slope) + lean * (0.75 - 0.45 * off / reach) + rng.normal(0, 0.10)
-        length = rng.uniform(0.035, 0.060) * (0.6 + 0.4 * look.brow_width)
-        foot = np.array([nose + root * (temple - nose), height + off])
-        away = np.stack([x, y], axis=1) - foot
-        t = (away @ [np.cos(turn), np.sin(turn)]) / length
-        bend = away @ [-np.sin(turn), np.cos(turn)] + 0.006 * np.clip(t, 0, 1) ** 2
-        thin = 0.0026 * np.clip(1.15 - np.clip(t, 0, 1), 0, 1)
-        hair = np.clip(1.3 - np.abs(bend) / np.maximum(thin, 1e-4), 0, 1) * (t > 0) * (t < 1)
-        hairs = 1 - (1 - hairs) * (1 - 0.62 * hair)
-    amount = np.zeros(face.x.shape)
-    amount[near] = np.clip(0.34 * ground + 0.85 * hairs * np.clip(ends * 1.6, 0, 1), 0, 0.95)
-    return mix(image, look.brow, look.brow_strength * amount)

@@ -1,12 +1,11 @@
 """The pieces of a head, and the file that ``services.driver.head.head`` reads.
 
-Eyeballs and teeth are made here, because MakeHuman's base mesh lacks them or has them too coarse.
+Eyeballs are made here, because those of MakeHuman's base mesh are too coarse.
 
 All lengths are MakeHuman decimeters, y up, z toward the viewer, x to the subject's left.
 """
 
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import FORMAT
 from kouxing.training.heads import subdivision
+from kouxing.training.heads.fitted import Fitted
 from kouxing.training.heads.makehuman import FEATURE_POINTS, METERS_PER_UNIT, PIVOT, BaseMesh
 from kouxing.training.heads.measures import eye_centers, eye_radius
 from kouxing.training.heads.zones import Fields, Skin, jaw_fields, tongue_fields
@@ -31,6 +31,7 @@ class Geometry:
     triangles: Index  # (F, 3)
     uv: Float  # (V, 2), v downward as in glTF
     colors: Float  # (V, 3) linear factors on the texture
+    welds: Index | None = None  # (V,) the first vertex at each position, if a position has several
 
 
 def grid_triangles(rows: int, columns: int) -> Index:
@@ -74,87 +75,9 @@ def pupil_growth(part: Geometry, center: Float) -> Float:
     return np.asarray(weight[:, None] * outward / length)
 
 
-# widths in mm from the middle outward: incisors, canine, premolars, molars
-UPPER_TEETH = (8.4, 6.6, 7.4, 6.8, 6.6, 9.5, 9.0)
-LOWER_TEETH = (5.4, 5.8, 6.6, 6.9, 7.0, 10.0, 9.5)
-_TOOTH_COLUMNS = 6
-_ARCH_HALF_WIDTH, _ARCH_DEPTH = 0.300, 0.44  # of half an ellipse, dm
-# profile of a row of teeth from the front gum over the cutting edge to the back:
-# (outward, away from the edge, texture row)
-_PROFILE = np.array(
-    [
-        [-0.035, 0.185, 0.00],
-        [-0.004, 0.135, 0.16],
-        [0.006, 0.095, 0.32],
-        [0.006, 0.055, 0.48],
-        [0.000, 0.018, 0.62],
-        [-0.008, 0.002, 0.70],
-        [-0.022, 0.004, 0.76],
-        [-0.042, 0.045, 0.84],
-        [-0.060, 0.130, 1.00],
-    ]
-)
-
-
-def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: float) -> Geometry:
-    """Sweep the profile of a tooth along the dental arch.
-
-    ``widths`` are those of one half in mm, outward. The cutting edge of the front teeth is at
-    ``edge_y`` and ``front_z``. ``up`` is 1 if the gum is above the edge, -1 if below.
-    """
-    half = np.concatenate([[0.0], np.cumsum(widths)]) / 100.0
-    bounds = np.concatenate([-half[:0:-1], half])
-    place = np.concatenate(
-        [np.linspace(a, b, _TOOTH_COLUMNS, endpoint=False) for a, b in pairwise(bounds)]
-        + [bounds[-1:]]
-    )
-    phase = np.concatenate([np.tile(np.arange(_TOOTH_COLUMNS), 2 * len(widths)), [0]])
-    swell = np.sin(np.pi * phase / _TOOTH_COLUMNS)  # 0 between two teeth, 1 in the middle of one
-
-    # the arch: half an ellipse, parametrized by its length
-    angle = np.linspace(-np.pi / 2, np.pi / 2, 2001)
-    arch = np.stack([_ARCH_HALF_WIDTH * np.sin(angle), _ARCH_DEPTH * np.cos(angle)], axis=1)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(arch, axis=0), axis=1))])
-    length -= length[-1] / 2
-    at = np.interp(place, length, angle)
-    x, z = _ARCH_HALF_WIDTH * np.sin(at), front_z - _ARCH_DEPTH + _ARCH_DEPTH * np.cos(at)
-    outward = np.stack(
-        [np.sin(at) / _ARCH_HALF_WIDTH, np.zeros_like(at), np.cos(at) / _ARCH_DEPTH], axis=1
-    )
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-
-    back = np.abs(place) / half[-1]
-    rows = []
-    for out, away, _ in _PROFILE:
-        on_tooth = np.clip(1 - away / 0.1, 0, 1)
-        lift = away + 0.010 * (1 - swell) ** 2 * np.clip(1 - away / 0.03, 0, 1)
-        lift = lift + 0.012 * back**2  # the row rises toward the molars
-        push = out + 0.010 * (swell - 1) * (0.3 + on_tooth)
-        point = np.stack([x, edge_y + up * lift, z], axis=1) + outward * push[:, None]
-        rows.append(point)
-    vertices = np.concatenate(rows)
-    columns = len(place)
-    uv = np.stack(
-        [np.tile(place / half[-1] * 0.5 + 0.5, len(rows)), np.repeat(_PROFILE[:, 2], columns)],
-        axis=1,
-    )
-    triangles = grid_triangles(len(rows), columns)
-    if up > 0:
-        triangles = triangles[:, ::-1]
-    shade = np.clip(1.0 - 0.95 * np.tile(back, len(rows)) ** 1.2, 0.06, 1.0)
-    by_row = np.interp(_PROFILE[:, 2], [0.0, 0.3, 0.7, 1.0], [0.45, 0.9, 1.0, 0.4])
-    shade *= np.repeat(by_row, columns)
-    return Geometry(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))
-
-
-def middle_of_teeth(row: Geometry) -> tuple[int, int]:
-    """Find the vertices between the middle teeth, at the cutting edge and at the gum."""
-    columns = len(row.vertices) // len(_PROFILE)
-    edge = int(np.argmin(np.abs(_PROFILE[:, 1])))
-    return edge * columns + columns // 2, columns // 2
-
-
-TRANSPARENT = ("hair_tips", "lashes")
+_FIRST_UPPER_TOOTH = 15060  # vertex of the base mesh; the lower teeth come before
+_TEETH_DEPTH = 0.29  # of the rows; the molars behind are never seen
+TRANSPARENT = ("brows", "lashes", "hair")
 
 
 @dataclass(slots=True)
@@ -169,6 +92,26 @@ class HeadPiece:
     fields: Fields = field(default_factory=dict)  # FAP -> (V, 3), dm at 1 FAPU or 1 rad
     coarse_vertices: int = 0  # 0: there is only one level of detail
     coarse_triangles: Index | None = None
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Remove the other triangles (F,) of a piece without coarse ones, and unused vertices."""
+        part = self.part
+        used, triangles = np.unique(part.triangles[kept], return_inverse=True)
+        welds = _welds(part)[used]
+        _, first, same = np.unique(welds, return_index=True, return_inverse=True)
+        self.part = Geometry(
+            part.vertices[used],
+            triangles.reshape(-1, 3),
+            part.uv[used],
+            part.colors[used],
+            first[same],
+        )
+        self.head_weight = self.head_weight[used]
+        self.fields = {fap: shift[used] for fap, shift in self.fields.items()}
+
+
+def _welds(part: Geometry) -> Index:
+    return np.arange(len(part.vertices)) if part.welds is None else part.welds
 
 
 def write(
@@ -215,9 +158,10 @@ def write(
         if tongue.number[vertex] >= 0
     }
     points |= {"3.5": start["eye_left"], "3.6": start["eye_right"]}
-    for piece, edge, root in ((pieces[4], "9.10", "9.8"), (pieces[5], "9.11", "9.9")):
-        at_edge, at_root = middle_of_teeth(piece.part)
-        points |= {edge: start[piece.name] + at_edge, root: start[piece.name] + at_root}
+    for name, edge, root in (("teeth_upper", "9.10", "9.8"), ("teeth_lower", "9.11", "9.9")):
+        row = next(piece.part for piece in pieces if piece.name == name)
+        at_edge, at_root = middle_of_teeth(row, is_upper=name == "teeth_upper")
+        points |= {edge: start[name] + at_edge, root: start[name] + at_root}
     vertices = np.concatenate([p.part.vertices for p in pieces])
     fapu = {name: value * METERS_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
 
@@ -249,7 +193,8 @@ def write(
         "part_textures": np.array([p.texture for p in pieces]),
         "part_roughness": np.array([p.roughness for p in pieces]),
         "part_transparent": np.array([p.name in TRANSPARENT for p in pieces]),
-        "part_double_sided": np.array([p.texture in ("hair", "lashes") for p in pieces]),
+        "part_double_sided": np.array([p.name in TRANSPARENT for p in pieces]),
+        "welds": np.concatenate([_welds(p.part) + start[p.name] for p in pieces]).astype(np.uint16),
         "part_vertices": np.array(part_vertices),
         "part_triangles": np.array(part_triangles),
         "fapu_names": np.array(list(fapu)),
@@ -283,18 +228,35 @@ def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[
     return pieces
 
 
-def teeth_pieces(fapu: dict[str, float]) -> list[HeadPiece]:
-    """Make the upper and the lower teeth; the lower teeth move with the jaw."""
+def teeth_pieces(teeth: Fitted, vertices: Float, fapu: dict[str, float]) -> list[HeadPiece]:
+    """Make the upper and the lower teeth; the lower teeth move with the jaw.
+
+    ``vertices`` (19158, 3) is the base mesh's shape for which the mouth is laid out.
+    """
     pieces = []
-    for name, widths, edge, front, up in (
-        ("teeth_upper", UPPER_TEETH, 5.144, 1.238, 1.0),
-        ("teeth_lower", LOWER_TEETH, 5.146, 1.206, -1.0),
+    is_lower = teeth.base[teeth.triangles[:, 0], 0] < _FIRST_UPPER_TOOTH
+    depth = teeth.fit(vertices)[teeth.triangles, 2].mean(axis=1)
+    for name, in_row, edge, front in (
+        ("teeth_upper", ~is_lower, 5.162, 1.238),
+        ("teeth_lower", is_lower, 5.146, 1.206),
     ):
-        part = tooth_row(widths, edge, front, up)
-        still = np.ones(len(part.vertices))
-        fields = jaw_fields(part.vertices, still, fapu) if up < 0 else {}
-        pieces.append(HeadPiece(name, part, name, 0.35, still, fields))
+        row = teeth.only(in_row & (depth > depth[in_row].max() - _TEETH_DEPTH))
+        points = row.fit(vertices)
+        part = Geometry(points, row.triangles, row.uv, np.ones_like(points), row.welds)
+        middle = points[middle_of_teeth(part, is_upper=name == "teeth_upper")[0]]
+        part.vertices = points - [0, middle[1] - edge, middle[2] - front]
+        still = np.ones(len(points))
+        fields = jaw_fields(part.vertices, still, fapu) if name == "teeth_lower" else {}
+        pieces.append(HeadPiece(name, part, "teeth", 0.3, still, fields))
     return pieces
+
+
+def middle_of_teeth(row: Geometry, *, is_upper: bool) -> tuple[int, int]:
+    """Find the vertices between the middle teeth, at the cutting edge and at the gum."""
+    x, y, z = row.vertices.T
+    front = np.flatnonzero((np.abs(x) < 0.05) & (z > z.max() - 0.05))
+    order = front[np.argsort(y[front])]
+    return (int(order[0]), int(order[-1])) if is_upper else (int(order[-1]), int(order[0]))
 
 
 def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> HeadPiece:

@@ -11,9 +11,8 @@ either the FAPs or the ARKit shapes. The rotations (FAPs 23 to 26 and 48 to 50) 
   node combine as yaw * pitch * roll.
 
 Nodes: ``kouxing`` > ``body`` (joint) > ``garment``, ``head`` (joint) > ``eye_left``, ``eye_right``,
-``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``. ``skin`` is a
-mesh next to the root, skinned to both joints. Lengths are in meters, y is up, the face looks along
-z.
+``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``brows``, ``lashes``. ``skin`` is a mesh
+next to the root, skinned to both joints. Lengths are in meters, y is up, the face looks along z.
 
 ``extras.coarse`` of a mesh is an accessor of alternative indices for viewers without a graphics
 card: fewer triangles on the first vertices of the mesh. Transparent meshes have no coarse indices.
@@ -65,6 +64,7 @@ _ROTATION_OF = {
     49: ("head", (0, 1, 0)),
     50: ("head", (0, 0, 1)),
 }
+_HAIR_ALPHA_CUTOFF = 0.4
 _TURNS_EYES = np.isin(np.arange(1, NUM_FAPS + 1), (23, 24, 25, 26))
 
 
@@ -118,11 +118,17 @@ def export_glb(
     )
     if len(motion):
         _add_animation(document, nodes, motion, as_arkit=as_arkit)
+    avatar = {"VRMC_vrm": _vrm(document, head, nodes)} if is_avatar else {}
+    of_materials = {
+        name for entry in document.json["materials"] for name in entry.get("extensions", ())
+    }
+    used = [*avatar, *sorted(of_materials)]
     document.save(
         Path(path),
         scene=0,
         scenes=[{"name": head.name, "nodes": [nodes["kouxing"], *skinned], "extras": extras}],
-        **(_vrm_extension(document, head, nodes) if is_avatar else {}),
+        **({"extensionsUsed": used} if used else {}),
+        **({"extensions": avatar} if avatar else {}),
     )
 
 
@@ -137,7 +143,7 @@ def _add_skeleton(document: GlbDocument, nodes: dict[str, int]) -> None:
             entries[nodes[parent]].setdefault("children", []).append(nodes[bone])
 
 
-def _vrm_extension(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
+def _vrm(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
     """Return the VRM extension."""
     bindings: dict[str, list[tuple[int, int]]] = {morph.name: [] for morph in AVATAR_MORPHS}
     for number, node in enumerate(document.json["nodes"]):
@@ -146,8 +152,7 @@ def _vrm_extension(document: GlbDocument, head: Head, nodes: dict[str, int]) -> 
             for index, name in enumerate(names):
                 bindings[name].append((number, index))
     x, y, z = head.eye_centers.mean(axis=0).tolist()
-    extension = vrm.extension(head.name, nodes, bindings, (x, y, z), is_free=_is_built_in(head))
-    return {"extensionsUsed": ["VRMC_vrm"], "extensions": {"VRMC_vrm": extension}}
+    return vrm.extension(head.name, nodes, bindings, (x, y, z), is_free=_is_built_in(head))
 
 
 def _add_animation(
@@ -224,7 +229,9 @@ def _part_node(
     attributes = {
         "POSITION": document.accessor(vertices, "VEC3", bounds=True),
         "NORMAL": document.accessor(head.normals[part.vertices], "VEC3"),
-        "TEXCOORD_0": document.accessor(head.uv[part.vertices], "VEC2"),
+        "TEXCOORD_0": document.accessor(
+            np.round(head.uv[part.vertices] * 65535).astype(np.uint16), "VEC2", normalized=True
+        ),
         "COLOR_0": document.accessor(
             np.round(colors * 65535).astype(np.uint16), "VEC4", normalized=True
         ),
@@ -273,8 +280,17 @@ def _material(part: HeadPart, textures: dict[str, int]) -> dict[str, Any]:
         },
         "extras": {"kouxing": {"wrap": wrap, "gloss": gloss, "shine": shine}},
     }
-    if part.transparent:
+    if part.name == shaders.HAIR:  # blended triangles would need sorting
+        material |= {"alphaMode": "MASK", "alphaCutoff": _HAIR_ALPHA_CUTOFF}
+    elif part.transparent:
         material["alphaMode"] = "BLEND"
+    relief = textures.get(f"{part.texture}_normal")
+    if relief is not None:
+        material["normalTexture"] = {"index": relief}
+    if part.name in shaders.EYES:
+        material["extensions"] = {
+            "KHR_materials_clearcoat": {"clearcoatFactor": 1.0, "clearcoatRoughnessFactor": 0.03}
+        }
     if part.double_sided:
         material["doubleSided"] = True
     return material

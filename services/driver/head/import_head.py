@@ -296,7 +296,7 @@ class _Import:
                 thrust = np.tile([0.0, 0.0, fapu["ES"] / FAP_UNITS_PER_FAPU], (len(rows), 1))
                 fields.setdefault(26 + eye, np.zeros_like(self._welded))[rows] = thrust
             elif (
-                np.abs(middle[0] - lips[0]) < 0.5 * fapu["MW"]
+                np.abs(middle[0] - lips[0]) < 0.6 * fapu["MW"]
                 and high[2] < lips[2] + 0.1 * fapu["ES"]
                 and low[2] > lips[2] - 1.6 * fapu["ES"]
                 and size[0] < 1.5 * fapu["MW"]

@@ -13,7 +13,7 @@ Float32 = NDArray[np.float32]
 
 _ANGLE_UNITS_PER_WEIGHT = 1 / RADIANS_PER_ANGLE_UNIT  # a weight of 1 is 1 rad
 _MIN_FAP_SHIFT_M = 2e-5
-_MIN_SHIFT_M = 1e-4
+_MIN_SHIFT_M = 1.5e-4
 EMOTIONS = {"happy": "joy", "angry": "anger", "sad": "sadness", "surprised": "surprise"}
 
 

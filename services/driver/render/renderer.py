@@ -106,10 +106,11 @@ class Renderer:
         self._own_context = context is None
         self._on_screen = on_screen
         self._samples = min(samples, self._context.max_samples)
-        self._program, self._eye_program, self._backdrop_program = (
+        self._program, self._cutout_program, self._eye_program, self._backdrop_program = (
             self._context.program(vertex_shader=vertex, fragment_shader=fragment)
             for vertex, fragment in (
                 (shaders.VERTEX, shaders.FRAGMENT),
+                (shaders.VERTEX, shaders.CUTOUT_FRAGMENT),
                 (shaders.VERTEX, shaders.EYE_FRAGMENT),
                 (shaders.BACKDROP_VERTEX, shaders.BACKDROP),
             )
@@ -139,9 +140,8 @@ class Renderer:
         self._arrays = {}
         for part in head.parts:
             indices = context.buffer(head.triangles[part.triangles].tobytes())
-            program = self._eye_program if part.name in shaders.EYES else self._program
             self._arrays[part.name] = context.vertex_array(
-                program,
+                self._program_of(part),
                 [
                     (self._moving, "3f 3f", "in_position", "in_normal"),
                     (fixed_buffer, "2f 3f", "in_uv", "in_color"),
@@ -241,7 +241,7 @@ class Renderer:
         context = self._context
         target.use()
         matrix = tuple(self._camera.view_projection(*self.size).T.ravel())
-        for program in (self._program, self._eye_program):
+        for program in (self._program, self._cutout_program, self._eye_program):
             program["view_projection"] = matrix
             program["eye"] = self._camera.position
         for part in self.head.parts:
@@ -254,17 +254,26 @@ class Renderer:
         others = moderngl.ONE_MINUS_SRC_ALPHA
         factors: Any = (moderngl.SRC_ALPHA, others, moderngl.ONE, others)
         context.blend_func = factors
-        for part in self.head.parts:
-            if part.transparent:
-                self._draw_part(part)
+        # only hair hides what is behind it
+        veils = [part for part in self.head.parts if part.transparent]
+        for part in sorted(veils, key=lambda part: part.name != shaders.HAIR):
+            target.depth_mask = part.name == shaders.HAIR
+            self._draw_part(part)
+        target.depth_mask = True
+
+    def _program_of(self, part: HeadPart) -> Any:
+        if part.name in shaders.EYES:
+            return self._eye_program
+        return self._cutout_program if part.transparent else self._program
 
     def _draw_part(self, part: HeadPart) -> None:
-        program = self._eye_program if part.name in shaders.EYES else self._program
+        program = self._program_of(part)
         wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
             ("two_sided", part.double_sided),
-            ("strands", part.name in shaders.HAIR),
+            ("strands", part.name == shaders.HAIR),
+            ("cutoff", shaders.HAIR_CUTOFF if part.name == shaders.HAIR else shaders.CUTOFF),
             ("cel", self.head.cel and part.name not in shaders.EYES),
             ("share", self._mouth_light if part.name in shaders.IN_MOUTH else 1.0),
         ):  # fmt: skip

@@ -45,6 +45,11 @@ void main() {{
 }}
 """
 
+# Texels with little alpha are omitted, because they would hide what is drawn behind them later.
+CUTOUT_FRAGMENT = FRAGMENT.replace(
+    "color = vec4", "if (texel.a < cutoff) discard;\n    color = vec4"
+).replace("uniform sampler2D", "uniform float cutoff;\nuniform sampler2D")
+
 EYE_FRAGMENT = f"""
 #version 330
 {LIGHT}
@@ -83,7 +88,8 @@ void main() {
 
 EYES = ("eye_left", "eye_right")
 IN_MOUTH = ("teeth_upper", "teeth_lower", "tongue")  # receives light through the lips
-HAIR = ("hair", "hair_tips")  # vertical strands
+HAIR = "hair"  # vertical strands
+HAIR_CUTOFF, CUTOFF = 0.30, 0.02  # texels with less alpha are not drawn, in hair and elsewhere
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
 MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
@@ -94,8 +100,8 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "teeth_upper": ((0.4, 0.38, 0.36), 30.0, 1.2),
     "teeth_lower": ((0.4, 0.38, 0.36), 30.0, 1.2),
     "tongue": ((0.5, 0.3, 0.3), 14.0, 2.0),
-    "hair": ((0.3, 0.3, 0.3), 80.0, 0.22),
-    "hair_tips": ((0.3, 0.3, 0.3), 80.0, 0.22),
+    "hair": ((0.3, 0.3, 0.3), 50.0, 0.32),
+    "brows": ((0.5, 0.34, 0.29), 8.0, 0.0),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
 PLAIN = ((0.3, 0.3, 0.3), 14.0, 0.08)  # other parts

@@ -4,7 +4,8 @@
 import * as THREE from "three";
 
 const EYES = ["eye_left", "eye_right"];
-const HAIR = ["hair", "hair_tips"];
+const HAIR = "hair";
+const HAIR_CUTOFF = 0.3; // texels with less alpha are not drawn, as in the driver
 const UNKNOWN = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // for files without these values
 const LIGHT = await (await fetch("light.glsl")).text(); // shared with the driver
 
@@ -42,6 +43,9 @@ varying vec3 vFacing;
 
 void main() {
   vec4 texel = texture2D(map, vUv);
+  #ifdef HAIR
+    if (texel.a < HAIR) discard;
+  #endif
   #ifdef EYE
     float high = mirrored(normalize(vFacing), normalize(cameraPosition));
   #else
@@ -59,7 +63,7 @@ function lightUniforms(name, gltf, cel) {
     shine: { value: shine },
     share: { value: 1 },
     two_sided: { value: gltf.side === THREE.DoubleSide },
-    strands: { value: HAIR.includes(name) },
+    strands: { value: name === HAIR },
     cel: { value: cel },
   };
 }
@@ -70,7 +74,7 @@ export function plainMaterial(name, gltf, head, cel) {
   gltf.map.minFilter = THREE.LinearMipmapNearestFilter;
   const isEye = EYES.includes(name);
   return new THREE.ShaderMaterial({
-    defines: isEye ? { EYE: 1 } : {},
+    defines: isEye ? { EYE: 1 } : name === HAIR ? { HAIR: HAIR_CUTOFF } : {},
     uniforms: {
       map: { value: gltf.map },
       turn: { value: head.matrixWorld },
@@ -79,7 +83,7 @@ export function plainMaterial(name, gltf, head, cel) {
     vertexShader: PLAIN_VERTEX,
     fragmentShader: PLAIN_FRAGMENT,
     vertexColors: true,
-    ...surface(gltf),
+    ...surface(name, gltf),
   });
 }
 
@@ -91,7 +95,7 @@ const SHEEN = `vec3 light;
   light_vertex(inverseTransformDirection(normal, viewMatrix),
     inverseTransformDirection(normalize(vViewPosition), viewMatrix), vColor.rgb, light, high);
   totalEmissiveRadiance += high;`;
-const ADDED = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN, hair_tips: SHEEN };
+const ADDED = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN };
 
 /** Return a physical material for a part: subsurface scattering, wet eyes, glossy hair. */
 export function physicalMaterial(name, gltf) {
@@ -100,12 +104,14 @@ export function physicalMaterial(name, gltf) {
     vertexColors: true,
     roughness: gltf.roughness,
     metalness: 0,
-    ...surface(gltf),
+    normalMap: gltf.normalMap,
+    alphaTest: name === HAIR ? HAIR_CUTOFF : 0,
+    ...surface(name, gltf),
   });
   if (name === "skin") {
     Object.assign(material, { sheen: 0.25, sheenRoughness: 0.5, specularIntensity: 0.6 });
     material.sheenColor.set(0xffc8b0);
-  } else if (HAIR.includes(name)) {
+  } else if (name === HAIR) {
     Object.assign(material, { specularIntensity: 0.2, roughness: 0.6 });
   } else if (EYES.includes(name)) {
     Object.assign(material, { clearcoat: 0.3, clearcoatRoughness: 0.03, specularIntensity: 0.3 });
@@ -146,6 +152,7 @@ export function setLight(material, share) {
 /** Free the memory of a material and its texture. */
 export function release(material) {
   (material.map ?? material.uniforms?.map.value)?.dispose();
+  material.normalMap?.dispose();
   material.dispose();
 }
 
@@ -172,6 +179,7 @@ export function studioEnvironment(renderer) {
   return texture;
 }
 
-function surface({ side, transparent, depthWrite }) {
-  return { side, transparent, depthWrite };
+/** Hair has soft edges, and hides what is behind it. Its triangles are in the order of blending. */
+function surface(name, { side, transparent, depthWrite }) {
+  return { side, transparent: transparent || name === HAIR, depthWrite };
 }
