@@ -10,16 +10,15 @@ f        a position: its two log-mel frames, and the ear's features    (160 + ea
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
 h        state of the gated recurrent unit, driven by u               (units,)
-l        the ear's own lips, the last of its features                 (lips,)
 y        for each delay the FAPs, and log odds of closure and of      (delays, 17)
          lip to teeth
 ======== ============================================================ ==================
 
-    y = A l + B [h, u] + c
+    y = A f + B [h, u] + c
 
-The ear's lips come from many voices, so they follow unseen speakers better, and have the larger
-share of the FAPs. B [h, u] follows the filmed speakers more closely. Closures come only from
-B [h, u]. Their odds are doubled, because a missed closure is more visible than a false one.
+A contains the ear's own lips, the last of its features. They come from many voices, so they follow
+unseen speakers better, and have the largest share of the FAPs. A also contains linear regressions
+to the lips of filmed speakers. B [h, u] follows these speakers more closely.
 
 There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen
 the audio up to T gives, for every delay d, the mouth at T - d. Every position is one step, so
@@ -75,7 +74,7 @@ class LipPredictor:
     input_bias: Floats  # (3 units,)
     state_weights: Floats  # (units, 3 units)
     state_bias: Floats  # (3 units,)
-    lip_weights: Floats  # (lips, delays, 17): A
+    lip_weights: Floats  # (last features, delays, 17): A; those of the others are 0
     output_weights: Floats  # (2 units, delays, 17): B
     output_bias: Floats  # (delays, 17): c
 
@@ -89,7 +88,7 @@ class LipPredictor:
         return {}
 
     def weights_of(self, delays: Sequence[int]) -> tuple[Floats, Floats]:
-        """Return A and B for some delays, (lips, delays 17), (2 units, delays 17).
+        """Return A and B for some delays, (features, delays 17), (2 units, delays 17).
 
         Streams with the same delays share them.
         """

@@ -1,7 +1,8 @@
 """From clips of tracked lips to the lip model.
 
     clips -> [small ear] -> principal components -> recurrent network with each speaker's units
-                         -> the ear's own lips   -> weighted mean
+                         -> features             -> linear regressions
+                         -> the ear's own lips   -> weighted mean of the three
 
 The recipe trains on every clip that is not held out and whose license allows it. These clips do not
 determine any setting. Each clip is used twice, unchanged and augmented. Clips of small sources
@@ -28,6 +29,7 @@ from kouxing.services.recognizer.lip_predictor import (
     LipPredictor,
 )
 from kouxing.shared.errors import UserError
+from kouxing.training.lips.linear import fit_linear
 from kouxing.training.lips.positions import Speech, components_of, features_of, speech_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
@@ -44,14 +46,17 @@ NUM_EPOCHS = 12
 # Whisper's encoder, lips); number of their components; extent of the first component and the last
 # one. Late components mostly describe the speaker, so they get less weight.
 COMPONENTS = ((160, 32, 0.5, 0.5), (128, 96, 1.0, 0.2), (128, 96, 1.0, 0.2), (51, 51, 2.0, 0.5))
-_EAR_SHARE = 0.65  # of the ear's lips in the FAPs
+# Shares of the FAPs: the ear's lips, linear regression, recurrent network. Chosen on four speakers
+# without clips in training.
+_EAR_SHARE, _LINEAR_SHARE, _NETWORK_SHARE = 0.5, 0.3, 0.2
+_LINEAR_CLOSURE = 0.85  # share of a closure's log odds; the rest is the network's
 _MAX_REPEATS = 6  # of the clips of a small source
 _NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
-_MISSED_CLOSURE = 2.0  # cost of a missed closure, false closures
+_CLOSURE_BIAS = (0.055, 0.155), (0.1, 0.7)  # by delay, added to the log odds of a closure
 # Predictions vary less than real lips, most of all in width. These factors correct about half of
 # that, at no cost in correlation.
-_EXTENT_FACTOR, _WIDTH_FACTOR = 1.2, 1.3
+_EXTENT_FACTOR, _WIDTH_FACTOR = 1.2, 1.5
 _WIDTH_FAPS = (6, 53)
 
 
@@ -104,13 +109,14 @@ def train_lips(
     targets = _targets(load_model(), filmed, closed_below(clips))
     basis = basis_of(trained_on, targets)
     repeats = repeats_by_source(used)
+    counts = [repeats[stretch.clip.source] for stretch in filmed]
     examples = [
         example
-        for stretch, example in zip(filmed, examples_of(filmed, targets, basis), strict=True)
-        for _ in range(repeats[stretch.clip.source])
+        for count, example in zip(counts, examples_of(filmed, targets, basis), strict=True)
+        for _ in range(count)
     ]
     network, losses = train_network(examples, num_epochs=NUM_EPOCHS, seed=seed)
-    lips = joined(basis, network)
+    lips = joined(basis, network, *fit_linear(filmed, targets, counts))
     lips.save(output)
     write_card(
         output,
@@ -207,11 +213,12 @@ def standardize(target: Floats, units: Units) -> Floats:
     return np.concatenate([faps, target[..., _NUM_FAPS:]], axis=-1).astype(np.float32)
 
 
-def joined(basis: Basis, network: LipNetwork) -> LipPredictor:
-    """Combine the network with the ear's lips; closure and lip to teeth come from the network.
+def joined(
+    basis: Basis, network: LipNetwork, linear_weights: Array, linear_bias: Array
+) -> LipPredictor:
+    """Combine the network with the linear part (see ``fit_linear``) and the ear's lips.
 
-    The FAPs are scaled around their means. The log odds of a closure are raised, so that closures
-    are predicted where this costs least (Bayes decision).
+    Lip to teeth comes from the network. The FAPs are scaled around their means.
     """
     weights = {name: value.numpy() for name, value in network.state_dict().items()}
     units, shape = basis.units, (len(DELAYS_S), NUM_OUTPUTS)
@@ -219,16 +226,21 @@ def joined(basis: Basis, network: LipNetwork) -> LipPredictor:
     scale[:_NUM_FAPS] = units.extent * _EXTENT_FACTOR
     width = [LIP_FAPS.index(fap) for fap in _WIDTH_FAPS]
     scale[width] = units.extent[width] * _WIDTH_FACTOR
-    share = scale.copy()
-    share[:_NUM_FAPS] *= 1 - _EAR_SHARE
+    of_network, of_linear = scale.copy(), scale.copy()
+    of_network[:_NUM_FAPS] *= _NETWORK_SHARE
+    of_network[CLOSURE] = 1 - _LINEAR_CLOSURE
+    of_linear[:_NUM_FAPS] *= _LINEAR_SHARE
+    of_linear[CLOSURE] = _LINEAR_CLOSURE
     ear = np.zeros((len(LIP_DELAYS_S), NUM_OUTPUTS, *shape))
     for fap in range(_NUM_FAPS):
         for number, delay_weights in enumerate(np.eye(len(LIP_DELAYS_S))):
             ear[number, fap, :, fap] = np.interp(DELAYS_S, LIP_DELAYS_S, delay_weights)
-    bias = weights["output.bias"].reshape(shape) * share
+    linear = linear_weights * of_linear
+    linear[-ear[..., 0, 0].size :] += _EAR_SHARE * scale * ear.reshape(-1, *shape)
+    bias = weights["output.bias"].reshape(shape) * of_network + linear_bias * of_linear
     bias[:, :_NUM_FAPS] += units.mean
-    bias[:, CLOSURE] += np.log(_MISSED_CLOSURE)
-    output = weights["output.weight"].T.reshape(-1, *shape) * share
+    bias[:, CLOSURE] += np.interp(DELAYS_S, *_CLOSURE_BIAS)
+    output = weights["output.weight"].T.reshape(-1, *shape) * of_network
     return LipPredictor(
         delays=np.array(DELAYS_S, np.float32),
         feature_mean=basis.mean,
@@ -239,7 +251,7 @@ def joined(basis: Basis, network: LipNetwork) -> LipPredictor:
         input_bias=weights["recurrent.bias_ih_l0"],
         state_weights=np.ascontiguousarray(weights["recurrent.weight_hh_l0"].T),
         state_bias=weights["recurrent.bias_hh_l0"],
-        lip_weights=(_EAR_SHARE * scale * ear.reshape(-1, *shape)).astype(np.float32),
+        lip_weights=linear.astype(np.float32),
         output_weights=output.astype(np.float32),
         output_bias=bias.astype(np.float32),
     )

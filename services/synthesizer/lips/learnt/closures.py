@@ -44,7 +44,7 @@ class ClosureRule:
     """
 
     sound: float = 2.0  # added to the predictor's log odds, because it misses closures
-    phone: float = 2.2  # maximum log odds added by a closing phone
+    phone: float = 4.0  # maximum log odds added by a closing phone
     other: float = 0.0  # maximum log odds subtracted by another phone
     vowel: float = 0.0  # factor of the log odds subtracted by a vowel between two closing phones
     doubt: float = 0.8  # log odds around 0 at which lips close partly
