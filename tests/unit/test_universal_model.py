@@ -26,6 +26,7 @@ from tests.unit.test_block_model import (
     BLOCK,
     FRAMES,
     HELLO,
+    LENGTH,
     SCALE,
     blocks,
     networks,
@@ -50,16 +51,19 @@ def extended() -> BlockModel:
     return replace(blocks(), network=np.concatenate([blocks().network, extension]))
 
 
-def test_the_second_readout_agrees_with_pytorch() -> None:
+@pytest.mark.parametrize("hop", [1, 2])
+def test_the_second_readout_agrees_with_pytorch(hop: int) -> None:
     encoder, _ = networks()
-    laid = layout(len(FRAMES) // 2, BLOCK)
+    laid = layout(len(FRAMES) // 2, hop * BLOCK, LENGTH - hop * BLOCK)
     repeated = torch.from_numpy(np.concatenate([FRAMES, FRAMES[-1:]]))[None]
     with torch.no_grad():
         hidden = encoder(repeated, laid)
         features = torch.cat([hidden[..., :32], hidden[..., -32:]], dim=-1)
         expected = readout().read(features, laid)[0, : len(FRAMES) // 2].flatten(0, 1).numpy()
-    scores = scores_of(extended(), FRAMES)
-    num_alike = len(FRAMES) - 2 * (BLOCK + 10)  # with a complete right context
+    stream = extended().create_stream()
+    stream.set_hop(hop)
+    scores = np.concatenate([stream.score(frame[None]) for frame in FRAMES])
+    num_alike = len(FRAMES) - 2 * LENGTH  # with a complete right context
     wanted = SCALE * (expected - blocks().log_prior)
     np.testing.assert_allclose(scores[:num_alike], wanted[:num_alike], atol=0.05)
 
@@ -130,3 +134,13 @@ def test_sessions_of_two_languages_share_a_recognizer() -> None:
     assert symbols <= {*load_inventory("universal").phones}
     with pytest.raises(UserError, match="'tlh' is not installed"):
         recognizer.create_stream(language="tlh")
+
+
+def test_the_shipped_model_keeps_the_state_after_the_kept_positions() -> None:
+    model = load_model("universal")
+    assert isinstance(model, BlockModel)
+    stream = model.create_stream()
+    stream.append_frames(FRAMES[:100])
+    block = stream.block()
+    first, second = (model.session.run([replace(block, num_kept=num)])[1] for num in (2, 4))
+    assert not np.array_equal(first, second)

@@ -75,7 +75,7 @@ Float16 = NDArray[np.float16]
 _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # before the caches
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 # Constants of the file that become inputs: the number of kept positions, and the last of them.
-_KEPT = integer_inputs({"block": 1, "last_of_block": 0})
+_NUM_KEPT, _LAST_KEPT = "block", "last_of_block"
 EXTENSION = "universal_"  # before the names of a second readout's input and outputs
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
@@ -175,7 +175,11 @@ class BlockRunner:
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
         self.run_s = 0.0  # processor time spent in the network so far
-        self._session = open_session(file, _KEPT)
+        content = file.tobytes()
+        names = (_LAST_KEPT, f"{EXTENSION}{_LAST_KEPT}")  # a second readout may have its own
+        self._last_kept = [name for name in names if name.encode() in content]
+        axes = {_NUM_KEPT: 1, **dict.fromkeys(self._last_kept, 0)}
+        self._session = open_session(file, integer_inputs(axes))
         self.sizes, self._first_state = _sizes_of(self._session)
         self._names = _cache_names(self.sizes.layers)
         prefix = EXTENSION if self._first_state else ""
@@ -202,8 +206,8 @@ class BlockRunner:
             "num_positions": np.array([block.num_positions for block in blocks]),
             "num_cached": np.array([block.past.num_cached for block in blocks]),
             self._state: np.stack([block.past.state for block in blocks]),
-            "block": np.array([num_kept]),
-            "last_of_block": np.array(num_kept - 1),
+            _NUM_KEPT: np.array([num_kept]),
+            **dict.fromkeys(self._last_kept, np.array(num_kept - 1)),
         }
         for ring, name in enumerate(self._names):
             of_sessions = [block.past.rings[ring] for block in blocks]

@@ -46,9 +46,10 @@ class NetworkModel(AcousticModel):
 def integer_inputs(num_axes: Mapping[str, int]) -> bytes:
     """Return bytes to append to an ONNX file. They make integer constants inputs of the graph.
 
-    ``num_axes`` has the axes of each constant, by name; each axis has length 1. Concatenated
-    messages of Protocol Buffers are merged, so the bytes add inputs to the file's graph. An input
-    with the name of a constant replaces it in a run (ONNX IR, "Graphs").
+    ``num_axes`` has the axes of each constant, by name; each axis has length 1. All inputs together
+    need less than 128 bytes. Concatenated messages of Protocol Buffers are merged, so the bytes add
+    inputs to the file's graph. An input with the name of a constant replaces it in a run (ONNX IR,
+    "Graphs").
     """
 
     def field(number: int, content: bytes) -> bytes:
