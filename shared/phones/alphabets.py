@@ -1,16 +1,21 @@
 """Phones in other alphabets: IPA, and ARPABET for English."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from enum import StrEnum
 from functools import cache
 from itertools import chain
+from typing import TYPE_CHECKING
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone
+
+if TYPE_CHECKING:  # it needs NumPy, which commands import only if they need it
+    from kouxing.shared.phones.events import Phone
 
 _ENGLISH = "english"
 _TOUCHING_S = 0.011  # phones of a diphthong have no gap
