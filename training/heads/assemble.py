@@ -117,7 +117,7 @@ class Builder:
             self._skin_piece(skin, face),
             self._garment(vertices),
             *eye_pieces(vertices, self._mesh, fapu),
-            *self._mouth_pieces(skin, fapu, person.raised),
+            *self._mouth_pieces(skin, fapu, person),
             self._brows(vertices, skin, face, person),
             self._lashes(vertices, skin, face, person),
             hair,
@@ -189,7 +189,7 @@ class Builder:
         )
         return HeadPiece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
 
-    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], raised: float) -> list[HeadPiece]:
+    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], person: Person) -> list[HeadPiece]:
         lips = ("2.2", "2.3")
         middle, target = (
             one.vertices[one.points(*lips)].mean(axis=0) for one in (self.reference, skin)
@@ -199,8 +199,8 @@ class Builder:
         pieces = [*teeth_pieces(self._teeth, self._plain, fapu), tongue_piece(self._tongue, fapu)]
         for piece in pieces:
             piece.part.vertices = (piece.part.vertices - middle) * size + target
-            if piece.name != "teeth_upper":
-                piece.part.vertices[:, 1] += raised
+            is_upper = piece.name == "teeth_upper"
+            piece.part.vertices[:, 1] += person.tucked if is_upper else person.raised
         return pieces
 
     def _hair(self, vertices: Float, person: Person) -> HeadPiece:

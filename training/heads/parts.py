@@ -237,7 +237,7 @@ def teeth_pieces(teeth: Fitted, vertices: Float, fapu: dict[str, float]) -> list
     is_lower = teeth.base[teeth.triangles[:, 0], 0] < _FIRST_UPPER_TOOTH
     depth = teeth.fit(vertices)[teeth.triangles, 2].mean(axis=1)
     for name, in_row, edge, front in (
-        ("teeth_upper", ~is_lower, 5.162, 1.238),
+        ("teeth_upper", ~is_lower, 5.144, 1.238),
         ("teeth_lower", is_lower, 5.146, 1.206),
     ):
         row = teeth.only(in_row & (depth > depth[in_row].max() - _TEETH_DEPTH))

@@ -19,6 +19,7 @@ class Person:
     brows: str
     lashes: str = "eyelashes01"
     raised: float = 0.0  # offset of tongue and lower teeth, dm
+    tucked: float = 0.0  # offset of the upper teeth, dm, so that u and o differ
 
 
 def _both(name: str, amount: float) -> Shape:
@@ -124,6 +125,7 @@ PEOPLE = {
         skin="young_lightskinned_male_diffuse3",
         hair="short02",
         brows="eyebrow001",
+        tucked=0.0060,
     ),
     "ada": Person(
         targets=(("macrodetails/african-female-young", 1.0), ("mouth/mouth-trans-down", 0.5),
@@ -155,6 +157,7 @@ PEOPLE = {
         hair="short03",
         brows="eyebrow012",
         raised=0.012,
+        tucked=0.0222,
     ),
     "rosa": Person(
         targets=(("macrodetails/caucasian-female-old", 1.0), ("eyebrows/eyebrows-angle-up", 0.6),
@@ -168,6 +171,7 @@ PEOPLE = {
         hair="ponytail01",
         brows="eyebrow010",
         raised=0.015,
+        tucked=0.0207,
     ),
     "mika": Person(
         targets=(("macrodetails/asian-female-young", 0.5),
@@ -188,5 +192,6 @@ PEOPLE = {
         skin="young_lightskinned_female_diffuse",
         hair="bob01",
         brows="eyebrow001",
+        tucked=0.0165,
     ),
 }  # fmt: skip
