@@ -15,21 +15,23 @@ from functools import partial
 
 from kouxing.services.recognizer.acoustic.languages import LANGUAGES_OF_MODELS
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.audio_intake import AudioIntake
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.live_batches import MAX_BATCH_S, MIN_TOGETHER, LiveBatches
 from kouxing.services.recognizer.load_numba import load_numba
-from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
+from kouxing.services.recognizer.resumption import Chunk
+from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
-from kouxing.shared.overload import MAX_HOP, NetworkPace, Work
 from kouxing.shared.phones.events import Progress, SpeechChange, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
@@ -41,16 +43,12 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge
 
-MAX_BATCH_S = 0.3  # of audio that is decoded together
-MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
 MAX_QUEUED_S = 60.0  # of live audio; further audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, and in total
 MAX_UNPACED_S = 0.06  # of unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # between ticks while a session is open
 STEP_S = 0.002  # between steps with several sessions, to process their audio together
-MIN_TOGETHER, MAX_TOGETHER = 4, 4  # sessions
-NETWORK_WEIGHT = 0.25  # of the block network's time in the load of the service
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
@@ -67,12 +65,13 @@ class RecognizerService(Service):
         self._unpaced = UnpacedAudio()
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
         self._max_behind_s = config.max_behind_s
-        self._unpaced_work = Work()  # so far
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
         self._stepped_s = 0.0
         self._stalls_checked_s = time.monotonic()
-        self._synthesizers: dict[str, Socket] = {}  # by endpoint
+        self._synthesizers = SynthesizerSockets(
+            self, {Acknowledge: self._on_acknowledge, Error: self.on_error}
+        )
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio", role="client")
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones", self._on_joined)
         self._unpaced_audio = self.bus.bind_router(
@@ -92,8 +91,15 @@ class RecognizerService(Service):
         self.languages = [*LANGUAGES_OF_MODELS]
         self._lip_predictor = lip_predictor or load_lip_predictor()
         self._recognizer.warm_up()
-        self._network = NetworkThread(self._recognizer, self.waker.wake)
-        self._pace = NetworkPace(self._work(), time.monotonic())
+        self._live = LiveBatches(
+            self._recognizer,
+            self.busy,
+            self.waker.wake,
+            on_early=self._send_results,
+            on_decoded=self._send_decoded,
+            on_batch=self.send_heartbeat_if_due,
+        )
+        self._intake = AudioIntake(self, self._on_chunk, self._on_end)
         for socket in (self._audio, self._unpaced_audio):
             self.register(socket, {AudioChunk: partial(self._on_audio, socket)})
         self.register(self._phones, {})
@@ -107,7 +113,7 @@ class RecognizerService(Service):
         has_unpaced = bool(self._unpaced) and not self._is_unpaced_blocked
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
         self._read_late_audio()
-        self._decode_live([*self._sessions.values()])
+        self._live.decode([*self._sessions.values()], is_alone=self._is_alone)
         is_live_waiting = self._has_live_audio or (
             not self._is_live_blocked and self._audio.wait(0.0)
         )
@@ -161,11 +167,12 @@ class RecognizerService(Service):
             self._sessions[start.session] = session
         if is_new or session.start.epoch != start.epoch:
             session.start = start
-            socket = self._connect(start.endpoints["phone_input"])
+            socket = self._synthesizers.connect(start.endpoints["phone_input"])
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
             if not is_new:  # the new synthesizer must receive the stalled state
                 session.without_audio_s = 0.0
-            self._close_unused_synthesizers()
+            used = {one.start.endpoints["phone_input"] for one in self._sessions.values()}
+            self._synthesizers.close_unused(used)
         return True
 
     def stop_session(self, session: str) -> None:
@@ -180,7 +187,7 @@ class RecognizerService(Service):
         """Drop the current speech; the next audio starts again."""
         flushed = self._sessions.get(session)
         if flushed is not None:
-            self._decode_all_live([flushed])
+            self._live.decode_all([flushed], is_alone=self._is_alone)
             self._unpaced.drop(flushed, keep_end=True)
             flushed.link.forget()
             flushed.without_audio_s = 0.0  # so that the face learns of a stalled client again
@@ -198,7 +205,7 @@ class RecognizerService(Service):
         self._report_stalled(now_s)
         blocked = set()
         for session in self._sessions.values():
-            self._accept_in_order(session, session.order.tick(now_s), session.client)
+            self._intake.accept_in_order(session, session.order.tick(now_s), session.client)
             session.acknowledge_if_due(now_s)
             self.metrics.count("resent", session.link.tick(now_s))
             if session.link.check_overdue(now_s):
@@ -225,7 +232,7 @@ class RecognizerService(Service):
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
         sessions = self._sessions.values()
-        self._decode_all_live([*sessions])
+        self._live.decode_all([*sessions], is_alone=self._is_alone)
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
         while self._unpaced:
@@ -253,74 +260,27 @@ class RecognizerService(Service):
         return {
             "queued_audio_seconds": self._live_audio_s + self._unpaced.duration_s,
             "unacknowledged_messages": max(backlogs, default=0),
-            "network_hop": self._pace.hop,
+            "network_hop": self._live.hop,
             "light_sessions": sum(session.stream.is_light for session in self._sessions.values()),
         }
 
     # --- audio -----------------------------------------------------------------------------------
 
     def _on_audio(self, socket: Socket, message: AudioChunk, sender: Peer) -> None:
-        session = self._sessions.get(message.session)
-        try:
-            if session is None:
-                text = f"session {message.session!r} is not open here; open it at control"
-                raise AudioRejected(ErrorCode.UNKNOWN_SESSION, text)
-            session.check_sender(message, socket)
-        except AudioRejected as rejection:
-            self._reject(socket, message, sender, rejection)
-            return
-        if 0 < message.epoch < session.first_epoch:  # sent to the recognizer before this one
-            self.metrics.count("other_epoch")
-            return
-        now_s = time.monotonic()
-        session.client = sender
-        if message.sequence <= session.order.last:
-            self.metrics.count("repeated")
-            in_order = []
+        self._intake.receive(self._sessions.get(message.session), socket, message, sender)
+
+    def _on_chunk(self, session: RecognizerSession, chunk: Chunk) -> None:
+        if session.start.paced:
+            session.audio.append(chunk, time.monotonic())
         else:
-            session.on_new_audio(now_s)
-            in_order = session.order.push(message, now_s)
-        self._accept_in_order(session, in_order, sender)
-        if message.acknowledge:  # at once if the client resends or must fill a gap
-            at_once = not in_order or session.is_finished
-            session.request_acknowledgement(now_s, at_once=at_once)
-
-    def _accept_in_order(
-        self, session: RecognizerSession, messages: Iterable[AudioChunk], sender: Peer
-    ) -> None:
-        """Accept messages in order; a rejected one counts as received."""
-        for message in messages:
-            try:
-                session.check_open(message)
-            except AudioRejected as rejection:
-                self._reject(session.socket, message, sender, rejection)
-                continue
-            if message.pcm or not message.last:
-                self._accept_chunk(session, message, sender)
-            if message.last:
-                session.end = message
-                if not session.start.paced:
-                    self._unpaced.append(session, None)
-                elif not session.is_decoding:
-                    self._finish(session)
-
-    def _accept_chunk(self, session: RecognizerSession, message: AudioChunk, sender: Peer) -> None:
-        if error := session.mouth_profile_error:
-            session.mouth_profile_error = ""
-            rejection = AudioRejected(ErrorCode.BAD_MOUTH_PROFILE, error)
-            self._reject(session.socket, message, sender, rejection)
-        try:
-            chunk = session.read_chunk(message, time.monotonic())
-        except AudioRejected as rejection:
-            self._reject(session.socket, message, sender, rejection)
-            return
-        if chunk is None:
-            return
-        if not session.start.paced:
             self._unpaced.append(session, chunk)
             self._limit_unpaced()
-            return
-        session.audio.append(chunk, time.monotonic())
+
+    def _on_end(self, session: RecognizerSession) -> None:
+        if not session.start.paced:
+            self._unpaced.append(session, None)
+        elif not session.is_decoding:
+            self._finish(session)
 
     @property
     def _has_live_audio(self) -> bool:
@@ -345,57 +305,10 @@ class RecognizerService(Service):
                 return
             self.handle_messages(self._audio)
 
-    def _decode_all_live(self, sessions: Sequence[RecognizerSession]) -> None:
-        """Decode all queued audio of live sessions."""
-        while any(session.is_decoding for session in sessions):
-            self._network.start(time.monotonic())
-            self._network.wait()
-            self._decode_live(sessions)
-
-    def _decode_live(self, sessions: Sequence[RecognizerSession]) -> None:
-        """Decode a part of the queued audio of live sessions; skip audio that is too old.
-
-        The thread of the block network continues with sessions that need the network. Meanwhile,
-        their further audio waits. Under load, their lips do not.
-        """
-        # Under load, the network runs at the longest hop, and on another core.
-        network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
-        if decoded := self._network.take_decoded():
-            self.busy.add(network_weight * self._network.batch_s)
-            self._send_decoded(decoded)
-        sessions = [session for session in sessions if session.audio and not session.is_scoring]
-        now_s = time.monotonic()
-        if sessions:
-            is_behind = any(session.audio.overload.is_behind for session in sessions)
-            self._pace.update(self._work() - self._unpaced_work, now_s, is_behind=is_behind)
-        part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
-        for begin in range(0, len(sessions), MAX_TOGETHER):  # the first ones do not wait for all
-            group = sessions[begin : begin + MAX_TOGETHER]
-            for session in group:
-                session.accept_waveform(part_s, now_s, self._pace.hop)
-            self._recognizer.hear_streams([session.stream for session in group])
-            if len(self._sessions) > 1:
-                self._decode([session for session in group if not self._waits_for_network(session)])
-            else:  # no other session waits
-                network_s = self._recognizer.network_s
-                self._decode(group)
-                self.busy.add((network_weight - 1.0) * (self._recognizer.network_s - network_s))
-        self._network.start(now_s, saves_time=self._pace.hop > 1)
-        self.send_heartbeat_if_due()
-
-    def _waits_for_network(self, session: RecognizerSession) -> bool:
-        """Let a session wait for the block network if it needs it; under load, send its lips."""
-        if not self._recognizer.needs_network(session.stream):
-            return False
-        if self._pace.hop > 1:
-            session.stream.decode_early()
-            self._send_results(session)
-        self._network.add(session, time.monotonic())
-        return True
-
-    def _work(self) -> Work:
-        network_s = self._recognizer.network_s
-        return Work(network_s, time.thread_time() + self._network.work_s - network_s)
+    @property
+    def _is_alone(self) -> bool:
+        """Whether there is only one session."""
+        return len(self._sessions) <= 1
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode the accepted audio of some sessions."""
@@ -433,7 +346,7 @@ class RecognizerService(Service):
 
     def _decode_unpaced(self) -> None:
         """Decode some unpaced audio, and finish the sessions whose audio ends."""
-        before = self._work()
+        before = self._live.work
         batch: dict[str, RecognizerSession] = {}
         for session, chunk in self._unpaced.take(self._max_unpaced_s):
             if chunk is not None:
@@ -447,7 +360,7 @@ class RecognizerService(Service):
         if batch:
             self._decode([*batch.values()])
         self._limit_unpaced()
-        self._unpaced_work += self._work() - before
+        self._live.unpaced_work += self._live.work - before
 
     def _finish(self, session: RecognizerSession) -> None:
         if not session.is_finished:
@@ -460,16 +373,6 @@ class RecognizerService(Service):
             LOG.info("end of audio", extra={"session": session.name})
 
     # --- messages --------------------------------------------------------------------------------
-
-    def _reject(
-        self, socket: Socket, message: AudioChunk, sender: Peer, rejection: AudioRejected
-    ) -> None:
-        text = str(rejection)
-        self.warn(rejection.code, text, message.session)
-        error = Error(
-            session=message.session, media_time=message.media_time, code=rejection.code, text=text
-        )
-        socket.send(error, to=sender)
 
     def _send_results(self, session: RecognizerSession) -> None:
         """Send new results to the subscribers, the synthesizer and control.
@@ -499,18 +402,6 @@ class RecognizerService(Service):
         joined = self._sessions.get(session)
         if joined is not None:
             joined.replay.repeat(time.monotonic())
-
-    def _connect(self, endpoint: str) -> Socket:
-        if endpoint not in self._synthesizers:
-            socket = self.bus.connect_dealer(endpoint)
-            self._synthesizers[endpoint] = socket
-            self.register(socket, {Acknowledge: self._on_acknowledge, Error: self.on_error})
-        return self._synthesizers[endpoint]
-
-    def _close_unused_synthesizers(self) -> None:
-        used = {session.start.endpoints["phone_input"] for session in self._sessions.values()}
-        for endpoint in self._synthesizers.keys() - used:
-            self.unregister(self._synthesizers.pop(endpoint))
 
     def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
         session = self._sessions.get(ack.session)

@@ -1,12 +1,14 @@
-"""A session's messages to its synthesizer.
+"""A session's messages to its synthesizer, and the sockets to synthesizers.
 
 A new synthesizer in place of a lost one must continue the face. It gets the newest frame that was
 published, and the messages of the last seconds again.
 """
 
 from collections import deque
+from collections.abc import Set as AbstractSet
 
 from kouxing.shared.clock import to_samples
+from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import is_report
@@ -94,3 +96,25 @@ class SynthesizerLink:
     def tick(self, now_s: float) -> int:
         """Resend messages that were not acknowledged in time; return their number."""
         return self._sender.tick(now_s) if self._sender is not None else 0
+
+
+class SynthesizerSockets:
+    """One socket for each synthesizer. The loop passes its messages to the handlers."""
+
+    def __init__(self, loop: MessageLoop, handlers: dict[type[Message], Handler]) -> None:
+        self._loop = loop
+        self._handlers = handlers
+        self._sockets: dict[str, Socket] = {}  # by endpoint
+
+    def connect(self, endpoint: str) -> Socket:
+        """Return the socket of an endpoint."""
+        if endpoint not in self._sockets:
+            socket = self._loop.bus.connect_dealer(endpoint)
+            self._sockets[endpoint] = socket
+            self._loop.register(socket, self._handlers)
+        return self._sockets[endpoint]
+
+    def close_unused(self, used: AbstractSet[str]) -> None:
+        """Close the sockets of all other endpoints."""
+        for endpoint in self._sockets.keys() - used:
+            self._loop.unregister(self._sockets.pop(endpoint))

@@ -8,7 +8,8 @@ from itertools import pairwise
 import pytest
 
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.service import MAX_BATCH_S, MAX_UNPACED_S, RecognizerService
+from kouxing.services.recognizer.live_batches import MAX_BATCH_S
+from kouxing.services.recognizer.service import MAX_UNPACED_S, RecognizerService
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
@@ -47,7 +48,7 @@ class Recognizer(RecognizerService):
 
     def decode_all(self) -> None:
         while self._has_live_audio:
-            self._decode_live([*self._sessions.values()])
+            self._live.decode([*self._sessions.values()], is_alone=self._is_alone)
         while self._unpaced:
             self._decode_unpaced()
             self.send_heartbeat_if_due()

@@ -1,0 +1,102 @@
+"""Checks the audio messages of clients, puts them in order, and reports rejected ones."""
+
+import time
+from collections.abc import Callable, Iterable
+
+from kouxing.services.recognizer.resumption import Chunk
+from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
+from kouxing.shared.keys import Peer
+from kouxing.shared.message_loop import MessageLoop
+from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.session import Error, ErrorCode
+
+
+class AudioIntake:
+    """Accepts the audio of sessions.
+
+    Parameters
+    ----------
+    loop
+        Counts and logs problems.
+    on_chunk
+        Called with each chunk of valid audio, in order.
+    on_end
+        Called when the last chunk of a session has arrived.
+    """
+
+    def __init__(
+        self,
+        loop: MessageLoop,
+        on_chunk: Callable[[RecognizerSession, Chunk], None],
+        on_end: Callable[[RecognizerSession], None],
+    ) -> None:
+        self._loop = loop
+        self._on_chunk, self._on_end = on_chunk, on_end
+
+    def receive(
+        self, session: RecognizerSession | None, socket: Socket, message: AudioChunk, sender: Peer
+    ) -> None:
+        """Process a client's message. Without an open session, reject it."""
+        try:
+            if session is None:
+                text = f"session {message.session!r} is not open here; open it at control"
+                raise AudioRejected(ErrorCode.UNKNOWN_SESSION, text)
+            session.check_sender(message, socket)
+        except AudioRejected as rejection:
+            self._reject(socket, message, sender, rejection)
+            return
+        if 0 < message.epoch < session.first_epoch:  # sent to the recognizer before this one
+            self._loop.metrics.count("other_epoch")
+            return
+        now_s = time.monotonic()
+        session.client = sender
+        if message.sequence <= session.order.last:
+            self._loop.metrics.count("repeated")
+            in_order = []
+        else:
+            session.on_new_audio(now_s)
+            in_order = session.order.push(message, now_s)
+        self.accept_in_order(session, in_order, sender)
+        if message.acknowledge:  # at once if the client resends or must fill a gap
+            at_once = not in_order or session.is_finished
+            session.request_acknowledgement(now_s, at_once=at_once)
+
+    def accept_in_order(
+        self, session: RecognizerSession, messages: Iterable[AudioChunk], sender: Peer
+    ) -> None:
+        """Accept messages in order; a rejected one counts as received."""
+        for message in messages:
+            try:
+                session.check_open(message)
+            except AudioRejected as rejection:
+                self._reject(session.socket, message, sender, rejection)
+                continue
+            if message.pcm or not message.last:
+                self._accept_chunk(session, message, sender)
+            if message.last:
+                session.end = message
+                self._on_end(session)
+
+    def _accept_chunk(self, session: RecognizerSession, message: AudioChunk, sender: Peer) -> None:
+        if error := session.mouth_profile_error:
+            session.mouth_profile_error = ""
+            rejection = AudioRejected(ErrorCode.BAD_MOUTH_PROFILE, error)
+            self._reject(session.socket, message, sender, rejection)
+        try:
+            chunk = session.read_chunk(message, time.monotonic())
+        except AudioRejected as rejection:
+            self._reject(session.socket, message, sender, rejection)
+            return
+        if chunk is not None:
+            self._on_chunk(session, chunk)
+
+    def _reject(
+        self, socket: Socket, message: AudioChunk, sender: Peer, rejection: AudioRejected
+    ) -> None:
+        text = str(rejection)
+        self._loop.warn(rejection.code, text, message.session)
+        error = Error(
+            session=message.session, media_time=message.media_time, code=rejection.code, text=text
+        )
+        socket.send(error, to=sender)

@@ -1,0 +1,115 @@
+"""Decodes the live audio of all sessions in batches; the block network runs on a thread."""
+
+import time
+from collections.abc import Callable, Sequence
+
+from kouxing.services.recognizer.network_thread import NetworkThread
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.shared.metrics import LoadMeter
+from kouxing.shared.overload import MAX_HOP, NetworkPace, Work
+
+MAX_BATCH_S = 0.3  # of audio that is decoded together
+MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
+MIN_TOGETHER, MAX_TOGETHER = 4, 4  # sessions
+NETWORK_WEIGHT = 0.25  # of the block network's time in the load of the service
+
+
+class LiveBatches:
+    """Decodes live audio, at the hop of the block network that the load allows.
+
+    Parameters
+    ----------
+    recognizer
+        Decodes the streams of the sessions.
+    busy
+        Load of the service, without most of the network's time.
+    wake
+        Called on the network's thread when sessions are decoded.
+    on_early
+        Called with a session whose lips are ready before its phones.
+    on_decoded
+        Called with the decoded sessions.
+    on_batch
+        Called after each batch.
+    """
+
+    def __init__(
+        self,
+        recognizer: Recognizer,
+        busy: LoadMeter,
+        wake: Callable[[], None],
+        on_early: Callable[[RecognizerSession], None],
+        on_decoded: Callable[[Sequence[RecognizerSession]], None],
+        on_batch: Callable[[], None],
+    ) -> None:
+        self._recognizer = recognizer
+        self._busy = busy
+        self._on_early, self._on_decoded, self._on_batch = on_early, on_decoded, on_batch
+        self._network = NetworkThread(recognizer, wake)
+        self.unpaced_work = Work()  # part of ``work`` that is not for live audio
+        self._pace = NetworkPace(self.work, time.monotonic())
+
+    @property
+    def hop(self) -> int:
+        """The current hop of the block network, in blocks."""
+        return self._pace.hop
+
+    @property
+    def work(self) -> Work:
+        """The work of the service so far."""
+        network_s = self._recognizer.network_s
+        return Work(network_s, time.thread_time() + self._network.work_s - network_s)
+
+    def decode_all(self, sessions: Sequence[RecognizerSession], *, is_alone: bool) -> None:
+        """Decode all queued audio of sessions."""
+        while any(session.is_decoding for session in sessions):
+            self._network.start(time.monotonic())
+            self._network.wait()
+            self.decode(sessions, is_alone=is_alone)
+
+    def decode(self, sessions: Sequence[RecognizerSession], *, is_alone: bool) -> None:
+        """Decode a part of the queued audio of sessions; skip audio that is too old.
+
+        The thread of the block network continues with sessions that need the network. Meanwhile,
+        their further audio waits. Under load, their lips do not. If a session ``is_alone`` in the
+        service, no other one waits, so it does not need the thread.
+        """
+        # Under load, the network runs at the longest hop, and on another core.
+        network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
+        if decoded := self._network.take_decoded():
+            self._busy.add(network_weight * self._network.batch_s)
+            self._on_decoded(decoded)
+        sessions = [session for session in sessions if session.audio and not session.is_scoring]
+        now_s = time.monotonic()
+        if sessions:
+            is_behind = any(session.audio.overload.is_behind for session in sessions)
+            self._pace.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
+        part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
+        for begin in range(0, len(sessions), MAX_TOGETHER):  # the first ones do not wait for all
+            group = sessions[begin : begin + MAX_TOGETHER]
+            for session in group:
+                session.accept_waveform(part_s, now_s, self._pace.hop)
+            self._recognizer.hear_streams([session.stream for session in group])
+            if is_alone:
+                network_s = self._recognizer.network_s
+                self._decode(group)
+                self._busy.add((network_weight - 1.0) * (self._recognizer.network_s - network_s))
+            else:
+                self._decode([session for session in group if not self._waits_for_network(session)])
+        self._network.start(now_s, saves_time=self._pace.hop > 1)
+        self._on_batch()
+
+    def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
+        self._recognizer.decode_streams([session.stream for session in sessions])
+        self._on_decoded(sessions)
+
+    def _waits_for_network(self, session: RecognizerSession) -> bool:
+        """Let a session wait for the block network if it needs it; under load, send its lips."""
+        if not self._recognizer.needs_network(session.stream):
+            return False
+        if self._pace.hop > 1:
+            session.stream.decode_early()
+            self._on_early(session)
+        self._network.add(session, time.monotonic())
+        return True
