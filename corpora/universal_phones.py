@@ -7,7 +7,7 @@ column       content
 ============ =====================================================================================
 phones_path  table of the labels of a recording of the Berlin EmoDB, made by hand (``emodb.tsv``)
 ipa          IPA, with spaces between words
-arpabet      ARPABET without stress (``arpabet.tsv``)
+arpabet      ARPABET without stress
 pinyin       Mandarin
 text         text in the language of the column ``language``, an ISO 639-1 code. ``yue``: jyutping
 ============ =====================================================================================
@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.alphabets import phones_of_arpabet
 from kouxing.shared.phones.inventory import (
     BUILT_IN,
     SILENCE,
@@ -85,14 +86,14 @@ def _by_code() -> dict[str, PhoneInventory]:
 
 
 @cache
-def _table(name: str) -> dict[str, Syllable]:
-    rows = read_table("kouxing.corpora", f"{name}.tsv")
+def _emodb() -> dict[str, Syllable]:
+    rows = read_table("kouxing.corpora", "emodb.tsv")
     return {row["symbol"]: tuple((row["phones"] or "").split()) for row in rows}
 
 
-def _known(table: str, symbol: str) -> Syllable:
+def _known(table: dict[str, Syllable], symbol: str) -> Syllable:
     try:
-        return _table(table)[symbol]
+        return table[symbol]
     except KeyError:
         raise UserError(f"unknown symbol {symbol!r}") from None
 
@@ -106,7 +107,7 @@ def _ipa_phones(word: str) -> Syllable:
 
 def _english_phones(symbols: list[str]) -> list[str]:
     """Return the phones of ARPABET. p t k are aspirated before a vowel, but not after s."""
-    phones = [phone for symbol in symbols for phone in _known("arpabet", symbol)]
+    phones = [phone for symbol in symbols for phone in _known(phones_of_arpabet(), symbol)]
     vowels = load_inventory("english").vowels
     return [
         phone + _ASPIRATED if phone in _STOPS and after in vowels and before != "s" else phone
@@ -130,7 +131,7 @@ def labeled_phones(path: Path) -> list[tuple[float, str]]:
         if symbol == before and symbol != label:
             phones[-1] = end_s, phones[-1][1]
         else:
-            parts = _known("emodb", symbol) or (SILENCE,)
+            parts = _known(_emodb(), symbol) or (SILENCE,)
             step_s = (end_s - start_s) / len(parts)
             phones += [(start_s + step_s * n, part) for n, part in enumerate(parts, start=1)]
         before = symbol

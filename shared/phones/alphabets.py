@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.inventory import PhoneInventory, Syllable, load_inventory
 from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone
 
@@ -90,6 +90,12 @@ def _in_arpabet(phones: Iterable[Phone]) -> Iterator[Phone]:
 
 
 @cache
-def _arpabet() -> dict[tuple[str, ...], str]:
+def phones_of_arpabet() -> dict[str, Syllable]:
+    """Return the universal phones of each symbol of ARPABET."""
+    return {symbol: phones for phones, symbol in reversed(_arpabet().items())}
+
+
+@cache
+def _arpabet() -> dict[Syllable, str]:
     rows = read_table(f"kouxing.shared.phones.{_ENGLISH}", "arpabet.tsv")
     return {tuple(row["phones"].split()): row["arpabet"] for row in rows}
