@@ -3,7 +3,7 @@
 A folder has a ``manifest.tsv`` with the columns ``path``, ``speaker``, ``licence``, ``seconds`` and
 ``note``. The note of such a recording contains ``emotion NAME``, for example *emotion anger*. The
 optional column ``phones_path`` names a table with the columns ``start_s`` and ``marks``. The marks
-1, 2 and 3 are those of stressed vowels.
+1, 2 and 3 denote stressed vowels.
 """
 
 import csv
@@ -32,8 +32,8 @@ _MAX_BYTES = 16 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class SpokenEmotion:
-    """A recording, with its emotion if the manifest names one."""
+class EmotionRecording:
+    """A recording and its emotion, if the manifest names one."""
 
     path: Path
     speaker: str
@@ -43,7 +43,7 @@ class SpokenEmotion:
     stressed_s: tuple[float, ...] = ()  # starts of stressed vowels, if phone times are given
 
 
-def read_emotions(folder: Path, *, shipping: bool = False) -> list[SpokenEmotion]:
+def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecording]:
     """Read the list of a folder; ``UserError`` if it is missing or names no known emotion.
 
     ``shipping`` excludes recordings whose license does not allow distributing a model.
@@ -56,7 +56,7 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[SpokenEmotion
         for row in rows:
             match = _EMOTION.search(row["note"])
             emotion = match[1] if match and match[1] in FEELINGS else None
-            recording = SpokenEmotion(
+            recording = EmotionRecording(
                 folder / row["path"],
                 row["speaker"],
                 row["licence"],
@@ -85,6 +85,6 @@ def _stressed(path: Path) -> tuple[float, ...]:
     )
 
 
-def speakers_of(recordings: Sequence[SpokenEmotion]) -> list[str]:
+def speakers_of(recordings: Sequence[EmotionRecording]) -> list[str]:
     """Return the speakers in alphabetical order."""
     return sorted({recording.speaker for recording in recordings})

@@ -62,7 +62,7 @@ class Utterance:
     seconds: float = 0.0
     phones: tuple[int, ...] = ()  # indices into the inventory's phones
     syllables: tuple[int, ...] = ()  # number of phones in each syllable
-    labels: Path | None = None  # table of universal phones with times, made by hand
+    labels: Path | None = None  # table of hand-labeled universal phones with times
 
     @property
     def minutes(self) -> float:

@@ -1,11 +1,11 @@
-"""Universal phones of the rows of a manifest, in any language.
+"""Finds the universal phones of the rows of a manifest, in any language.
 
 The first of these columns that a row has gives its phones:
 
 ============ =====================================================================================
 column       content
 ============ =====================================================================================
-phones_path  table of the labels of a recording of the Berlin EmoDB, made by hand (``emodb.tsv``)
+phones_path  table of the hand-made labels of a recording of the Berlin EmoDB (``emodb.tsv``)
 ipa          IPA, with spaces between words
 arpabet      ARPABET without stress
 pinyin       Mandarin
@@ -75,7 +75,7 @@ def universal_words(row: dict[str, str]) -> list[Syllable]:
 
 
 def has_labels(row: dict[str, str]) -> bool:
-    """Return whether a row has phones with times, made by hand."""
+    """Return whether a row has hand-labeled phones with times."""
     return bool(row.get("phones_path")) and row["utt_id"].startswith(_EMODB)
 
 
@@ -116,7 +116,7 @@ def _english_phones(symbols: list[str]) -> list[str]:
 
 
 def labeled_phones(path: Path) -> list[tuple[float, str]]:
-    """Return the end in seconds of each phone of a table of labels; pauses are phones too.
+    """Return the end in seconds of each phone of a table of labels; pauses count as phones.
 
     A stop has up to three labels. Labels of a diphthong have two phones of equal durations.
     Raises ``OSError`` or ``UserError`` if the table cannot be read.

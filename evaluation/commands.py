@@ -152,7 +152,8 @@ def face(
         Path, typer.Option(help="Folder of speech whose manifest names emotions.")
     ],
     acoustic: Annotated[
-        str, typer.Option(help="Model: blocks, light, gmm or a file; it hardly matters.")
+        str,
+        typer.Option(help="Model: blocks, light, gmm or a file; it hardly changes the figures."),
     ] = "light",
     json_file: JsonFile = None,
     force: Force = False,

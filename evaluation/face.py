@@ -1,19 +1,19 @@
 """Measures the motion of a live face apart from its lips: feeling, nods, brows, blinks, stillness.
 
-The recordings of each speaker are one session, with pauses between them. The folder names their
-emotions (:mod:`kouxing.corpora.emotions`), and may have the times of stressed vowels. A second face
-is at rest for a minute.
+The recordings of each speaker are one session, with pauses between them. The manifest names
+their emotions (:mod:`kouxing.corpora.emotions`), and may give the times of stressed vowels. A
+second face is at rest for a minute.
 
-- Rank correlations (Spearman), mean over speakers: the estimated arousal and valence, the size of
-  the mouth's motion and the height of the brows, each with the feeling of the named emotion.
+- Rank correlations (Spearman) with the feeling of the named emotion, mean over speakers: of the
+  estimated arousal and valence, the size of the mouth's motion, and the height of the brows.
 - Nods and brow raises: peaks of the head's pitch and of the brows. Those during a recording match a
   stressed vowel if the last one started 0.1 to 0.3 s before the peak. The chance is the share of
   all times that match. Movements within 0.6 s after a recording mark the end of the phrase.
 - Blinks per minute and their median duration.
 - Still frames: no FAP moves by more than 0.01 degrees or 0.5 FAP units.
 
-The actors of the shipped readout are not unseen speakers. Its card has the correlations of unseen
-ones.
+The shipped readout was trained on the actors of EmoDB. Its card has the correlations for unseen
+speakers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from rich.progress import track
 from scipy.signal import find_peaks
 from scipy.stats import spearmanr
 
-from kouxing.corpora.emotions import FEELINGS, SpokenEmotion, speakers_of
+from kouxing.corpora.emotions import FEELINGS, EmotionRecording, speakers_of
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.evaluation.lips.effort import opening_range
 from kouxing.evaluation.tables import format_number, percent
@@ -70,7 +70,7 @@ _ANGLES = [
 
 @dataclass(frozen=True, slots=True)
 class Movements:
-    """How often a movement occurs, and how often it matches a stressed vowel."""
+    """Rate of a movement, and how often it matches a stressed vowel."""
 
     per_minute: float  # of speech
     at_end: float  # share after a phrase
@@ -79,7 +79,7 @@ class Movements:
 
 @dataclass(frozen=True, slots=True)
 class FaceFigures:
-    """The figures of a face."""
+    """Metrics of a face."""
 
     correlations: Mapping[str, float]
     nods: Movements
@@ -102,7 +102,7 @@ class _Session:
     stressed_s: Times
 
 
-def measure_face(model: AcousticModel, recordings: Sequence[SpokenEmotion]) -> FaceFigures:
+def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -> FaceFigures:
     """Animate all recordings that name an emotion, and a face at rest."""
     config = SynthesizerConfig()
     spoken = [recording for recording in recordings if recording.emotion]
@@ -143,7 +143,7 @@ def measure_face(model: AcousticModel, recordings: Sequence[SpokenEmotion]) -> F
 
 
 def _animate(
-    model: AcousticModel, recordings: Sequence[SpokenEmotion], config: SynthesizerConfig
+    model: AcousticModel, recordings: Sequence[EmotionRecording], config: SynthesizerConfig
 ) -> _Session:
     """Stream the recordings of a speaker as one session."""
     chain = LiveChain(model, load_lip_model(name=config.lips), synthesizer=config)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def _choose_numba_folder() -> None:
-    """Give numba a temporary folder if it cannot store its compiled functions anywhere.
+    """Set a temporary cache folder for numba if no permanent one is writable.
 
     Otherwise numba raises an error, for example for a user without a home folder if the
     installation is read-only.

@@ -129,7 +129,7 @@ class LoadMeter:
         self._changed_s, self._works = now_s, False
 
     def add(self, duration_s: float) -> None:
-        """Count work of another thread, or, if negative, less of the loop's work."""
+        """Add work of another thread. A negative time reduces the loop's work."""
         self._busy_s += duration_s
 
     def share(self, now_s: float) -> float:

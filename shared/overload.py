@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-SLOW_FROM = 0.5  # fraction of the limit above which the block network runs less often
+SLOWDOWN_FRACTION = 0.5  # fraction of the limit above which the block network runs less often
 LIGHT_FROM = 0.75  # fraction of the limit above which a session uses the light model
 LIGHT_FOR_S = 2.0  # time for which a session that is on time still uses it
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
@@ -27,7 +27,7 @@ REPORT_INTERVAL_S = 1.0  # between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
 ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is just as late
 
-MAX_HOP = 4  # between runs of the block network, in its shortest hops
+MAX_HOP = 4  # longest time between runs of the block network, in multiples of the shortest
 MAX_LOAD = 0.6  # cores of a recognizer; above it, the network runs less often
 RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
 RESTORE_AFTER_S = 5.0  # time for which the expected load must be that low
@@ -49,7 +49,7 @@ class Work:
 
 
 class NetworkPace:
-    """Chooses the hop of the block network, from the load of a recognizer.
+    """Chooses the hop of the block network from the load of a recognizer.
 
     The network's time is proportional to 1 / hop. The hop is the shortest one whose expected load
     is low enough. It also rises while a session is behind, because other programs use the
@@ -68,10 +68,10 @@ class NetworkPace:
         self._since_s = self._restored_s = now_s
         self._before = work
         self._needed = 1  # the longest hop needed since ``_restored_s``
-        self._is_behind = False  # whether a session was behind since ``_since_s``
+        self._is_behind = False  # whether a session has been behind since ``_since_s``
 
     def update(self, work: Work, now_s: float, *, is_behind: bool) -> int:
-        """Return the hop, given the work on live sessions so far, and if a session is behind."""
+        """Return the hop, given the work on live sessions so far and if a session is behind."""
         self._is_behind |= is_behind
         passed_s = now_s - self._since_s
         if passed_s < PACE_PERIOD_S:
@@ -152,7 +152,7 @@ class Overload:
             return False
         late_s = self._late_s(waiting_s, now_s)
         behind_s = min(waiting_s, late_s)
-        self.is_behind = behind_s > SLOW_FROM * self._max_behind_s
+        self.is_behind = behind_s > SLOWDOWN_FRACTION * self._max_behind_s
         if behind_s > LIGHT_FROM * self._max_behind_s:
             self._light_until_s = now_s + LIGHT_FOR_S
         if behind_s <= self._max_behind_s:

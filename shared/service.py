@@ -93,7 +93,7 @@ class Service(MessageLoop):
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # that it provides, by name
         self.facts = SessionFacts()  # about the sessions that it serves
-        self.languages: list[str] = []  # that its sessions may have besides that of ``facts``
+        self.languages: list[str] = []  # further languages that its sessions may choose
         self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
         self._hand_over_end_s = 0.0

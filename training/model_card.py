@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from kouxing.corpora.emotions import SpokenEmotion
+from kouxing.corpora.emotions import EmotionRecording
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.training.search_weights import SearchWeights
@@ -19,7 +19,7 @@ def write_card(
     recordings: Sequence[Example]
     | Sequence[LipClip]
     | Sequence[Utterance]
-    | Sequence[SpokenEmotion],
+    | Sequence[EmotionRecording],
     errors: RowErrors | None = None,
     chosen: SearchWeights | None = None,
     notes: str = "",
@@ -29,7 +29,9 @@ def write_card(
     ``details`` describe the training as part of a sentence. ``chosen`` are the search weights, if
     they were chosen on development data.
     """
-    by_license: dict[str, list[Example | LipClip | Utterance | SpokenEmotion]] = defaultdict(list)
+    by_license: dict[str, list[Example | LipClip | Utterance | EmotionRecording]] = defaultdict(
+        list
+    )
     for recording in recordings:
         by_license[recording.license or "none given"].append(recording)
     rows = [

@@ -15,8 +15,8 @@ a        ridge, relative to the mean square of a state
 
     W = (X^T X + a n width I)^-1 X^T (T - mean T)
 
-Feelings are tested on each speaker with the readout of the other speakers. The second half of each
-sound of laughter and breath is held out.
+Feelings are tested on each speaker with a readout trained on the other speakers. The second half of
+each sound of laughter and breath is held out.
 """
 
 from collections.abc import Iterator, Sequence
@@ -59,7 +59,7 @@ def train_traits(
     means, targets, owners = [], [], []  # of the recordings with an emotion
     rows, labels = [], []  # positions
     for recording in track(speech, description="speech"):
-        for positions in _heard(read_audio(recording.path), rng):
+        for positions in _ear_positions(read_audio(recording.path), rng):
             states = np.stack([position.state for position in positions])
             rows.append(states[::_OTHER_STEP])
             labels.append(np.zeros((len(rows[-1]), len(_TRAITS)), np.float32))
@@ -70,7 +70,7 @@ def train_traits(
     for sound in track(read_sounds(sounds, shipping=shipping), description="sounds"):
         if not sound.is_held_out:
             is_trait = [sound.kind == trait for trait in _TRAITS]
-            for positions in _heard(as_floats(sound.samples), rng):
+            for positions in _ear_positions(as_floats(sound.samples), rng):
                 states = np.stack([position.state for position in positions])
                 rows.append(states if any(is_trait) else states[::_OTHER_STEP])
                 labels.append(np.tile(np.array(is_trait, np.float32), (len(rows[-1]), 1)))
@@ -102,7 +102,7 @@ def train_traits(
     )
 
 
-def _heard(samples: Floats, rng: np.random.Generator) -> Iterator[list[HeardPosition]]:
+def _ear_positions(samples: Floats, rng: np.random.Generator) -> Iterator[list[HeardPosition]]:
     """Yield the ear's positions for samples, unchanged and augmented."""
     for sound in (samples, scale_level(disturb(samples, rng), rng)):
         frames = WhisperMel().accept_waveform(sound)

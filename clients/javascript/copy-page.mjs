@@ -14,5 +14,5 @@ if (existsSync(PAGE)) {
   await mkdir(COPY, { recursive: true });
   for (const name of SHARED) await cp(new URL(`${name}.js`, PAGE), new URL(`${name}.js`, COPY));
 } else if (!existsSync(COPY)) {
-  throw new Error("there are no modules of the page; install the package from a checkout of kouxing");
+  throw new Error("the modules of the page are missing; install the package from a checkout of kouxing");
 }

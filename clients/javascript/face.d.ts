@@ -1,6 +1,6 @@
 import type { PhoneMessage, SessionMessage, ShapeSet } from "./index.js";
 
-/** The methods of kouxing-lips' LipSync; its own types have all. */
+/** The main methods of LipSync; the types of kouxing-lips have all. */
 export interface LocalLips extends EventTarget {
   listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;
   listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;

@@ -1,4 +1,4 @@
-// <kouxing-face>: a GLB or VRM model that is moved by a session, by a recording, or by local lip sync.
+// <kouxing-face>: a GLB or VRM model that a session, a recording or local lip sync moves.
 
 import * as THREE from "three";
 import { Blinks } from "./blinks.js";
@@ -129,7 +129,7 @@ export class KouxingFace extends HTMLElement {
 
   /** The local lip sync: a promise of a LipSync of kouxing-lips. Its sources move the model. */
   get lips() {
-    if (!this.hasAttribute("local")) throw new Error("<kouxing-face> has no attribute local; add it");
+    if (!this.hasAttribute("local")) throw new Error("<kouxing-face> needs the attribute local; add it");
     this.#lips ??= this.#loadLips();
     return this.#lips;
   }

@@ -22,7 +22,7 @@ export interface EngineOptions {
   expressiveness?: number;
   /** How strongly the face shows the feeling in the voice, 0 to 1; default: the server's, 0.5. */
   feeling?: number;
-  /** Sound after a frame that is known when the frame is made, ms; default: the server's, 60. */
+  /** How much later than its sound a frame is made, ms; default: the server's, 60. */
   delayMs?: number;
 }
 
@@ -32,14 +32,14 @@ export interface LipFrame extends Partial<Record<ShapeSetName, Float32Array>> {
   timeS: number;
   /** The 68 FAPs of MPEG-4, FAP units. */
   faps: Float32Array;
-  /** Whether someone speaks or sings at the end of the known sound. */
+  /** Whether someone speaks or sings at the end of the sound so far. */
   isSpeaking: boolean;
   /** Whether someone laughs. */
   isLaughing: boolean;
 }
 
 /**
- * A recognized phone of Mandarin. It is emitted at least twice: first with an estimated duration, at
+ * A recognized phone of Mandarin. It is emitted at least twice: first with an estimated duration,
  * last with `isFinal`. A phone with `isFinal` and the duration 0 is withdrawn.
  */
 export interface LipPhone {

@@ -1,4 +1,4 @@
-// Runs the engine in a worker: sound in, faces out.
+// Runs the engine in a worker. It receives sound and sends faces.
 
 import { LipEngine } from "./engine/engine.js";
 import { loadModel } from "./engine/model.js";

@@ -197,7 +197,7 @@ def serve_folder(folder: Path, port: int = 0) -> Iterator[str]:
 
 
 def write_microphone(audio: Path, wav: Path) -> None:
-    """Write a recording as the WAV file that the microphone repeats.
+    """Write a recording as the WAV file that the fake microphone repeats.
 
     Raises ``UserError`` if the file is not audio.
     """

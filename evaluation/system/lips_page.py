@@ -1,4 +1,4 @@
-"""Measure lip sync in the browser: ``kouxing-lips`` in a headless Chromium, without a drawn head.
+"""Measures lip sync in the browser: ``kouxing-lips`` in headless Chromium, without a drawn head.
 
 The microphone plays a recording in a loop. The delay of a frame is the time from its sound in the
 audio thread to its weights in the page. The processor time is that of the page's process: page,

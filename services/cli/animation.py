@@ -102,7 +102,7 @@ def animate(
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
     are those of the live services with their default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
-    it, if given. ``language`` is that of the speech.
+    it, if given. ``language`` is the language of the speech.
 
     Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """

@@ -1,4 +1,4 @@
-"""Files of Rhubarb Lip Sync: which mouth is drawn at which time, as TSV, XML or JSON.
+"""Writes files of Rhubarb Lip Sync (TSV, XML or JSON), which say when each mouth is drawn.
 
 Source: README of Rhubarb Lip Sync, "Output formats". Times have two decimals, and the end of the
 recording is truncated to them. A cue ends where the next one starts. The last line of a TSV is the
@@ -26,7 +26,7 @@ _Span: TypeAlias = tuple[str, str, str]  # start and end, and the mouth between 
 
 @dataclass(frozen=True, slots=True)
 class CueKind:
-    """A set of mouths of which one is shown at a time."""
+    """A set of mouths, one of which is shown at a time."""
 
     cues_of: Callable[[Frames], Iterator[Cue]]
     rest: str
@@ -43,8 +43,8 @@ def write_cues(
 ) -> str:
     """Return the cues of a recording as a file, for a suffix in ``CUE_FORMATS``.
 
-    ``end_s`` is the end of the recording. Lips that close for a rest are at rest at once. Equal
-    mouths in a row are one cue.
+    ``end_s`` is the end of the recording. Lips that close for a pause are at rest at once. Equal
+    consecutive mouths become one cue.
     """
     end = math.floor(100.0 * end_s + 1e-6) / 100.0
     merged: list[Cue] = []

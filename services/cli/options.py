@@ -11,7 +11,7 @@ from kouxing.services.driver.config import HEAD_NAMES, DriverConfig, Framing
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 from kouxing.shared.phones.alphabets import Alphabet
-from kouxing.shared.phones.inventory import codes, find_language
+from kouxing.shared.phones.inventory import find_language, language_codes
 
 DEFAULT_HEAD = DriverConfig().head
 
@@ -35,8 +35,8 @@ Language = Annotated[
     typer.Option(
         "--language",
         callback=_find_language,
-        help=f"Language of the speech: {', '.join(codes())}, or an installed language. auto: any"
-        " language, with universal phones. Default: zh.",
+        help=f"Language of the speech: {', '.join(language_codes())}, or an installed language."
+        " auto: any language, with universal phones. Default: zh.",
     ),
 ]
 PhoneAlphabet = Annotated[

@@ -97,7 +97,7 @@ def _format(motion: Motion, options: argparse.Namespace) -> str:
 
 
 def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -> str:
-    """Return the switch data of Moho and OpenToonz: frames, counted from 1, and their mouths.
+    """Return the switch data of Moho and OpenToonz: frame numbers from 1, and their mouths.
 
     If several mouths start in a frame, the last one counts.
     """

@@ -232,7 +232,7 @@ def _read_timed_lyrics(text: str) -> str:
 def _read_timed_lines(text: str) -> str:
     """Extract the lines without their times.
 
-    If an untimed line follows every timed line, the timed lines contain the names of speakers.
+    If every timed line is followed by an untimed line, the timed lines contain speakers' names.
     """
     lines = [(re.match(_TIMED_LINE, line), line) for line in text.split("\n")]
     are_names = all(

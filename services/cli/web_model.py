@@ -1,4 +1,4 @@
-"""The models for lip sync in a browser: the files that ``clients/kouxing-lips`` reads.
+"""Writes the models for lip sync in a browser, which ``clients/kouxing-lips`` reads.
 
 ============== =====================================================================
 file           contents
@@ -9,8 +9,8 @@ file           contents
 ``model.json`` types, shapes and places of these arrays; constants of the modules
 ============== =====================================================================
 
-The constants are those of the modules that the server runs. The package has no values of its own,
-so a new model or another threshold needs only a new export.
+The constants come from the modules that the server runs. The package defines none of its own, so a
+new model or threshold needs only a new export.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from collections import deque
 EQUAL_LOAD = 0.05  # loads that differ by less are equal
 MIN_SESSIONS = 2  # never refused; on a busy machine every session seems to be expensive
 MEASURED_S = 2.0  # period over which a worker measures its load
-DEFAULT_COST = 0.1  # of a session, until it is measured; true for a slow machine
+DEFAULT_COST = 0.1  # of a session until it is measured; typical of a slow machine
 COST_HALF_LIFE_S = 60.0  # of the highest measured cost
 SPEAKING_HALF_LIFE_S = 4.0  # of the cost, while the speaking sessions cost less than that
 RETRY_AFTER_S = 5.0  # for a client that is refused

@@ -117,7 +117,7 @@ class Sessions:
         """Place a new session.
 
         Raises ``Refusal`` if the name is taken, there are too many sessions, a service is missing
-        or busy, or none has the language.
+        or busy, or no recognizer has the language.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:
@@ -304,7 +304,7 @@ class Sessions:
 
 
 def _language_of(opening: OpenSession) -> str | None:
-    """Return the language that a client chose, by its name; None if it chose none."""
+    """Return the name of the language that a client chose; None if it did not choose one."""
     if opening.language is None:
         return None
     try:

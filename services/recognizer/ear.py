@@ -113,11 +113,13 @@ class EarStream:
 
     def accept_position(self, frames: Floats) -> HeardPosition:
         """Take the next position's frames, (2, 80)."""
-        return hear_positions([self], [frames])[0]
+        return process_positions([self], [frames])[0]
 
 
-def hear_positions(streams: Sequence[EarStream], frames: Sequence[Floats]) -> list[HeardPosition]:
-    """Take the next position's frames, (2, 80), of several streams of one ear, in one run."""
+def process_positions(
+    streams: Sequence[EarStream], frames: Sequence[Floats]
+) -> list[HeardPosition]:
+    """Process the next frames, (2, 80), of several streams of one ear in one run."""
     states = np.stack([stream.state for stream in streams])
     outputs = streams[0].ear.run(np.stack(frames), states)
     positions = []

@@ -52,8 +52,8 @@ class LiveDecoder:
     within speech is a phone like any other.
 
     A phone is final when all paths of the search over settled scores share it, or speech has ended.
-    So the final phones are those of a traceback over the whole speech, and their confidence is the
-    mean over their frames. The output rule and the provisional scores affect neither.
+    The final phones therefore equal those of a full traceback. Their confidence is the mean over
+    their frames. The output rule and the provisional scores affect neither.
 
     If the model has provisional scores, the search continues over them. When the next scores come,
     it restarts from the last settled frame. The output rule gets each frame once, as soon as the

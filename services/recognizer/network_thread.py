@@ -1,4 +1,4 @@
-"""The thread of the block network, so that other sessions do not wait for its runs."""
+"""Runs the block network in its own thread, so that other sessions do not wait for it."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -8,8 +8,8 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.stream import SpeechStream
 
-MAX_SESSIONS = 4  # decoded together; the results of all of them are sent at the end
-MAX_WAIT_S = 0.02  # for more sessions, if the processor is to be spared
+MAX_SESSIONS = 4  # decoded together; all results are sent at the end
+MAX_WAIT_S = 0.02  # longest wait for more sessions, to save processor time
 
 
 class NetworkThread:
@@ -37,7 +37,7 @@ class NetworkThread:
         self._job: Future[None] | None = None
 
     def add(self, session: RecognizerSession, now_s: float) -> None:
-        """Let a session wait for the network, if it does not wait yet."""
+        """Queue a session for the network, unless it is already queued."""
         if not session.is_due:
             session.is_due = True
             self._due_since_s = self._due_since_s if self._due else now_s
@@ -46,7 +46,7 @@ class NetworkThread:
     def start(self, now_s: float, *, saves_time: bool = False) -> None:
         """Decode the accepted audio of waiting sessions, unless the thread is busy.
 
-        With ``saves_time``, wait for several sessions, because they take less time together.
+        With ``saves_time``, wait for several sessions, because a shared run takes less time.
         """
         if self._job is not None or not self._due:
             return
@@ -64,7 +64,7 @@ class NetworkThread:
         """Return the sessions that were decoded since the last call."""
         if self._job is None or not self._job.done():
             return []
-        self._job.result()  # raises what the decoding has raised
+        self._job.result()  # raises the errors of the decoding
         self._job = None
         for session in self._batch:
             session.is_scoring = False

@@ -108,7 +108,7 @@ class Recognizer:
         hear_streams([scorer for stream in streams for scorer in stream.scorers])
 
     def needs_network(self, stream: SpeechStream) -> bool:
-        """Return whether the block network runs to decode the speech in a stream's audio."""
+        """Return whether decoding a stream's audio needs a run of the block network."""
         return any(scorer.needs_network for scorer in stream.scorers)
 
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:

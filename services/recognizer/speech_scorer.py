@@ -17,7 +17,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Work,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
-from kouxing.services.recognizer.ear import EarStream, HeardPosition, hear_positions
+from kouxing.services.recognizer.ear import EarStream, HeardPosition, process_positions
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.speech_segmenter import (
@@ -89,8 +89,8 @@ class SpeechScorer:
         self._light = light.create_stream() if light else None
         front_end = WhisperMel() if self._own.uses_ear else model.create_front_end()
         self._segmenter = SpeechSegmenter(front_end, lip_stream, start_frame)
-        # Audio that the ear has not heard, and events in order; None: the end of the audio
-        self._unheard: deque[Position | _Slice | ScoreEvent | None] = deque()
+        # Audio that the ear has not processed, and events, in order; None: the end of the audio
+        self._ear_queue: deque[Position | _Slice | ScoreEvent | None] = deque()
         self._needs_light = False  # whether the light model scores the next speech
         # Frames to score, and events in order. The first item is to be scored; SpeechEnd is too.
         self._queue: deque[SpeechFrames | ScoreEvent] = deque()
@@ -116,7 +116,7 @@ class SpeechScorer:
 
     @property
     def needs_network(self) -> bool:
-        """Whether the block network runs to score the queued audio."""
+        """Whether scoring the queued audio needs a run of the block network."""
         if self._blocks is None or self._stream is not self._blocks:
             return False
         frames = (item.features for item in self._queue if isinstance(item, SpeechFrames))
@@ -130,25 +130,25 @@ class SpeechScorer:
 
     def accept_waveform(self, samples: Floats, progress: Progress | None = None) -> None:
         """Queue samples, 16 kHz mono, shape (n,), and the measurement of the slice they end."""
-        self._unheard.extend(self._segmenter.positions(samples))
+        self._ear_queue.extend(self._segmenter.positions(samples))
         if progress is not None:
-            self._unheard.append(_Slice(progress))
+            self._ear_queue.append(_Slice(progress))
 
     def input_finished(self) -> None:
         """End the audio."""
-        self._unheard.append(None)
+        self._ear_queue.append(None)
 
     def add_event(self, event: ScoreEvent) -> None:
         """Queue an event, to be returned after the results of the audio so far."""
-        self._unheard.append(event)
+        self._ear_queue.append(event)
 
     def next_position(self) -> Position | None:
-        """Return the next position that the ear must process; None if there is no other."""
-        while self._unheard:
-            item = self._unheard[0]
+        """Return the next position for the ear; None if there is none."""
+        while self._ear_queue:
+            item = self._ear_queue[0]
             if isinstance(item, Position):
                 return item
-            self._unheard.popleft()
+            self._ear_queue.popleft()
             if item is None:
                 self._queue.extend(self._segmenter.input_finished())
             elif isinstance(item, _Slice):
@@ -164,15 +164,15 @@ class SpeechScorer:
         """The stream that processes the positions."""
         return self._segmenter.ear
 
-    def add_heard(self, position: Position, heard: HeardPosition) -> None:
-        """Add what the ear has computed at ``next_position``."""
-        self._unheard.popleft()
+    def add_ear_output(self, position: Position, heard: HeardPosition) -> None:
+        """Add the output of the ear at ``next_position``."""
+        self._ear_queue.popleft()
         self._queue.extend(self._segmenter.process(position, heard))
 
     @property
     def is_ready(self) -> bool:
         """Whether there is audio to score."""
-        return bool(self._queue or self._unheard)
+        return bool(self._queue or self._ear_queue)
 
     @property
     def model(self) -> AcousticModel:
@@ -228,9 +228,9 @@ def hear_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
     while waiting := [(one, position) for one in scorers if (position := one.next_position())]:
         streams = [scorer.ear for scorer, _ in waiting]
-        heard = hear_positions(streams, [position.mels for _, position in waiting])
+        heard = process_positions(streams, [position.mels for _, position in waiting])
         for (scorer, position), of_scorer in zip(waiting, heard, strict=True):
-            scorer.add_heard(position, of_scorer)
+            scorer.add_ear_output(position, of_scorer)
 
 
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:

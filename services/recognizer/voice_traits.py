@@ -1,4 +1,4 @@
-"""What a voice shows apart from its words: arousal, valence, laughter and breath.
+"""Estimates what a voice shows apart from its words: arousal, valence, laughter and breath.
 
 A linear readout of the small ear's hidden layers, every 20 ms:
 
@@ -36,7 +36,7 @@ from kouxing.shared.errors import UserError
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
 FORMAT = "traits 1"
 NUM_TRAITS = 4  # arousal, valence, laughter, breath
-MIN_VOICE = 0.5  # probability of a voice above which arousal and valence count
+MIN_VOICE = 0.5  # smallest probability of a voice at which arousal and valence count
 
 _FEELING = slice(0, 2)
 _MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # of the averages of arousal and valence; at the start
@@ -47,7 +47,7 @@ _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and st
 
 
 class VoiceTraits(NamedTuple):
-    """What the voice shows; fields as those of ``Progress``."""
+    """What the voice shows; the fields are those of ``Progress``."""
 
     arousal: float = 0.0
     valence: float = 0.0

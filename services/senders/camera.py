@@ -1,9 +1,9 @@
-"""Input from a camera tracker: its packets pass through, with the mouth of the sound.
+"""Forwards the packets of a camera tracker with the mouth from the sound.
 
 A tracker such as VSeeFace, or Live Link Face on an iPhone, sends its packets to a port of this
 machine instead of the program with the avatar. Each packet is forwarded on arrival. Its mouth is
-replaced by the newest frame of the session; everything else stays. Frames of the session are not
-sent by themselves while the tracker sends. Packets that are malformed are dropped.
+replaced with that of the session's newest frame, and everything else stays. While the tracker
+sends, the session's own frames are not sent. Malformed packets are dropped.
 """
 
 import asyncio
@@ -11,12 +11,12 @@ import contextlib
 import math
 from collections.abc import Callable
 
-_LIVE_S = 1.0  # without a packet for this time, the tracker has stopped
+_LIVE_S = 1.0  # after this time without a packet, the tracker counts as stopped
 _MAX_RATE_HZ = 600  # packets above this rate are dropped unread
 
 
 class CameraInput(asyncio.DatagramProtocol):
-    """Passes the packets of a tracker to ``forward``.
+    """Passes a tracker's packets to ``forward``.
 
     ``forward`` returns whether the packet contained a mouth, and raises ``ValueError`` if the
     packet is malformed.

@@ -64,7 +64,7 @@ def _message_start(address: str, texts: tuple[str, ...], kinds: str) -> bytes:
 
 
 def split(packet: bytes, depth: int = 0) -> Iterator[bytes]:
-    """Yield the messages of a packet, also of nested bundles, as bytes.
+    """Yield the messages of a packet, including those in nested bundles, as bytes.
 
     Raises ``ValueError`` if the packet is malformed.
     """
@@ -90,16 +90,16 @@ def address_of(content: bytes) -> str:
 
 
 def first_text(content: bytes) -> str:
-    """Return the first argument of a message, a text; ``ValueError`` if it is not one."""
+    """Return the first argument of a message; ``ValueError`` if it is not a string."""
     _, start = _text_at(content, 0)
     kinds, start = _text_at(content, start)
     if not kinds.startswith(",s"):
-        raise ValueError("the first argument is not a text")
+        raise ValueError("the first argument is not a string")
     return _text_at(content, start)[0]
 
 
 def _text_at(content: bytes, start: int) -> tuple[str, int]:
-    """Return a text, and where the next value is: texts are padded to multiples of 4 bytes."""
+    """Return a string, which is padded to a multiple of 4 bytes, and the offset after it."""
     end = content.index(b"\0", start)
     return content[start:end].decode(), end // 4 * 4 + 4
 

@@ -25,7 +25,7 @@ from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.services.synthesizer.modifiers.feeling import FeelingMotion
-from kouxing.services.synthesizer.modifiers.idle_motion import Manner, SpeechIdleMotion
+from kouxing.services.synthesizer.modifiers.idle_motion import Behavior, SpeechIdleMotion
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
 from kouxing.services.synthesizer.modifiers.nonverbal import NonverbalSounds
 from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
@@ -54,7 +54,7 @@ _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
 _REHEARSAL_S = 1.6
 _MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # of mouth FAPs, of other FAPs
 _BIND_S = 0.04  # after this part of a transition, lips close fully for speech
-_VOICE_LEAD_S = 0.06  # feeling and laughter act this long before their frame, if known
+_VOICE_LEAD_S = 0.06  # feeling and laughter are applied this early, if known
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
 _ROUNDING = 0.01  # tolerance of media times, in frames
 
@@ -223,10 +223,10 @@ class FaceAnimator:
         """Set the strength of the feeling in the voice on the face, 0 to 1."""
         self._feeling.amount = amount
 
-    def set_manner(self, change: Manner) -> None:
-        """Change how the face behaves while it speaks and listens; None changes nothing."""
+    def set_behavior(self, change: Behavior) -> None:
+        """Change the behavior of the face; fields that are None stay as they are."""
         if self._idle_motion is not None:
-            self._idle_motion.set_manner(change)
+            self._idle_motion.set_behavior(change)
 
     def set_lip_model(self, lip_model: LipModel) -> None:
         """Change the lip model with a continuous transition."""

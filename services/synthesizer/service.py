@@ -25,7 +25,7 @@ from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Fra
 from kouxing.services.synthesizer.kind import KIND
 from kouxing.services.synthesizer.lateness import IN_TIME
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.modifiers.idle_motion import Manner
+from kouxing.services.synthesizer.modifiers.idle_motion import Behavior
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
@@ -129,7 +129,7 @@ class SynthesizerService(Service):
         )
         if settings.expressions:
             face.set_expressions(settings.expressions, settings.hold_s)
-        face.set_manner(_manner_of(settings))
+        face.set_behavior(_behavior_of(settings))
         return face
 
     def stop_session(self, session: str) -> None:
@@ -161,7 +161,7 @@ class SynthesizerService(Service):
             session.face.set_expressiveness(settings.expressiveness)
         if settings.feeling is not None:
             session.face.set_feeling(settings.feeling)
-        session.face.set_manner(_manner_of(settings))
+        session.face.set_behavior(_behavior_of(settings))
         if settings.expressions is not None:
             session.face.set_expressions(settings.expressions, settings.hold_s)
         session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
@@ -391,7 +391,7 @@ class SynthesizerService(Service):
             joined.replay.repeat(time.monotonic())
 
 
-def _manner_of(settings: FaceSettings) -> Manner:
-    return Manner(
+def _behavior_of(settings: FaceSettings) -> Behavior:
+    return Behavior(
         still=settings.still, eye_contact=settings.eye_contact, listening=settings.listening
     )

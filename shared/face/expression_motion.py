@@ -78,7 +78,7 @@ class ExpressionMotion:
         self.show_faps(goal, hold_s if strengths else 0.0)
 
     def show_faps(self, goal: NDArray[np.float32], hold_s: float) -> None:
-        """Replace the current expressions by FAPs, (68,), for a time."""
+        """Replace the current expressions with FAPs, (68,), for a time."""
         self._goal, self._remaining_s = goal, hold_s
 
     @property

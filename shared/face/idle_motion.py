@@ -33,7 +33,7 @@ _BLINK_LOG_SD = 0.5
 _BLINK_MIN_S = 0.6
 _LID_FALL_S, _LID_CLOSED_S, _LID_RISE_S = 0.08, 0.03, 0.16
 _BLINK_S = _LID_FALL_S + _LID_CLOSED_S + _LID_RISE_S
-_SLOW_BLINK = 1.6  # duration of a slow blink, relative to _BLINK_S
+_SLOW_BLINK = 1.6  # duration of a slow blink, in multiples of _BLINK_S
 UPPER_LID, LOWER_LID = 900.0, 150.0  # the sum slightly exceeds the open eye's 1024
 
 _FIXATION_MEAN_S = 1.4
@@ -66,7 +66,7 @@ _HEAD = span("head_pitch", "head_roll")
 class State(Enum):
     """Conversational state; it controls gaze and head motion."""
 
-    LISTENING = "listening"  # or alone
+    LISTENING = "listening"  # or nobody speaks
     ATTENDING = "attending"  # listening to someone who speaks
     STARTING = "starting"  # the first second of one's own speech
     SPEAKING = "speaking"

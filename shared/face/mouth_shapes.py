@@ -1,9 +1,9 @@
-"""Nine drawn mouths, A to H and X, and the Oculus visemes, as cues: one at a time, with its start.
+"""Nine drawn mouths (A to H and X) and the Oculus visemes as cues: one mouth at a time.
 
 The letters are those of Rhubarb Lip Sync (D. S. Wolf, README, "Mouth shapes"), after the studio
 Hanna-Barbera: A closed, B slightly open, C open, D wide open, E slightly rounded, F puckered, G
-lower lip at the upper teeth, H tongue behind the upper teeth, X rest. They follow from the FAPs of
-the face, so that they fit its lips in any language. Thresholds are FAP units, chosen for the
+lower lip at the upper teeth, H tongue behind the upper teeth, X rest. They are computed from the
+FAPs of the face, so they match its lips in any language. Thresholds are FAP units, chosen for the
 openings of filmed speakers: 60, 370 and 500 separate A to D.
 """
 
@@ -21,10 +21,10 @@ Cue: TypeAlias = tuple[float, str]  # start in seconds, and the mouth
 CLOSED, REST = "A", "X"
 SILENCE = "sil"  # of the Oculus visemes
 _MAX_CLOSED, _MAX_SLIGHTLY_OPEN, _MAX_OPEN = 60.0, 370.0, 500.0  # largest opening of A, B and C
-_ROUNDED = 90.0  # least rounding of E and F
+_ROUNDED = 90.0  # smallest rounding of E and F
 _PUCKERED = 200.0  # largest opening of F
 _TEETH_GAP, _TEETH_LIFT = 50.0, 80.0  # G: the lower lip is up, the upper lip is raised
-_TONGUE_TIP = 200.0  # least height of the tongue tip in H
+_TONGUE_TIP = 200.0  # smallest height of the tongue tip in H
 _WEAK = 0.12  # weight below which an Oculus viseme is not shown
 _REST_S = 0.2  # lips that stay closed for longer are at rest
 
@@ -50,8 +50,8 @@ def mouth_shape(faps: Float32) -> str:
 def oculus_viseme(faps: Float32) -> str:
     """Return the strongest of the 15 Oculus visemes of a face with FAPs (68,).
 
-    ``sil`` is the rest of the weights, so it counts only if all others are weak. ``PP`` needs
-    closed lips; in a blend, it only narrows an opening.
+    ``sil`` is 1 minus the other weights, so it counts only if all others are weak. ``PP`` needs
+    closed lips, because in a blend it only narrows an opening.
     """
     weights = OCULUS.weights(faps)
     weights[0] = _WEAK
@@ -90,7 +90,7 @@ def _cues(
     mouth_of: Callable[[float, Float32], str],
     at_once: frozenset[str],
 ) -> Iterator[Cue]:
-    """Yield the mouths that last for two frames; those in ``at_once`` may last for one."""
+    """Yield the mouths that last two frames; those in ``at_once`` may last one."""
     shown = candidate = ""
     since_s = 0.0
     for time_s, faps in frames:

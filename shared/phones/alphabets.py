@@ -1,4 +1,4 @@
-"""Phones in other alphabets: IPA, and ARPABET for English."""
+"""Writes phones in other alphabets: IPA, and ARPABET for English."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TOUCHING_S = 0.011  # phones of a diphthong have no gap
 class Alphabet(StrEnum):
     """How phones are written."""
 
-    OWN = "own"  # symbols of the language's inventory
+    OWN = "own"  # the symbols of the language's inventory
     IPA = "ipa"
     ARPABET = "arpabet"
 
@@ -32,7 +32,7 @@ class Alphabet(StrEnum):
 def respell(
     phones: Iterable[Phone], inventory: PhoneInventory, alphabet: Alphabet | None = None
 ) -> Iterator[Phone]:
-    """Yield spoken phones, in order, in another alphabet.
+    """Convert spoken phones to another alphabet, in order.
 
     Without an alphabet, universal phones are written in IPA, and others as they are. A phone of
     Mandarin may be several IPA letters, which share its time equally. A diphthong of ARPABET is two

@@ -1,4 +1,4 @@
-"""Letters to sounds by espeak-ng, a program that runs as a process of its own (GPL-3)."""
+"""Converts letters to sounds with espeak-ng (GPL-3), which runs as a separate process."""
 
 import shutil
 import subprocess
@@ -8,16 +8,16 @@ from kouxing.shared.errors import UserError
 
 _TIMEOUT_S = 60.0
 _INSTALL = (
-    "espeak-ng is missing, which reads texts in this language; install it"
+    "espeak-ng is missing, and texts in this language need it; install it"
     " (Debian: apt-get install espeak-ng; macOS: brew install espeak-ng)"
 )
 
 
-def sound_out(phrases: Sequence[Sequence[str]], voice: str) -> list[list[str]]:
+def transcribe_phrases(phrases: Sequence[Sequence[str]], voice: str) -> list[list[str]]:
     """Return the IPA of each word of each phrase; phones of more than one letter are tied.
 
-    A word is read within its phrase, or alone if espeak-ng joins words of the phrase. A word
-    without sound has an empty text. ``voice`` is one of espeak-ng.
+    A word is read within its phrase, or alone if espeak-ng joins words of the phrase. A silent word
+    has an empty text. ``voice`` is an espeak-ng voice.
 
     Raises ``UserError`` if espeak-ng is missing or fails.
     """

@@ -68,7 +68,7 @@ class Progress:
     arousal: float = 0.0  # relative to the speaker's mean, -1 to 1
     valence: float = 0.0  # likewise: below 0 is unpleasant
     is_laughter: bool = False  # laughter is not speech
-    is_breath: bool = False  # an audible breath, such as before speech
+    is_breath: bool = False  # audible breath, for example before speech
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ A language with phones of its own is a Python package with ``phones.tsv`` and a 
 - ``spell``, a function that spells a syllable's phones; by default the symbols in a row
 - ``write``, a function that returns a spelling or a phone as it is printed; by default unchanged
 - ``CODE``, the ISO 639-1 code that recordings use for the language
-- ``universal.tsv``, the phones of the universal inventory (``universal``) that make up each phone
+- ``universal.tsv``, the universal phones (``universal``) that make up each phone
 
 ``BUILT_IN`` lists the languages of kouxing. An installed distribution adds a language with an entry
 point in the group ``kouxing.languages``: the language's name, and the package.
@@ -49,7 +49,7 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 TABLE_LANGUAGES = "english french german italian japanese portuguese russian spanish".split()
 DEFAULT_LANGUAGE = "mandarin"
 UNIVERSAL = "universal"  # the phones of all languages
-AUTO = "auto"  # a user's name for it
+AUTO = "auto"  # its code for users
 BUILT_IN = {
     name: f"kouxing.shared.phones.{name}"
     for name in (DEFAULT_LANGUAGE, UNIVERSAL, *TABLE_LANGUAGES)
@@ -128,7 +128,7 @@ class PhoneInventory:
 
     @cached_property
     def has_universal_phones(self) -> bool:
-        """Whether the phones are those of the universal inventory, or some of them."""
+        """Whether all phones are universal phones."""
         return all(self.universal.get(phone) == (phone,) for phone in self.phones)
 
     def read(self, text: str) -> Transcript:
@@ -142,9 +142,9 @@ class PhoneInventory:
         return Transcript(tuple(syllables))
 
     def in_universal_phones(self, phones: Sequence[str]) -> Syllable:
-        """Return phones of this language as phones of the universal inventory.
+        """Convert phones of this language to universal phones.
 
-        Raises ``KeyError`` if the language does not list them.
+        Raises ``KeyError`` if the language has no universal phones for one of them.
         """
         return tuple(universal for phone in phones for universal in self.universal[phone])
 
@@ -155,15 +155,17 @@ class PhoneInventory:
 
 
 @lru_cache
-def codes() -> dict[str, str]:
-    """Return the languages by what a user may call them: codes of ``BUILT_IN``, and ``auto``."""
+def language_codes() -> dict[str, str]:
+    """Return the language of each code that a user may give, with ``auto``."""
     of_tables = {load_table_language(BUILT_IN[name]).code: name for name in TABLE_LANGUAGES}
     return {AUTO: UNIVERSAL, "zh": DEFAULT_LANGUAGE} | dict(sorted(of_tables.items()))
 
 
 def language_titles() -> dict[str, Mapping[str, str]]:
-    """Return the names for users of the languages in ``codes``, in "en" and "zh"; zh first."""
-    of_tables = {code: BUILT_IN[name] for code, name in codes().items() if name in TABLE_LANGUAGES}
+    """Return the display names in "en" and "zh" of ``language_codes``; zh first."""
+    of_tables = {
+        code: BUILT_IN[name] for code, name in language_codes().items() if name in TABLE_LANGUAGES
+    }
     return {
         "zh": {"en": "Mandarin", "zh": "普通话"},
         AUTO: {"en": "any language", "zh": "任何语言"},
@@ -175,7 +177,7 @@ def find_language(name: str) -> str:
 
     Raises ``UserError`` if it is not installed.
     """
-    return load_inventory(codes().get(name, name)).language
+    return load_inventory(language_codes().get(name, name)).language
 
 
 @lru_cache
@@ -189,7 +191,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
         installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         package = installed.get(language)
         if package is None:
-            known = ", ".join([*codes(), *sorted({*BUILT_IN, *installed})])
+            known = ", ".join([*language_codes(), *sorted({*BUILT_IN, *installed})])
             raise UserError(f"language {language!r} is not installed; choose from: {known}")
     try:
         if resources.files(package).joinpath(SETTINGS).is_file():
@@ -207,7 +209,7 @@ def _inventory_of(
     lexicon: Any,
     universal: Mapping[str, Syllable],
 ) -> PhoneInventory:
-    """Return the inventory of a table of phones, and of the functions of a module."""
+    """Return the inventory of a table of phones and the functions of a module."""
     return PhoneInventory(
         language=language,
         phones=tuple(row["phone"] for row in rows),

@@ -1,4 +1,4 @@
-"""Tables of packages: tab-separated, with comments."""
+"""Reads tab-separated tables of packages; they may contain comments."""
 
 import csv
 from importlib import resources

@@ -1,4 +1,4 @@
-"""A language as a folder of tables, whose texts espeak-ng reads.
+"""A language that is a folder of tables. espeak-ng converts its texts to phones.
 
 ``language.toml`` has these keys:
 
@@ -25,13 +25,13 @@ from functools import cache
 from importlib import resources
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.espeak import sound_out
+from kouxing.shared.phones.espeak import transcribe_phrases
 from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone, read_ipa
 
 SETTINGS = "language.toml"
-_SIGNS = "%&@#§€$£¥°+="  # espeak-ng reads them
+_SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words
 _TOKENS = re.compile(
     r"(?P<number>[€$£¥]?[0-9]+(?:[.,:][0-9]+)*(?: ?[%€£°])?)"
     rf"|(?P<word>[^\W\d_]+(?:['’·-][^\W\d_]+)*['’]?|[{_SIGNS}])|(?P<other>\S)"
@@ -40,7 +40,7 @@ _TOKENS = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class TableLanguage:
-    """The texts of a language."""
+    """Converts the texts of a language to phones."""
 
     code: str
     titles: Mapping[str, str]
@@ -67,7 +67,7 @@ class TableLanguage:
         """
         phrases, dropped = self._phrases_of(text)
         words = []
-        for phrase, sounds in zip(phrases, sound_out(phrases, self.voice), strict=True):
+        for phrase, sounds in zip(phrases, transcribe_phrases(phrases, self.voice), strict=True):
             for word, ipa in zip(phrase, sounds, strict=True):
                 phones = self._phones_of(ipa)
                 if phones:
@@ -98,7 +98,7 @@ class TableLanguage:
         return unicodedata.name(letter, "").startswith(self.scripts)
 
     def _phones_of(self, ipa: str) -> tuple[str, ...]:
-        """Return the language's phones of a word; none if it has unknown symbols."""
+        """Return a word in the language's phones; empty if it has unknown symbols."""
         for pattern, replacement in self.rules:
             ipa = re.sub(pattern, replacement, ipa)
         phones, unknown = read_ipa(ipa)

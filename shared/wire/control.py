@@ -77,7 +77,7 @@ class Heartbeat(Message):
     facts: SessionFacts = field(default_factory=SessionFacts)
     languages: Annotated[list[Name], Meta(max_length=64)] = field(
         default_factory=list
-    )  # that its sessions may have instead of the one in facts
+    )  # further languages that its sessions may choose
     build: Text = ""  # version of kouxing
     load: Probability = 0.0  # share of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)

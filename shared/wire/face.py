@@ -34,7 +34,7 @@ class FaceSettings:
     feeling: Strength | None = None  # of the voice's feeling on the face; 0: off
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer
-    listen_to: SessionName | None = None  # whose speech the face listens to; "": nobody's
+    listen_to: SessionName | None = None  # session that the face listens to; "": none
     listening: bool | None = None  # someone else speaks; control sets it with listen_to
     expressions: ExpressionMap | None = None  # strengths by name; {}: fade those shown now
     hold_s: Annotated[float, Meta(ge=0, le=MAX_HOLD_S)] = DEFAULT_HOLD_S  # until they fade

@@ -103,7 +103,7 @@ class Progress(Message):
     arousal: Feeling = 0.0  # of the voice, relative to the speaker's mean
     valence: Feeling = 0.0  # likewise; below 0: unpleasant
     is_laughter: bool = False  # someone laughs, which is not speech
-    is_breath: bool = False  # an audible breath
+    is_breath: bool = False  # audible breath
     # Of the lost synthesizer: the new one continues after it. In the first message of an epoch
     newest_frame: NewestFrame | None = None
 

@@ -14,7 +14,12 @@ from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import codes, find_language, language_titles, load_inventory
+from kouxing.shared.phones.inventory import (
+    find_language,
+    language_codes,
+    language_titles,
+    load_inventory,
+)
 from tests.system import ROOT, VOWELS_FILE
 
 SAMPLES = read_audio(VOWELS_FILE)[0][:, 0]
@@ -63,13 +68,13 @@ def test_a_recognizer_has_models_for_all_languages() -> None:
 
 
 def test_languages_have_codes_and_titles() -> None:
-    assert codes()["auto"] == "universal"
+    assert language_codes()["auto"] == "universal"
     assert [find_language(name) for name in ("zh", "de", "german")] == [
         "mandarin",
         "german",
         "german",
     ]
-    assert {*language_titles()} == {*codes()}
+    assert {*language_titles()} == {*language_codes()}
     assert all({*titles} == {"en", "zh"} for titles in language_titles().values())
 
 

@@ -80,7 +80,7 @@ def test_trains_resumes_and_writes_model_and_card(
 @pytest.mark.slow
 def test_needs_labels_made_by_hand(tmp_path: Path) -> None:
     languages = [write_corpus(tmp_path / "corpus", with_labels=False)]
-    with pytest.raises(UserError, match="no recording has labels made by hand"):
+    with pytest.raises(UserError, match="no recording has hand-made labels"):
         train_universal([], tmp_path / "universal.npz", languages=languages, report=print)
 
 

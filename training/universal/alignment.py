@@ -1,13 +1,13 @@
-"""Align recordings with their phones by a small classifier of features.
+"""Aligns recordings with their phones by a small classifier of features.
 
 Source: Young et al. 2009, "The HTK book", chapter 8 (Viterbi training). A classifier of the
-positions' features first learns the recordings with labels made by hand. A phone that they lack is
+positions' features is first trained on the hand-labeled recordings. A phone without labels is
 likely where phones with similar features are likely:
 
     p(u | x) = sum_v w[u, v] p(v | x),    w[u, v] ~ exp(-d(u, v) / 1.5)
 
 d is the number of panphon's features in which the phones differ, and v are the phones with labels.
-The classifier aligns all recordings, learns this alignment, and so on.
+The classifier then aligns all recordings and is trained on this alignment, repeatedly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -68,7 +68,7 @@ class Aligner:
         labels = [self._by_hand(one) for one in stored]
         by_hand = [len(phones) > 0 for phones in labels]
         if not any(by_hand):
-            raise UserError("no recording has labels made by hand; add the Berlin EmoDB")
+            raise UserError("no recording has hand-made labels; add the Berlin EmoDB")
         for number in range(_NUM_ROUNDS):
             known = [place for place, phones in enumerate(labels) if len(phones)]
             classifier, log_prior = _classifier(
@@ -106,7 +106,7 @@ class Aligner:
         )
 
     def _by_hand(self, stored: Features) -> NDArray[np.int64]:
-        """Return the phones of a recording's positions; empty without labels made by hand."""
+        """Return the phones of a recording's positions; empty without hand-made labels."""
         table = self.recordings[stored.name].labels
         if table is None:
             return np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""The block network's encoder in longer blocks, which computes features of recordings quickly.
+"""Computes features of recordings with the block network's encoder, in longer, faster blocks.
 
 Its weights are the block model's 8-bit integers. Live, blocks have 2 positions and the same right
 context; the network does not depend on the length of a block.

@@ -1,4 +1,4 @@
-"""Export the universal readout as an extension of the block network's ONNX file.
+"""Exports the universal readout as an extension of the block network's ONNX file.
 
 The extension is a part of an ONNX file. Appended to the bytes of the block network, it adds the
 readout's nodes, an input and two outputs, because joined protocol buffers merge their lists. The

@@ -1,4 +1,4 @@
-"""From corpora to the universal readout with its card."""
+"""Trains the universal readout from corpora, and writes its model card."""
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,6 @@
-"""The recordings that the universal readout is trained on.
+"""Reads the recordings on which the universal readout is trained.
 
-Whole speakers and two languages are held out, to measure unseen speakers and unknown languages.
+Whole speakers and two languages are held out, to measure errors for unseen speakers and languages.
 """
 
 import random

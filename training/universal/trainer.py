@@ -1,4 +1,4 @@
-"""Train the universal readout on stored features.
+"""Trains the universal readout on stored features.
 
 The readout is that of the block network (:mod:`kouxing.training.blocks.network`). Its loss is the
 cross-entropy with the aligned states, of a block's own positions and, with half the weight, of its

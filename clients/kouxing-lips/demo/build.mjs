@@ -11,7 +11,7 @@ const CLIENT = join(ROOT, "clients/javascript");
 const PAGE = join(ROOT, "services/gateway/page");
 const THREE = join(CLIENT, "node_modules/three");
 const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
-const LATER = /^heads\/(?!woman)|^modules\/three\/examples\/jsm\/libs\/draco/; // not needed at the first visit
+const LAZY_FILES = /^heads\/(?!woman)|^modules\/three\/examples\/jsm\/libs\/draco/; // loaded when first used
 
 const [folder] = process.argv.slice(2);
 await rm(folder, { recursive: true, force: true });
@@ -43,7 +43,7 @@ for (const name of ["BufferGeometryUtils.js", "SkeletonUtils.js"]) {
 const files = (await readdir(folder, { recursive: true, withFileTypes: true }))
   .filter((entry) => entry.isFile())
   .map((entry) => relative(folder, join(entry.parentPath, entry.name)).replaceAll("\\", "/"))
-  .filter((name) => !LATER.test(name))
+  .filter((name) => !LAZY_FILES.test(name))
   .sort();
 const hash = createHash("sha256");
 for (const name of files) hash.update(name).update(await readFile(join(folder, name)));

@@ -3,7 +3,7 @@
 import "kouxing-client/face.js";
 
 const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
-const NUM_PHONES = 12; // that are shown
+const NUM_PHONES = 12; // on the page
 const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
 const [face, note] = [byId("face"), byId("note")];
@@ -79,7 +79,7 @@ async function prepare() {
   show();
 }
 
-/** Run an action on the lip sync; show the sentence of its error. */
+/** Run an action on the lip sync; show its error message. */
 async function act(action) {
   note.textContent = "";
   try {

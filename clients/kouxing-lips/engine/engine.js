@@ -1,4 +1,4 @@
-// Lip sync of one voice: PCM in, faces out. It needs no browser, worker or thread.
+// Lip sync of one voice, from PCM to faces. It needs no browser, worker or thread.
 
 import { Face } from "./face.js";
 import { loadModel } from "./model.js";

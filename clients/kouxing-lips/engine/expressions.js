@@ -33,7 +33,7 @@ export class Expressions {
     this.showFaps(goal, holdS);
   }
 
-  /** Replace the expressions by FAPs (68,) for a time. */
+  /** Replace the expressions with FAPs (68,) for a time. */
   showFaps(goal, holdS) {
     [this.#goal, this.#remainingS] = [goal, holdS];
   }

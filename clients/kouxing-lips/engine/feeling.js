@@ -1,4 +1,4 @@
-// The face follows the arousal and valence of the voice; services/synthesizer/modifiers/feeling.py
+// Moves the face with the arousal and valence of the voice; services/synthesizer/modifiers/feeling.py
 // has the values.
 
 import { applyExpressiveness } from "./expressions.js";

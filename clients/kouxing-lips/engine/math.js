@@ -1,4 +1,4 @@
-// Small functions that several modules need.
+// Small functions that several modules use.
 
 export function sigmoid(x) {
   return 0.5 * Math.tanh(0.5 * x) + 0.5;

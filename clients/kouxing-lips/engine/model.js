@@ -19,7 +19,7 @@ const ARRAYS = {
  * Load the models.
  *
  * @param base URL of the folder with the files; in Node also a file URL
- * @param options { phones: whether to load the phone recognizer, too }
+ * @param options { phones: whether to also load the phone recognizer }
  * @returns a promise of { ear: Network, phoneLm: PhoneLm or null, arrays: { values, shape } by name,
  *   constants, ... }; it is rejected if a file is missing or of another version
  */

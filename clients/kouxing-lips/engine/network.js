@@ -1,7 +1,7 @@
 // Runs the small ear: an ONNX graph whose tensors are vectors, with products of 8-bit integers.
 //
-// The graph is the one that the server runs with onnxruntime. Only its operators are known here.
-// Values are rounded to 32 bits after each operator, as there. All vectors are allocated once, so a
+// The graph is the one that the server runs with onnxruntime. Only its operators are supported.
+// As on the server, values are rounded to 32 bits after each operator. All vectors are allocated once, so a
 // run leaves no garbage.
 
 import { loadMatrices } from "./matvec.js";

@@ -1,4 +1,4 @@
-// Prints what the engine makes of 32-bit samples of a file: node frames.mjs MODELS FILE OPTIONS.
+// Prints the output of the engine for 32-bit samples in a file: node frames.mjs MODELS FILE OPTIONS.
 
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";

@@ -255,8 +255,8 @@ class Renderer:
         factors: Any = (moderngl.SRC_ALPHA, others, moderngl.ONE, others)
         context.blend_func = factors
         # only hair hides what is behind it
-        veils = [part for part in self.head.parts if part.transparent]
-        for part in sorted(veils, key=lambda part: part.name != shaders.HAIR):
+        blended = [part for part in self.head.parts if part.transparent]
+        for part in sorted(blended, key=lambda part: part.name != shaders.HAIR):
             target.depth_mask = part.name == shaders.HAIR
             self._draw_part(part)
         target.depth_mask = True

@@ -17,7 +17,7 @@ import { mouthLight } from "./mouth-light.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
-const VEILS = ["brows", "lashes"]; // drawn after the hair, which may be behind them
+const DRAWN_AFTER_HAIR = ["brows", "lashes"]; // drawn after the hair, which may be behind them
 const OVERLAY_SHARE = 0.6; // fraction of the overlay that the head avoids
 const HEAD_HALF_WIDTH = 0.3; // relative to the window's height
 const PORTRAIT_ASPECT = 0.66; // in narrower windows the camera moves back, so that the face fits
@@ -91,7 +91,7 @@ export class Head {
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
       node.frustumCulled = false; // its bounds do not follow the face
-      node.renderOrder = VEILS.includes(node.name) ? 1 : 0;
+      node.renderOrder = DRAWN_AFTER_HAIR.includes(node.name) ? 1 : 0;
       node.material = plain
         ? plainMaterial(node.name, node.material, gltf.scene.getObjectByName("head"), info.cel)
         : physicalMaterial(node.name, node.material);

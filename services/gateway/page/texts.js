@@ -123,7 +123,7 @@ export const TEXTS = {
   lightModel: { en: "light model", zh: "轻量模型" },
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
-  speechLanguage: { en: "Language of the speech", zh: "说话的语言" },
+  speechLanguage: { en: "Speech language", zh: "说话的语言" },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
   captions: { en: "Captions", zh: "字幕" },
   still: { en: "Keep the head still", zh: "头部保持不动" },

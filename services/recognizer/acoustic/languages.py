@@ -1,4 +1,4 @@
-"""The acoustic model of a language, for commands and services."""
+"""Chooses the acoustic model of a language for commands and services."""
 
 import copy
 from dataclasses import replace
@@ -25,9 +25,9 @@ _EXCLUDED = np.float32(-1e3)  # log-probability of a phone that the language lac
 def model_of_language(language: str | None = None, acoustic: str | None = None) -> AcousticModel:
     """Return the acoustic model with the phones of a language; by default Mandarin.
 
-    Mandarin has a model of its own. The universal model serves all other languages; it then uses
-    only the phones of the language. ``acoustic`` names another model, or its file. Without a
-    language, it is that of the model.
+    Mandarin has its own model. For other languages, the universal model is restricted to the phones
+    of the language. ``acoustic`` names another model, or its file. Without a language, the phones
+    are those of the model.
 
     Raises ``UserError`` if the language is not installed, or the model has other phones.
     """
@@ -39,7 +39,7 @@ def model_of_language(language: str | None = None, acoustic: str | None = None) 
     inventory = load_inventory(language)
     if of_model != UNIVERSAL or not inventory.has_universal_phones:
         raise UserError(
-            f"the acoustic model {acoustic or UNIVERSAL} has the phones of {of_model}; choose this"
+            f"the acoustic model {acoustic or UNIVERSAL} has the phones of {of_model}; use that"
             f" language, or a model for {language}"
         )
     return limit_phones(model, inventory.phones)

@@ -25,7 +25,7 @@ def universal_model_from(archive: Archive) -> BlockModel:
     """Build the model after checking every size; ``ValueError`` if something does not fit."""
     network = _block_network()
     if str(archive.array("block_network", ())) != _hash_of(network):
-        raise ValueError("it extends another version of the block model")
+        raise ValueError("it belongs to another version of the block model")
     extension = archive.array("extension", None).astype(np.uint8)
     return model_of(archive, np.concatenate([network, extension]))
 

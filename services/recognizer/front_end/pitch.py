@@ -18,8 +18,8 @@ _PITCH_STEP = 0.01  # ratio of neighboring pitches minus 1; half of Kaldi's take
 _FULL_SCALE = 32768.0  # Kaldi's samples are 16-bit integers
 # Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalized cross-correlation is over 0.8
 _VOICED = -0.43
-# Kaldi's tracker keeps all its input, 250 kB a second. So a younger one replaces it after this
-# number of slices. The younger one starts earlier, to agree with the older one.
+# Kaldi's tracker keeps all its input, 250 kB a second. A new tracker replaces it after this number
+# of slices. The new tracker starts earlier, so that both agree.
 _REPLACE_AFTER = 80
 _START_BEFORE = 20
 

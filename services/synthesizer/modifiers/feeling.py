@@ -1,9 +1,9 @@
-"""The face follows the arousal and valence of the voice.
+"""Moves the face with the arousal and valence of the voice.
 
 Aroused voices raise the brows, open the lids, lift the head and enlarge the mouth's movements.
-Tired voices do the opposite. Pleasant voices raise the corners of the mouth and the lower lids;
-unpleasant ones draw the brows together (Ekman & Friesen 1978, "Facial action coding system": action
-units 1, 2, 4, 5, 6, 12 and 15). Closures stay closed, as in
+Tired voices do the opposite. Pleasant voices raise the corners of the mouth and the lower lids.
+Unpleasant voices draw the brows together (Ekman & Friesen 1978, "Facial action coding system":
+action units 1, 2, 4, 5, 6, 12 and 15). Closures stay closed, as in
 :mod:`kouxing.services.synthesizer.modifiers.expressiveness`.
 """
 
@@ -19,7 +19,7 @@ from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _GAIN = 2.5  # usual voices differ from their mean by up to 0.4
 _FILTER_S = 0.4  # time constant of each filter pole
-_VISIBLE = 1e-3  # smaller feelings are not shown
+_VISIBLE = 1e-3  # weaker feelings are not shown
 _SIZE = 0.25  # of the mouth's movements, at full arousal
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 

@@ -5,7 +5,7 @@ The prosody (:mod:`kouxing.services.synthesizer.modifiers.prosody`) starts all m
 =================  ==================================================================
 prosody            movement
 =================  ==================================================================
-stressed syllable  a nod; with the strongest ones the brows rise too
+stressed syllable  a nod; the strongest ones also raise the brows
 end of a phrase    a nod
 question           the head tilts and the brows rise
 start of speech    the head turns, and returns within two seconds
@@ -19,9 +19,10 @@ listens to someone else looks at the viewer. When the other speaker pauses, it n
 
 Sources: Graf et al. 2002, "Visual prosody" (nods and brows at pitch accents and ends of phrases);
 Ambrazaitis et al. 2015 (newsreaders nod on 23 % of the words, and raise the brows on 7 %); Swerts &
-Krahmer 2010 (accented words have more of both); Munhall et al. 2004 (the head follows pitch and
-level); Hadar et al. 1984 (wide head movements when speech starts after a pause). A two-pole filter
-smooths each movement. Lips are not moved. The motion depends only on the seed and the sound.
+Krahmer 2010 (accented words have more nods and brow raises); Munhall et al. 2004 (the head follows
+pitch and level); Hadar et al. 1984 (wide head movements when speech starts after a pause). A
+two-pole filter smooths each movement. Lips are not moved. The motion depends only on the seed and
+the sound.
 """
 
 import math
@@ -62,8 +63,8 @@ _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Manner:
-    """How a face behaves while it speaks and listens. None changes nothing."""
+class Behavior:
+    """Behavior of a face while it speaks and listens. A field that is None changes nothing."""
 
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer
@@ -85,8 +86,8 @@ class SpeechIdleMotion:
         self._tilt, self._turn = _Movement(_SLOW_S), _Movement(_SLOW_S)
         self._lift = TwoPoleFilter(0.0)
 
-    def set_manner(self, change: Manner) -> None:
-        """Change the behavior."""
+    def set_behavior(self, change: Behavior) -> None:
+        """Change the behavior; fields that are None stay as they are."""
         if change.still is not None:
             self._is_still = self._idle.is_still = change.still
         if change.eye_contact is not None:

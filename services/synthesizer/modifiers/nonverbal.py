@@ -1,4 +1,4 @@
-"""Laughter and audible breaths of the voice on the face.
+"""Shows laughter and audible breaths of the voice on the face.
 
 Laughter opens the mouth, raises the corners and narrows the eyes; the head leans back (Ruch & Ekman
 2001, "The expressive pattern of laughter"). A breath parts the lips, widens the nostrils and lifts

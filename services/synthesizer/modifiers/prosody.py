@@ -1,4 +1,4 @@
-"""Prosody from levels and pitches: stressed syllables, ends of phrases and questions.
+"""Finds stressed syllables, ends of phrases and questions from levels and pitches.
 
 A syllable is stressed while its level and pitch stand out from the last seconds:
 
@@ -9,8 +9,8 @@ is a question if its pitch ends high and rises:
 
     final - lowest of the last 0.5 s of voice > 3 semitones,   final - mean > 1.3 spread
 
-``final`` is the mean of the last 60 ms of voice. Rising tones of Mandarin seldom end as high. Most
-questions with a question word do not rise.
+``final`` is the mean of the last 60 ms of voice. Rising tones of Mandarin rarely end this high.
+Most questions with a question word do not rise.
 """
 
 import math
@@ -35,14 +35,14 @@ _FINAL_S, _RISE_S, _RISE_ST, _RISE_SPREADS = 0.06, 0.5, 3.0, 1.3
 
 @dataclass(slots=True)
 class Prosody:
-    """What the sound of one session shows at a frame."""
+    """The prosody of one session at a frame."""
 
     stress: float = 0.0  # p of the current stressed syllable, otherwise 0
     silence_s: float = math.inf  # since the last speech
     phrase_s: float = 0.0  # duration of speech in the current phrase
     raised: float = 0.0  # pitch above the mean, in spreads, -1 to 1
     has_ended: bool = False  # a phrase has ended at this frame
-    is_question: bool = False  # likewise, with a rising pitch
+    is_question: bool = False  # it has ended with a rising pitch
 
 
 class ProsodyTracker:

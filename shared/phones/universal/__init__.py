@@ -1,4 +1,4 @@
-"""Phones of all languages: 85 IPA segments and silence, above the languages' own inventories.
+"""Phones of all languages: 85 IPA segments and silence, shared by the languages' inventories.
 
 ``phones.tsv`` has the columns of ``kouxing.shared.phones.inventory``, and:
 
@@ -9,7 +9,7 @@ ipa       IPA letter (International Phonetic Association, 2020); empty for silen
 features  24 features of panphon, ``+``, ``-`` or ``0``; the file's head names them
 ========  ==============================================================================
 
-A phone's symbol is made of letters a-z, as on the wire; ``write`` returns its IPA letter. A
+A phone's symbol is made of letters a-z, as on the wire; ``write`` converts symbols to IPA. A
 diphthong is two phones. Length, stress and tone are not part of a phone. Secondary palatalization
 is left out, except for ɲ and ʎ. Texts may mix languages (``mixed_text``).
 """

@@ -1,6 +1,6 @@
 """Texts of several languages: Mandarin with English words, as people speak.
 
-Each script is read in one language. A text in another language needs the language to be chosen.
+Each script is read in one language. For other languages, the user must choose one.
 Numbers are read in the language of the words before them. In a text with kana, Chinese characters
 are Japanese.
 """

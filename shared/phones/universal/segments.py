@@ -16,8 +16,8 @@ _MAX_LETTERS = 4
 def read_ipa(ipa: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the phones of a text in IPA, and its symbols that have no phone.
 
-    Stress, length and tone are left out, and modifiers that no phone has, such as in lʷ. A tied
-    pair that is not one phone, such as a͡ɪ, is two.
+    Stress, length, tone, and modifiers that no phone has (as in lʷ) are left out. A tied pair that
+    is not a single phone, such as a͡ɪ, becomes two phones.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def read_ipa(ipa: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def ipa_of(symbol: str) -> str:
-    """Return the IPA letter of a phone; other texts stay as they are."""
+    """Return the IPA letter of a phone; other text stays as it is."""
     row = _rows().get(symbol)
     return row["ipa"] if row and row["ipa"] else symbol
 
@@ -76,7 +76,7 @@ def _spellings() -> dict[str, tuple[str, ...]]:
 
 @cache
 def nearest_phone(phone: str, phones: tuple[str, ...]) -> str:
-    """Return the phone of a list with the most common features; itself if it is listed."""
+    """Return the listed phone that shares most features with a phone; itself if it is listed."""
     if phone in phones:
         return phone
     known, own = features(), features()[phone]

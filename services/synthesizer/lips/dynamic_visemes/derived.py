@@ -22,8 +22,8 @@ class DerivedViseme:
 
     name: str
     base: str
-    opening: float  # times that of the base
-    rounding: float  # times that of the base
+    opening: float  # factor on that of the base
+    rounding: float  # factor on that of the base
     spread: float  # added to the width, FAP units
     tongue: str  # viseme with the same tongue, or the values of _TONGUE
 
@@ -48,7 +48,7 @@ def add_derived(arrays: Mapping[str, Array], index: Mapping[str, int]) -> dict[s
     """Append the rows of the derived visemes to arrays with a row for each trained viseme.
 
     ``index`` is the row of each trained viseme. A derived viseme has the dominance of its base and
-    a target of its own. It does not close the lips.
+    its own target. It does not close the lips.
     """
     bases = [index[viseme.base] for viseme in derived_visemes()]
     rows = {name: array[bases] for name, array in arrays.items()}
