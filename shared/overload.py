@@ -58,7 +58,7 @@ class NetworkPace:
     Parameters
     ----------
     work
-        The work so far, which does not count.
+        The work so far; it does not count toward the load.
     now_s
         The time, in seconds, on any monotonic clock.
     """

@@ -1,6 +1,6 @@
 // The newest frames, from which the face at any time is interpolated.
 
-const MAX_S = 60; // that are kept
+const MAX_S = 60; // older frames are dropped
 
 export class FrameTrack {
   #frames = []; // times rise

@@ -3,13 +3,13 @@ import type { EngineOptions, ExpressionName, LipFrame, LipPhone, ShapeSetName } 
 export type { EngineOptions, ExpressionName, LipFrame, LipPhone, ShapeSetName };
 
 export interface LipSyncEventMap {
-  /** The voice starts or ends, or laughter does. */
+  /** Speech or laughter starts or ends. */
   voice: CustomEvent<{ timeS: number; isSpeaking: boolean; isLaughing: boolean }>;
   /** A phone is found or changed. */
   phone: CustomEvent<LipPhone>;
   /** New frames; `startS` is the start of the session on the clock of `context`, null for push(). */
   frames: CustomEvent<{ frames: LipFrame[]; startS: number | null }>;
-  /** A sentence for the user, for example that the page needs a click; empty once it no longer applies. */
+  /** A message for the user, for example that the page needs a click; empty when it no longer applies. */
   notice: CustomEvent<string>;
   /** An AudioBuffer has been played. */
   ended: Event;
@@ -19,7 +19,7 @@ export interface LipSyncEventMap {
 export class LipSync extends EventTarget {
   /** Load the models and the worker. `models` is the URL of their folder; default: the package's. */
   static create(options?: EngineOptions & { models?: string | URL }): Promise<LipSync>;
-  /** Names of the weights of each set, known from the first source on. */
+  /** Names of the weights of each set; available after the first source. */
   readonly names: Partial<Record<ShapeSetName, string[]>>;
   /** The audio context of this lip sync. */
   readonly context: AudioContext;
@@ -27,7 +27,7 @@ export class LipSync extends EventTarget {
   readonly current: LipFrame | null;
   /** Return the face at a time of the session, seconds; null before the first frame. */
   at(timeS: number): LipFrame | null;
-  /** Follow the microphone. Rejected with a sentence for the user if it cannot be opened. */
+  /** Follow the microphone. Rejects with a message for the user if it cannot be opened. */
   listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;
   /** Follow a source. AudioBuffers and media elements are also played, in sync with the face. */
   listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
@@ -35,7 +35,7 @@ export class LipSync extends EventTarget {
   open(sampleRateHz: number): Promise<void>;
   /** Take PCM, mono in [-1, 1]; it may come faster than real time. */
   push(samples: Float32Array): void;
-  /** End pushed audio. Resolved when all its frames are known. */
+  /** End pushed audio. Resolves when all its frames are known. */
   finish(): Promise<void>;
   /** Show expressions, strengths 0 to 1, for some seconds. */
   express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;
@@ -43,7 +43,7 @@ export class LipSync extends EventTarget {
   resume(): Promise<void>;
   /** Stop following the sound. */
   stop(): void;
-  /** Stop, and release everything. */
+  /** Stop, and release all resources. */
   close(): void;
   addEventListener<K extends keyof LipSyncEventMap>(
     type: K,

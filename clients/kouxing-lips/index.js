@@ -1,4 +1,4 @@
-// Lip sync in a page: microphone, media or PCM in, faces out. All sound stays on the device.
+// Lip sync in a page, from microphone, media or PCM to faces. All sound stays on the device.
 
 import { FrameTrack } from "./frame-track.js";
 
@@ -13,7 +13,7 @@ const TEXTS = {
   NotFoundError: "no microphone was found; connect one, and try again",
   NotReadableError: "another program uses the microphone, or it is broken; close that program, and try again",
   unplugged: "the microphone was unplugged; connect it, and start again",
-  telephone: "the microphone sends 8 kHz, as a telephone does, so the lips are less exact; choose another microphone",
+  telephone: "the microphone sends 8 kHz, as a telephone does, so the lips are less accurate; choose another microphone",
   suspended: "the browser has not started the sound yet; click on the page",
   interrupted: "the system paused the sound, for example for a call; it continues afterwards",
   hidden: "the tab is in the background; the lips follow the sound again when it is visible",
@@ -55,7 +55,7 @@ export class LipSync extends EventTarget {
     return lips;
   }
 
-  /** Follow the microphone. Rejected with a sentence that says what to do. */
+  /** Follow the microphone. If it cannot be opened, rejects with a message that says what to do. */
   async listenToMicrophone(constraints = {}) {
     if (!navigator.mediaDevices) throw new Error(TEXTS.insecure);
     const audio = { channelCount: 1, echoCancellation: true, autoGainControl: true, ...constraints };
@@ -87,7 +87,7 @@ export class LipSync extends EventTarget {
 
   /**
    * Follow a MediaStream, a track, an AudioBuffer, a media element or an audio node of this.context.
-   * Buffers and elements are also played, with the delay that the face has.
+   * Buffers and elements are also played, delayed like the face.
    */
   async listenTo(source) {
     const context = this.context;
@@ -133,7 +133,7 @@ export class LipSync extends EventTarget {
     this.#worker.postMessage({ type: "push", session: this.#session, samples });
   }
 
-  /** End pushed audio. Resolved when all its frames are known. */
+  /** End pushed audio. Resolves when all its frames are known. */
   finish() {
     return new Promise((resolve) => {
       this.#pending.set("finished", resolve);
@@ -185,7 +185,7 @@ export class LipSync extends EventTarget {
     this.#source = null;
   }
 
-  /** Stop, and release everything. */
+  /** Stop, and release all resources. */
   close() {
     this.stop();
     document.removeEventListener("visibilitychange", this.#onVisibility);
@@ -254,7 +254,7 @@ export class LipSync extends EventTarget {
 
 const elementNodes = new WeakMap(); // an element allows only one node
 
-/** Return the audio node of a source; its property isPlayed tells whether the page plays it. */
+/** Return the audio node of a source. Its property isPlayed is true if the page plays the sound. */
 function sourceNode(context, source) {
   if (source instanceof AudioNode) return Object.assign(source, { isPlayed: false });
   if (source instanceof MediaStreamTrack) source = new MediaStream([source]);

@@ -22,7 +22,7 @@ const HANDLERS = {
     self.postMessage({ type: "loaded" });
   },
 
-  /** Start a session; its sound comes from a port, or by "push". */
+  /** Start a session; its sound arrives over a port, or by "push". */
   open({ session, options, input }) {
     port?.close();
     engine = new LipEngine(model, options);

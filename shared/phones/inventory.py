@@ -3,7 +3,7 @@
 A language is a package of tables (``table_language``), if it has ``language.toml``. Its phones are
 those of the universal inventory.
 
-A language with phones of its own is a Python package with ``phones.tsv`` and a function
+A language with its own phones is a Python package with ``phones.tsv`` and a function
 ``pronounce``. It may also have:
 
 - ``transcribe``, a function that returns a text's syllables with their spelling, and the parts that

@@ -218,7 +218,7 @@ def joined(
 ) -> LipPredictor:
     """Combine the network with the linear part (see ``fit_linear``) and the ear's lips.
 
-    Lip to teeth comes from the network. The FAPs are scaled around their means.
+    Lip-to-teeth contact comes from the network. The FAPs are scaled around their means.
     """
     weights = {name: value.numpy() for name, value in network.state_dict().items()}
     units, shape = basis.units, (len(DELAYS_S), NUM_OUTPUTS)

@@ -9,7 +9,7 @@ import { readGraph } from "./onnx-file.js";
 
 const PRODUCT = "MatMulIntegerToFloat";
 
-// Each of these loops is a function of its own, so that JavaScript engines compile it for its operation.
+// Each of these loops is a separate function, so that JavaScript engines compile it for its operation.
 const UNARY = {
   Abs(out, x) {
     for (let i = 0; i < out.length; i++) out[i] = Math.abs(x[i]);

@@ -1,7 +1,7 @@
 // Position and velocity of values, transitions between trajectories, and the track of lip frames;
 // services/synthesizer/lips has the formulas in trajectory.py and learnt/track.py.
 
-/** A state { value, velocity } that does not move. */
+/** Return a state { value, velocity } at rest. */
 export function still(value) {
   return { value, velocity: value.map(() => 0) };
 }

@@ -17,7 +17,7 @@ import { mouthLight } from "./mouth-light.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
-const DRAWN_AFTER_HAIR = ["brows", "lashes"]; // drawn after the hair, which may be behind them
+const DRAWN_AFTER_HAIR = ["brows", "lashes"]; // the hair may be behind them
 const OVERLAY_SHARE = 0.6; // fraction of the overlay that the head avoids
 const HEAD_HALF_WIDTH = 0.3; // relative to the window's height
 const PORTRAIT_ASPECT = 0.66; // in narrower windows the camera moves back, so that the face fits

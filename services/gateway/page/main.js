@@ -48,7 +48,7 @@ const speech = new SpeechControls(sound, {
   session(name) {
     if (name !== null) {
       showLipModel();
-      if (name === gateway.session) sendMotions(); // the viewer was notified first
+      if (name === gateway.session) sendMotions(); // the session was reported to the viewer first
     }
     socket.follow(name ?? "");
   },

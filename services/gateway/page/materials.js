@@ -179,7 +179,7 @@ export function studioEnvironment(renderer) {
   return texture;
 }
 
-/** Hair has soft edges, and hides what is behind it. Its triangles are in the order of blending. */
+/** Hair has soft edges and hides parts behind it. Its triangles are stored in blending order. */
 function surface(name, { side, transparent, depthWrite }) {
   return { side, transparent: transparent || name === HAIR, depthWrite };
 }
