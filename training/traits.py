@@ -93,10 +93,10 @@ def train_traits(
         recordings=speech,
         notes=(
             f"{len(spoken)} recordings of {len(speakers_of(spoken))} actors name an emotion "
-            "(EmoDB: Burkhardt et al. 2005). Their arousal and valence are placed by hand on the "
-            "circumplex of Russell 1980. Each recording is used twice, unchanged and augmented. "
-            "Laughter and breath are those of one man.\n\n"
-            "Rank correlation with the labels, of each speaker with the readout of the other "
+            "(EmoDB: Burkhardt et al. 2005). Arousal and valence of each emotion were placed by hand "
+            "on the circumplex of Russell 1980. Each recording is used twice, unchanged and "
+            "augmented. All laughter and breaths are from one man.\n\n"
+            "Rank correlation with the labels, for each speaker with a readout trained on the other "
             f"speakers: arousal {arousal:.2f}, valence {valence:.2f}."
         ),
     )

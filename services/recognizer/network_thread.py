@@ -1,4 +1,4 @@
-"""Runs the block network in its own thread, so that other sessions do not wait for it."""
+"""Runs the block network in its own thread, so that other sessions do not wait for its runs."""
 
 import time
 from collections.abc import Callable, Sequence
