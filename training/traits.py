@@ -93,11 +93,11 @@ def train_traits(
         recordings=speech,
         notes=(
             f"{len(spoken)} recordings of {len(speakers_of(spoken))} actors name an emotion "
-            "(EmoDB: Burkhardt et al. 2005). Arousal and valence of each emotion were placed by hand "
-            "on the circumplex of Russell 1980. Each recording is used twice, unchanged and "
+            "(EmoDB: Burkhardt et al. 2005). Arousal and valence of each emotion were placed by "
+            "hand on the circumplex of Russell 1980. Each recording is used twice, unchanged and "
             "augmented. All laughter and breaths are from one man.\n\n"
-            "Rank correlation with the labels, for each speaker with a readout trained on the other "
-            f"speakers: arousal {arousal:.2f}, valence {valence:.2f}."
+            "Rank correlation with the labels, for each speaker with a readout trained on the "
+            f"other speakers: arousal {arousal:.2f}, valence {valence:.2f}."
         ),
     )
 
