@@ -1,7 +1,7 @@
 """Decodes the live audio of all sessions in batches; the block network runs on a thread."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Sized
 
 from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
@@ -20,6 +20,8 @@ class LiveBatches:
 
     Parameters
     ----------
+    sessions
+        All sessions of the service.
     recognizer
         Decodes the streams of the sessions.
     busy
@@ -36,6 +38,7 @@ class LiveBatches:
 
     def __init__(
         self,
+        sessions: Sized,
         recognizer: Recognizer,
         busy: LoadMeter,
         wake: Callable[[], None],
@@ -43,6 +46,7 @@ class LiveBatches:
         on_decoded: Callable[[Sequence[RecognizerSession]], None],
         on_batch: Callable[[], None],
     ) -> None:
+        self._all = sessions
         self._recognizer = recognizer
         self._busy = busy
         self._on_early, self._on_decoded, self._on_batch = on_early, on_decoded, on_batch
@@ -61,19 +65,18 @@ class LiveBatches:
         network_s = self._recognizer.network_s
         return Work(network_s, time.thread_time() + self._network.work_s - network_s)
 
-    def decode_all(self, sessions: Sequence[RecognizerSession], *, is_alone: bool) -> None:
+    def decode_all(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode all queued audio of sessions."""
         while any(session.is_decoding for session in sessions):
             self._network.start(time.monotonic())
             self._network.wait()
-            self.decode(sessions, is_alone=is_alone)
+            self.decode(sessions)
 
-    def decode(self, sessions: Sequence[RecognizerSession], *, is_alone: bool) -> None:
+    def decode(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode a part of the queued audio of sessions; skip audio that is too old.
 
         The thread of the block network continues with sessions that need the network. Meanwhile,
-        their further audio waits. Under load, their lips do not. If a session ``is_alone`` in the
-        service, no other one waits, so it does not need the thread.
+        their further audio waits. Under load, their lips do not.
         """
         # Under load, the network runs at the longest hop, and on another core.
         network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
@@ -91,7 +94,7 @@ class LiveBatches:
             for session in group:
                 session.accept_waveform(part_s, now_s, self._pace.hop)
             self._recognizer.hear_streams([session.stream for session in group])
-            if is_alone:
+            if len(self._all) <= 1:  # no other session waits
                 network_s = self._recognizer.network_s
                 self._decode(group)
                 self._busy.add((network_weight - 1.0) * (self._recognizer.network_s - network_s))

@@ -25,10 +25,11 @@ from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.starting_sessions import StartingSessions
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.clock import to_samples
-from kouxing.shared.keys import Peer
+from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
@@ -89,9 +90,11 @@ class RecognizerService(Service):
         self._recognizer = Recognizer(model, config.output_rule)
         self.facts = SessionFacts(language=model.inventory.language)
         self.languages = [*LANGUAGES_OF_MODELS]
+        self._starting = StartingSessions(model.inventory.language, self.waker.wake)
         self._lip_predictor = lip_predictor or load_lip_predictor()
         self._recognizer.warm_up()
         self._live = LiveBatches(
+            self._sessions,
             self._recognizer,
             self.busy,
             self.waker.wake,
@@ -113,7 +116,7 @@ class RecognizerService(Service):
         has_unpaced = bool(self._unpaced) and not self._is_unpaced_blocked
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
         self._read_late_audio()
-        self._live.decode([*self._sessions.values()], is_alone=self._is_alone)
+        self._live.decode([*self._sessions.values()])
         is_live_waiting = self._has_live_audio or (
             not self._is_live_blocked and self._audio.wait(0.0)
         )
@@ -143,12 +146,17 @@ class RecognizerService(Service):
             yield dataclasses.replace(session.start, face=session.face.at(now_s))
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        session = self._sessions.get(message.session)
-        if session is not None:
+        self._starting.set_face(message.session, message.face)
+        if (session := self._sessions.get(message.session)) is not None:
             session.face.change(message.face, time.monotonic())
 
     def start_session(self, start: StartSession) -> bool:
-        """Create a session, or connect an existing one to another synthesizer."""
+        """Create a session, or connect an existing one to another synthesizer.
+
+        The first session in another language starts when its model is loaded.
+        """
+        if self._starting.add(start):
+            return False
         session = self._sessions.get(start.session)
         is_new = session is None or session.start.token != start.token
         if session is None or is_new:
@@ -177,17 +185,16 @@ class RecognizerService(Service):
 
     def stop_session(self, session: str) -> None:
         """Forget a session."""
-        stopped = self._sessions.pop(session, None)
-        if stopped is not None:
+        self._starting.remove(session)
+        if (stopped := self._sessions.pop(session, None)) is not None:
             self._unpaced.drop(stopped, keep_end=False)
             free_at_s = time.monotonic() + FREE_MEMORY_AFTER_S
             self._free_memory_at_s = min(self._free_memory_at_s, free_at_s)
 
     def flush_session(self, session: str) -> None:
         """Drop the current speech; the next audio starts again."""
-        flushed = self._sessions.get(session)
-        if flushed is not None:
-            self._live.decode_all([flushed], is_alone=self._is_alone)
+        if (flushed := self._sessions.get(session)) is not None:
+            self._live.decode_all([flushed])
             self._unpaced.drop(flushed, keep_end=True)
             flushed.link.forget()
             flushed.without_audio_s = 0.0  # so that the face learns of a stalled client again
@@ -195,10 +202,12 @@ class RecognizerService(Service):
             self._send_results(flushed)
 
     def on_tick(self, now_s: float) -> float:
-        """Acknowledge audio, report stalled clients, and resend to the synthesizers.
+        """Start sessions, acknowledge audio, report stalled clients, and resend to synthesizers.
 
         Clients must wait while a synthesizer's acknowledgements are overdue.
         """
+        for start in self._starting.take_ready():
+            self._on_start_session(start, NO_PEER)
         if now_s >= self._free_memory_at_s:
             self._free_memory_at_s = math.inf
             trim_heap()
@@ -232,7 +241,7 @@ class RecognizerService(Service):
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
         sessions = self._sessions.values()
-        self._live.decode_all([*sessions], is_alone=self._is_alone)
+        self._live.decode_all([*sessions])
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
         while self._unpaced:
@@ -304,11 +313,6 @@ class RecognizerService(Service):
                     audio.overload.adapt(now_s)
                 return
             self.handle_messages(self._audio)
-
-    @property
-    def _is_alone(self) -> bool:
-        """Whether there is only one session."""
-        return len(self._sessions) <= 1
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode the accepted audio of some sessions."""
@@ -385,8 +389,7 @@ class RecognizerService(Service):
         if (acoustic := session.acoustic_message(results)) is not None:
             session.replay.send(acoustic, now_s)
         for result in results:
-            published = session.published_message(result)
-            if published is not None:
+            if (published := session.published_message(result)) is not None:
                 session.replay.send(published, now_s)
                 if isinstance(result, SpeechChange):
                     self.send_to_control(published)
@@ -399,11 +402,9 @@ class RecognizerService(Service):
                 self.publish_event(name, session.name, media_time=to_samples(result.time_s))
 
     def _on_joined(self, session: str) -> None:
-        joined = self._sessions.get(session)
-        if joined is not None:
+        if (joined := self._sessions.get(session)) is not None:
             joined.replay.repeat(time.monotonic())
 
     def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
-        session = self._sessions.get(ack.session)
-        if session is not None:
+        if (session := self._sessions.get(ack.session)) is not None:
             session.on_acknowledge(ack, time.monotonic())

@@ -1,5 +1,6 @@
 """The recognizer's loop with real sockets: how much it does at a time."""
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,13 +8,21 @@ from itertools import pairwise
 
 import pytest
 
+from kouxing.services.recognizer import starting_sessions
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.live_batches import MAX_BATCH_S
 from kouxing.services.recognizer.service import MAX_UNPACED_S, RecognizerService
 from kouxing.shared.bus import Bus
+from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES
+from kouxing.shared.wire.session import SessionFacts
+from kouxing.shared.wire.speech import AcousticModel as AcousticModelName
 from tests.live_streams import START
 from tests.system import free_port
 
@@ -35,9 +44,13 @@ class Recognizer(RecognizerService):
         )
         self.media_times: list[int] = [0]
         self.warned: list[tuple[str, str]] = []
+        self.started: list[str] = []
 
     def warn(self, reason: str, text: str, session: str = "") -> None:
         self.warned.append((reason, text))
+
+    def session_started(self, start: StartSession, media_time: int = 0) -> None:
+        self.started.append(start.session)
 
     def send_heartbeat_if_due(self) -> None:
         self.media_times += [session.stream.media_time for session in self._sessions.values()]
@@ -48,7 +61,7 @@ class Recognizer(RecognizerService):
 
     def decode_all(self) -> None:
         while self._has_live_audio:
-            self._live.decode([*self._sessions.values()], is_alone=self._is_alone)
+            self._live.decode([*self._sessions.values()])
         while self._unpaced:
             self._decode_unpaced()
             self.send_heartbeat_if_due()
@@ -108,3 +121,56 @@ def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
         assert other.next_media_time == 8000 * num_long
         assert other.num_gaps == 0  # no audio was dropped
     assert not service.warned
+
+
+def test_other_sessions_continue_while_a_model_is_loaded(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_released, loaded_on = threading.Event(), list[int]()
+
+    def load_slowly(language: str) -> AcousticModel:
+        loaded_on.append(threading.get_ident())
+        assert is_released.wait(60.0)
+        return model_of_language(language)
+
+    monkeypatch.setattr(starting_sessions, "model_of_language", load_slowly)
+    german = replace(UNPACED, session="de", facts=SessionFacts(language="german"))
+    live = replace(UNPACED, session="live", paced=True)
+    for start in (live, german, replace(german, session="closed")):
+        service._on_start_session(start, Peer())
+    service.receive(chunk(0, 3200, "live"))
+    service.decode_all()
+    assert service._sessions["live"].stream.media_time > 0
+    service._on_set_face(
+        SetFace(session="de", face=FaceSettings(acoustic=AcousticModelName.LIGHT)), Peer()
+    )
+    service.stop_session("closed")
+    assert service.started == ["live"]
+    is_released.set()
+    end_s = time.monotonic() + 60
+    while len(service.started) < 2 and time.monotonic() < end_s:
+        service.step(0.01)
+    assert service.started == ["live", "de"]
+    assert {*service._sessions} == {"live", "de"}
+    assert service._sessions["de"].face.settings.acoustic == AcousticModelName.LIGHT
+    assert len(loaded_on) == 1
+    assert loaded_on != [threading.get_ident()]
+    assert service.start_session(replace(german, session="later"))  # at once
+    service.receive(chunk(0, 3200, "later"))
+    service.decode_all()
+    assert service._sessions["later"].stream.media_time > 0
+
+
+def test_reports_a_model_that_cannot_be_loaded(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(language: str) -> AcousticModel:
+        raise UserError(f"no model for {language}")
+
+    monkeypatch.setattr(starting_sessions, "model_of_language", fail)
+    service._on_start_session(replace(UNPACED, facts=SessionFacts(language="german")), Peer())
+    end_s = time.monotonic() + 60
+    while not service.warned and time.monotonic() < end_s:
+        service.step(0.01)
+    assert service.warned == [("start", "no model for german")]
+    assert not service._sessions

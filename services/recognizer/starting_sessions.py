@@ -1,0 +1,74 @@
+"""Sessions that wait for the acoustic model of their language, which a thread loads."""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import FaceSettings
+
+
+class StartingSessions:
+    """Loads each model at its first use, while other sessions continue.
+
+    Parameters
+    ----------
+    language
+        The language of the model that is loaded already.
+    on_loaded
+        Called on the thread when a model is loaded.
+    """
+
+    def __init__(self, language: str, on_loaded: Callable[[], None]) -> None:
+        self._language = language
+        self._on_loaded = on_loaded
+        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="models")
+        self._models: dict[str, Future[AcousticModel]] = {}  # by language
+        self._starts: dict[str, StartSession] = {}  # by session
+
+    def add(self, start: StartSession) -> bool:
+        """Let a session wait, if its model is not loaded yet; return whether it waits.
+
+        Raises ``UserError`` if no model has the language.
+        """
+        language = start.facts.language
+        if language in (None, self._language):
+            return False
+        if language not in self._models:
+            model = self._models[language] = self._executor.submit(_load, language)
+            model.add_done_callback(lambda _: self._on_loaded())
+        if self._models[language].done():
+            self._models[language].result()
+            return False
+        self._starts[start.session] = start
+        return True
+
+    def remove(self, session: str) -> None:
+        """Forget a session, if it waits."""
+        self._starts.pop(session, None)
+
+    def set_face(self, session: str, face: FaceSettings) -> None:
+        """Change the face of a session, if it waits."""
+        if (start := self._starts.get(session)) is not None:
+            self._starts[session] = replace(start, face=start.face.merged_with(face))
+
+    def take_ready(self) -> list[StartSession]:
+        """Return the sessions whose model is now loaded; they wait no longer."""
+        ready = [
+            start
+            for start in self._starts.values()
+            if self._models[start.facts.language or self._language].done()
+        ]
+        for start in ready:
+            del self._starts[start.session]
+        return ready
+
+
+def _load(language: str) -> AcousticModel:
+    model = model_of_language(language)
+    if isinstance(model, BlockModel):
+        model.session  # noqa: B018 - opens the network, which takes most of the time
+    return model
