@@ -7,6 +7,8 @@ course 16, 2002.
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from kouxing.services.driver.render.renderer import standalone_context
 from kouxing.training.heads import subdivision
@@ -17,6 +19,7 @@ Float = NDArray[np.float64]
 
 _SKULL = np.array([0.0, 5.93, 0.42])  # its middle, dm
 _HIDDEN = 0.002  # fraction of the sphere that is visible from a hidden vertex, at most
+_TOOTH_SHOWN = 0.4  # a tooth with a smaller share of visible triangles is removed
 _SIZE = 512  # px
 _NUM_DIRECTIONS = 160
 _VERTEX = """
@@ -97,7 +100,7 @@ def _opened(piece: HeadPiece) -> Float:
 def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> None:
     """Bake the ambient occlusion into the vertex colors of a head's pieces; skin is the first.
 
-    Hidden triangles of the teeth are removed.
+    Hidden triangles of the teeth are removed, and teeth that are mostly hidden.
 
     ``layout`` (V, 3) are the skin's vertices on the reference head, dm. ``cavity`` (V,) are those
     that line the mouth.
@@ -143,7 +146,17 @@ def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> 
         part.colors = part.colors * shaded
         if piece.name.startswith("teeth"):
             visible = seen[first : first + len(part.vertices)] > _HIDDEN
-            piece.keep(np.asarray(visible[part.triangles].any(axis=1)))
+            piece.keep(_shown(part.triangles, visible))
+
+
+def _shown(triangles: NDArray[np.int64], visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which triangles (F,) of the teeth are visible, without fragments of hidden teeth."""
+    edges = np.concatenate([triangles[:, :2], triangles[:, 1:]]).T
+    graph = coo_array((np.ones(edges.shape[1]), edges), shape=(len(visible), len(visible)))
+    tooth = connected_components(graph, directed=False)[1][triangles[:, 0]]
+    shown = visible[triangles].any(axis=1)
+    share = np.bincount(tooth, shown) / np.maximum(np.bincount(tooth), 1)
+    return np.asarray(shown & (share[tooth] > _TOOTH_SHOWN))
 
 
 def _outward(piece: HeadPiece) -> Float:

@@ -19,7 +19,7 @@ class Person:
     brows: str
     lashes: str = "eyelashes01"
     raised: float = 0.0  # offset of tongue and lower teeth, dm
-    tucked: float = 0.0  # offset of the upper teeth, dm, so that u and o differ
+    tucked: float = 0.0  # offset of the upper teeth, dm, so that f meets them and u and o differ
 
 
 def _both(name: str, amount: float) -> Shape:
@@ -85,6 +85,7 @@ PEOPLE = {
         skin="young_lightskinned_female_diffuse",
         hair="bob02",
         brows="eyebrow001",
+        tucked=0.0075,
     ),
     "man": Person(
         targets=(("macrodetails/asian-male-young", 1.0), *_both("ears/ear-wing-decr", 0.50),
@@ -99,6 +100,7 @@ PEOPLE = {
         skin="young_lightskinned_male_diffuse",
         hair="short01",
         brows="eyebrow012",
+        tucked=0.0105,
     ),
     "elder": Person(
         targets=(("macrodetails/asian-male-old", 1.0), *_both("ears/ear-wing-decr", 0.40),
@@ -110,6 +112,7 @@ PEOPLE = {
         skin="old_lightskinned_male_diffuse2",
         hair="short04",
         brows="eyebrow008",
+        tucked=0.0110,
     ),
     "child": Person(
         targets=(("macrodetails/asian-male-child", 0.65), ("macrodetails/asian-male-baby", 0.35),
@@ -140,6 +143,7 @@ PEOPLE = {
         skin="young_darkskinned_female_diffuse",
         hair="afro01",
         brows="eyebrow001",
+        tucked=0.0120,
         raised=0.003,
     ),
     "leo": Person(
