@@ -32,7 +32,7 @@ from kouxing.corpora.emotions import FEELINGS, read_emotions, speakers_of
 from kouxing.corpora.feature_cache import as_floats, read_audio
 from kouxing.corpora.sounds import read_sounds
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.ear import HeardPosition, Voice, load_ear
+from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.training.model_card import write_card
@@ -102,7 +102,7 @@ def train_traits(
     )
 
 
-def _ear_positions(samples: Floats, rng: np.random.Generator) -> Iterator[list[HeardPosition]]:
+def _ear_positions(samples: Floats, rng: np.random.Generator) -> Iterator[list[EarPosition]]:
     """Yield the ear's positions for samples, unchanged and augmented."""
     for sound in (samples, scale_level(disturb(samples, rng), rng)):
         frames = WhisperMel().accept_waveform(sound)
@@ -113,7 +113,7 @@ def _ear_positions(samples: Floats, rng: np.random.Generator) -> Iterator[list[H
         ]
 
 
-def _mean_state(positions: Sequence[HeardPosition], states: Floats) -> Floats:
+def _mean_state(positions: Sequence[EarPosition], states: Floats) -> Floats:
     voice = np.stack([position.voice for position in positions])
     is_voiced = voice[:, Voice.SPEECH] + voice[:, Voice.SUNG] > MIN_VOICE
     if is_voiced.sum() >= _MIN_VOICED:

@@ -59,7 +59,7 @@ class Voice(IntEnum):
     LAUGHTER = 3
 
 
-class HeardPosition(NamedTuple):
+class EarPosition(NamedTuple):
     """What the ear computes at a position; shapes as above."""
 
     frames: Floats  # x as (2, 80)
@@ -111,14 +111,12 @@ class EarStream:
         self.ear = ear
         self.state = np.zeros(ear.state_width, np.float32)
 
-    def accept_position(self, frames: Floats) -> HeardPosition:
+    def accept_position(self, frames: Floats) -> EarPosition:
         """Take the next position's frames, (2, 80)."""
         return process_positions([self], [frames])[0]
 
 
-def process_positions(
-    streams: Sequence[EarStream], frames: Sequence[Floats]
-) -> list[HeardPosition]:
+def process_positions(streams: Sequence[EarStream], frames: Sequence[Floats]) -> list[EarPosition]:
     """Process the next frames, (2, 80), of several streams of one ear in one run."""
     states = np.stack([stream.state for stream in streams])
     outputs = streams[0].ear.run(np.stack(frames), states)
@@ -126,7 +124,7 @@ def process_positions(
     for stream, of_stream, *rows in zip(streams, frames, *outputs, strict=True):
         features, phones, voice, state = (row.copy() for row in rows)  # a view keeps all rows
         stream.state = state
-        positions.append(HeardPosition(of_stream, features, phones, voice, state))
+        positions.append(EarPosition(of_stream, features, phones, voice, state))
     return positions
 
 

@@ -93,7 +93,7 @@ class LiveBatches:
             group = sessions[begin : begin + MAX_TOGETHER]
             for session in group:
                 session.accept_waveform(part_s, now_s, self._pace.hop)
-            self._recognizer.hear_streams([session.stream for session in group])
+            self._recognizer.run_ear([session.stream for session in group])
             if len(self._all) <= 1:  # no other session waits
                 network_s = self._recognizer.network_s
                 self._decode(group)

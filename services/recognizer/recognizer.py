@@ -17,7 +17,7 @@ from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import hear_streams, score_streams
+from kouxing.services.recognizer.speech_scorer import run_ear, score_streams
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
@@ -103,9 +103,9 @@ class Recognizer:
         """Return whether a stream has audio to score."""
         return any(scorer.is_ready for scorer in stream.scorers)
 
-    def hear_streams(self, streams: Sequence[SpeechStream]) -> None:
+    def run_ear(self, streams: Sequence[SpeechStream]) -> None:
         """Find the speech in the audio that the streams have accepted, in batches."""
-        hear_streams([scorer for stream in streams for scorer in stream.scorers])
+        run_ear([scorer for stream in streams for scorer in stream.scorers])
 
     def needs_network(self, stream: SpeechStream) -> bool:
         """Return whether decoding a stream's audio needs a run of the block network."""

@@ -17,7 +17,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Work,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
-from kouxing.services.recognizer.ear import EarStream, HeardPosition, process_positions
+from kouxing.services.recognizer.ear import EarPosition, EarStream, process_positions
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.speech_segmenter import (
@@ -69,7 +69,7 @@ class _Slice:
 class SpeechScorer:
     """Scores the speech of one session.
 
-    ``accept_waveform`` queues the audio. ``hear_streams`` finds the speech in it and
+    ``accept_waveform`` queues the audio. ``run_ear`` finds the speech in it and
     ``score_streams`` scores the speech, together with other sessions' audio. ``get_events`` returns
     the results in order.
 
@@ -164,10 +164,10 @@ class SpeechScorer:
         """The stream that processes the positions."""
         return self._segmenter.ear
 
-    def add_ear_output(self, position: Position, heard: HeardPosition) -> None:
+    def add_ear_output(self, position: Position, ear: EarPosition) -> None:
         """Add the output of the ear at ``next_position``."""
         self._ear_queue.popleft()
-        self._queue.extend(self._segmenter.process(position, heard))
+        self._queue.extend(self._segmenter.process(position, ear))
 
     @property
     def is_ready(self) -> bool:
@@ -224,18 +224,18 @@ class SpeechScorer:
         self._release_events()
 
 
-def hear_streams(scorers: Sequence[SpeechScorer]) -> None:
+def run_ear(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
     while waiting := [(one, position) for one in scorers if (position := one.next_position())]:
         streams = [scorer.ear for scorer, _ in waiting]
-        heard = process_positions(streams, [position.mels for _, position in waiting])
-        for (scorer, position), of_scorer in zip(waiting, heard, strict=True):
+        ear_positions = process_positions(streams, [position.mels for _, position in waiting])
+        for (scorer, position), of_scorer in zip(waiting, ear_positions, strict=True):
             scorer.add_ear_output(position, of_scorer)
 
 
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Score the queued audio of several sessions, in one batch for each model."""
-    hear_streams(scorers)
+    run_ear(scorers)
     while ready := [scorer for scorer in scorers if scorer.is_ready]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]

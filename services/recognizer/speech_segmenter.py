@@ -16,7 +16,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.ear import HeardPosition, load_ear
+from kouxing.services.recognizer.ear import EarPosition, load_ear
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
@@ -98,7 +98,7 @@ class SpeechSegmenter:
         self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
         self._features: Floats | None = None  # its feature frames
         # Features and positions before speech
-        self._recent: deque[tuple[Floats, HeardPosition]] = deque(maxlen=_MAX_RECENT)
+        self._recent: deque[tuple[Floats, EarPosition]] = deque(maxlen=_MAX_RECENT)
         self._num_frames = 0
         self._is_speaking = False
 
@@ -130,20 +130,20 @@ class SpeechSegmenter:
         if self._is_speaking:
             yield self._end_speech()
 
-    def process(self, heard: Position, position: HeardPosition) -> Iterator[SpeechItem]:
+    def process(self, position: Position, ear: EarPosition) -> Iterator[SpeechItem]:
         """Start or end speech and predict lips after a position, given what the ear computed."""
-        features = heard.features
+        features = position.features
         self._num_frames += len(features)
         if self._is_speaking:
-            yield _frames_of([(features, position)])
+            yield _frames_of([(features, ear)])
         else:
-            self._recent.append((features, position))
-        self._detector.update(position.voice)
-        self._traits.accept_position(position)
+            self._recent.append((features, ear))
+        self._detector.update(ear.voice)
+        self._traits.accept_position(ear)
         if self._is_speaking and not self._detector.is_speech:
             yield self._end_speech()
         elif self._is_speaking:
-            yield from self._predict_lips(position, self._num_frames - 1)
+            yield from self._predict_lips(ear, self._num_frames - 1)
         elif self._detector.is_speech:
             yield from self._start_speech()
 
@@ -180,7 +180,7 @@ class SpeechSegmenter:
         self._is_speaking = False
         return SpeechEnd(self._num_frames)
 
-    def _predict_lips(self, position: HeardPosition, newest_frame: int) -> list[LipPositions]:
+    def _predict_lips(self, position: EarPosition, newest_frame: int) -> list[LipPositions]:
         """Return the lip frames that follow from a position, whose last frame is given."""
         if self._lip_stream is None:
             return []
@@ -188,7 +188,7 @@ class SpeechSegmenter:
         return self._lip_stream.process_position(known_s, position.frames, position.features)
 
 
-def _frames_of(positions: Sequence[tuple[Floats, HeardPosition]]) -> SpeechFrames:
+def _frames_of(positions: Sequence[tuple[Floats, EarPosition]]) -> SpeechFrames:
     """Return the frames of some positions."""
     phones = np.stack([position.phones for _, position in positions])
     features = np.concatenate([features for features, _ in positions])

@@ -30,7 +30,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
-from kouxing.services.recognizer.ear import HeardPosition, Voice, load_ear
+from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
 from kouxing.shared.errors import UserError
 
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
@@ -83,7 +83,7 @@ class VoiceTraitsStream:
         self._num_voiced = 0  # positions with a voice
         self._evidence = np.zeros(NUM_TRAITS - 2)  # of laughter, of breath
 
-    def accept_position(self, position: HeardPosition) -> None:
+    def accept_position(self, position: EarPosition) -> None:
         """Take the next position of the ear."""
         outputs = position.state @ self._readout.weights + self._readout.bias
         if position.voice[Voice.SPEECH] + position.voice[Voice.SUNG] > MIN_VOICE:

@@ -18,7 +18,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.ear import batches, lip_teacher, targets, teachers
 from kouxing.training.ear.batches import Material, batch_of, inputs_of
 from kouxing.training.ear.export import onnx_of
-from kouxing.training.ear.lip_teacher import hear
+from kouxing.training.ear.lip_teacher import teacher_features
 from kouxing.training.ear.network import NUM_FEATURES, NUM_LIPS, Ear
 from kouxing.training.ear.recipe import Sources, load_teachers, train_ear
 from kouxing.training.ear.singing import sing
@@ -65,8 +65,8 @@ def test_teachers_hear_the_phones(whisper: Path) -> None:
 
 def test_hears_long_recordings_in_parts(whisper: Path) -> None:
     networks, _ = load_teachers(whisper)
-    heard = hear(networks, np.resize(HELLO, 336_000))  # 21 s
-    assert len(heard.encoder) == len(heard.phones) == 1000 + 48
+    features = teacher_features(networks, np.resize(HELLO, 336_000))  # 21 s
+    assert len(features.encoder) == len(features.phones) == 1000 + 48
 
 
 def test_sings_and_holds_speech() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.model_file import write_archive
-from kouxing.services.recognizer.ear import HeardPosition, Voice, load_ear
+from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
 from kouxing.services.recognizer.voice_traits import (
     NUM_TRAITS,
     VoiceReadout,
@@ -30,7 +30,7 @@ def traits_of(*parts: tuple[float, Voice, Sequence[float]]) -> list[VoiceTraits]
     seen = []
     for duration_s, kind, state in parts:
         voice = np.eye(len(Voice), dtype=np.float32)[kind]
-        position = HeardPosition(none, none, none, voice, np.array(state, np.float32))
+        position = EarPosition(none, none, none, voice, np.array(state, np.float32))
         for _ in range(round(duration_s * PER_S)):
             stream.accept_position(position)
             seen.append(stream.newest)

@@ -59,7 +59,7 @@ _PARTS = ("mean", "deviation", "directions")
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class TeacherFeatures:
     """Outputs of the networks for a recording; row p is centered on 20 (p + 1) ms."""
 
     encoder: Floats  # (positions, 1536)
@@ -103,9 +103,9 @@ class LipTeacher:
     networks: Sequence[LipNetwork]
 
     @torch.no_grad()
-    def lips_of(self, heard: Heard) -> Floats:
+    def lips_of(self, features: TeacherFeatures) -> Floats:
         """Predict FAPs in canonical units, closure and lip to teeth: (positions, 17)."""
-        inputs = torch.from_numpy(_inputs(self.projection, heard))
+        inputs = torch.from_numpy(_inputs(self.projection, features))
         outputs = torch.stack([network(inputs[None])[0, :, 0] for network in self.networks])
         lips: Floats = outputs.mean(dim=0).numpy()
         lips[:, len(LIP_FAPS) :] = expit(lips[:, len(LIP_FAPS) :])
@@ -129,28 +129,28 @@ class LipTeacher:
         return cls(Projection(*(state["projection"][name].numpy() for name in _PARTS)), networks)
 
 
-def hear(teachers: Teachers, samples: Floats) -> Heard:
+def teacher_features(teachers: Teachers, samples: Floats) -> TeacherFeatures:
     """Run the networks on a whole recording at 16 kHz."""
-    heard = []
+    features = []
     for start in range(0, max(1, len(samples) - _MIN_SAMPLES), _PART_SAMPLES):
         part = samples[start : start + _PART_SAMPLES + WINDOW_SAMPLES]
         outputs = teachers.compute_targets(as_integers(part))
-        heard.append((outputs.encoder, outputs.phones))
-    encoder, phones = zip(*heard, strict=True)
-    return Heard(np.concatenate(encoder), np.concatenate(phones))
+        features.append((outputs.encoder, outputs.phones))
+    encoder, phones = zip(*features, strict=True)
+    return TeacherFeatures(np.concatenate(encoder), np.concatenate(phones))
 
 
 def train_lip_teacher(
     clips: Sequence[LipClip],
-    heard: Sequence[Heard],
+    features: Sequence[TeacherFeatures],
     phones: Mapping[str, Sequence[Phone]],
     seed: int,
 ) -> LipTeacher:
     """Train the teacher on filmed clips; ``phones`` has those of clips in its language, by name."""
-    projection = Projection.of(np.concatenate([one.encoder for one in heard]))
+    projection = Projection.of(np.concatenate([one.encoder for one in features]))
     closed_at = closed_below(clips)
     targets = []
-    for clip, one in zip(clips, heard, strict=True):
+    for clip, one in zip(clips, features, strict=True):
         time_s = POSITION_S * np.arange(1.0, 1 + len(one.encoder))
         known = phones.get(clip.name)
         targets.append(targets_at(clip, known, closed_at[clip.speaker], time_s, [0.0]))
@@ -158,7 +158,7 @@ def train_lip_teacher(
     speakers = sorted({clip.speaker for clip in clips})
     repeats = repeats_by_source(clips)
     examples = []
-    for clip, one, target in zip(clips, heard, targets, strict=True):
+    for clip, one, target in zip(clips, features, targets, strict=True):
         rows = _inputs(projection, one), standardize(target, units)
         example = Example(*rows, speakers.index(clip.speaker))
         examples += repeats[clip.source] * [example]
@@ -172,6 +172,6 @@ def train_lip_teacher(
     return LipTeacher(projection, list(process_in_order(train, range(_NUM_NETWORKS))))
 
 
-def _inputs(projection: Projection, heard: Heard) -> Floats:
-    phones = np.log(heard.phones + 1e-3) / 3 + 1
-    return np.concatenate([projection.apply(heard.encoder), phones], axis=1).astype(np.float32)
+def _inputs(projection: Projection, features: TeacherFeatures) -> Floats:
+    phones = np.log(features.phones + 1e-3) / 3 + 1
+    return np.concatenate([projection.apply(features.encoder), phones], axis=1).astype(np.float32)

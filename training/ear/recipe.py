@@ -29,7 +29,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.ear.batches import BATCH_S, Batch, Material, batch_of
 from kouxing.training.ear.export import save_ear
-from kouxing.training.ear.lip_teacher import LipTeacher, hear, train_lip_teacher
+from kouxing.training.ear.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
 from kouxing.training.ear.network import Ear
 from kouxing.training.ear.targets import Columns, Recording, Samples, TargetStore
 from kouxing.training.ear.teachers import Teachers
@@ -164,7 +164,9 @@ def _load_lip_teacher(
     """Load the lip teacher, or train it on the clips whose audio is in sync."""
     if not path.exists():
         clips = [clip for clip in all_clips if clip.is_in_sync]
-        heard = list(process_in_order(partial(hear, teachers), [clip.samples for clip in clips]))
+        features = list(
+            process_in_order(partial(teacher_features, teachers), [clip.samples for clip in clips])
+        )
         model = load_model(model_path("blocks"))
         phones = {
             clip.name: label_clip(model, clip)
@@ -172,7 +174,7 @@ def _load_lip_teacher(
             if clip.language == model.inventory.code
         }
         unfinished = path.with_suffix(".part")
-        train_lip_teacher(clips, heard, phones, seed).save(unfinished)
+        train_lip_teacher(clips, features, phones, seed).save(unfinished)
         unfinished.replace(path)
     return LipTeacher.load(path)
 

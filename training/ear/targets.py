@@ -34,7 +34,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.ear import Voice
 from kouxing.shared.errors import UserError
-from kouxing.training.ear.lip_teacher import Heard, LipTeacher
+from kouxing.training.ear.lip_teacher import LipTeacher, TeacherFeatures
 from kouxing.training.ear.singing import sing
 from kouxing.training.ear.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
 
@@ -159,9 +159,9 @@ class TargetStore:
             speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
             sounds = [sound for one in speech for sound in _cut(one)]
             computed = process_in_order(self._teachers.compute_targets, sounds)
-            heard = [Heard(outputs.encoder, outputs.phones) for outputs in computed]
-            encoder = np.concatenate([one.encoder for one in heard])
-            lips = np.concatenate([self._lip_teacher.lips_of(one) for one in heard])
+            features = [TeacherFeatures(outputs.encoder, outputs.phones) for outputs in computed]
+            encoder = np.concatenate([one.encoder for one in features])
+            lips = np.concatenate([self._lip_teacher.lips_of(one) for one in features])
             basis = {
                 "encoder_mean": encoder.mean(axis=0),
                 "encoder": _components_of(encoder - encoder.mean(axis=0)),
@@ -221,7 +221,7 @@ class TargetStore:
             voice[~self._is_audible(outputs, recording.voice)] = Voice.NONE
             scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
             encoder = (outputs.encoder - self._basis["encoder_mean"]) @ self._basis["encoder"]
-            lips = self._lip_teacher.lips_of(Heard(outputs.encoder, outputs.phones))
+            lips = self._lip_teacher.lips_of(TeacherFeatures(outputs.encoder, outputs.phones))
             lips = (lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
             rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, encoder, lips]
             targets = np.column_stack(rows).astype(np.float16)
