@@ -108,7 +108,7 @@ def kouxing(
         ),
     ] = False,
 ) -> None:
-    """Live Mandarin speech in, a talking 3-D face out."""
+    """Live speech in, a talking 3-D face out."""
 
 
 def _service_command(kind: ServiceKind) -> Callable[..., None]:
