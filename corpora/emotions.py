@@ -6,15 +6,14 @@ optional column ``phones_path`` names a table with the columns ``start_s`` and `
 1, 2 and 3 denote stressed vowels.
 """
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import read_text, split_lines
 
 # Arousal and valence, placed by hand on the circumplex of Russell 1980
 FEELINGS = {
@@ -28,7 +27,6 @@ FEELINGS = {
 }
 _EMOTION = re.compile(r"emotion (\w+)")
 _STRESS_MARKS = {"1", "2", "3"}
-_MAX_BYTES = 16 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +47,9 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecord
     ``shipping`` excludes recordings whose license does not allow distributing a model.
     """
     manifest = folder / "manifest.tsv"
-    lines = split_lines(manifest, read_text(manifest, _MAX_BYTES))
-    rows = csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE)
     recordings = []
     try:
-        for row in rows:
+        for row in read_rows(manifest):
             match = _EMOTION.search(row["note"])
             emotion = match[1] if match and match[1] in FEELINGS else None
             recording = EmotionRecording(
@@ -78,10 +74,10 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecord
 
 
 def _stressed(path: Path) -> tuple[float, ...]:
-    lines = split_lines(path, read_text(path, _MAX_BYTES))
-    rows = csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE)
     return tuple(
-        float(row["start_s"]) for row in rows if _STRESS_MARKS & set(row["marks"].split(","))
+        float(row["start_s"])
+        for row in read_rows(path)
+        if _STRESS_MARKS & set(row["marks"].split(","))
     )
 
 

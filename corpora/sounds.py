@@ -5,7 +5,6 @@ a quarter of the music and noise files are held out, by the CRC-32 of their name
 have few files, so the second half of each file is held out.
 """
 
-import csv
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,10 +15,9 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import read_text, split_lines
 
-_MAX_BYTES = 16 << 20
 _BY_FILE = ("music", "noise")
 _BACKGROUNDS = ("music", "noise", "babble")
 
@@ -42,8 +40,7 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
     sounds = []
     for folder in folders:
         manifest = folder / "manifest.tsv"
-        lines = split_lines(manifest, read_text(manifest, _MAX_BYTES))
-        rows = list(csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE))
+        rows = read_rows(manifest)
         if not rows:
             raise UserError(f"{manifest} lists no sounds; add some, or give another folder")
         try:

@@ -139,7 +139,5 @@ def load_ear(path: Path = EAR_PATH) -> Ear:
 
 
 def _ear_from(archive: Archive) -> Ear:
-    form = str(archive.array("format", ()))
-    if form != FORMAT:
-        raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
+    archive.check_format(FORMAT)
     return Ear(archive.array("network", None).astype(np.uint8))

@@ -226,9 +226,7 @@ def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
     """Read a file; ``UserError`` if it is missing, broken or of another format."""
     archive = read_archive(path)
     try:
-        form = str(archive.array("format", ()))
-        if form != FORMAT:
-            raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
+        archive.check_format(FORMAT)
         predictor = lip_predictor_from(archive)
         num_features = FRAMES_PER_POSITION * NUM_MELS + load_ear().num_features
         if len(predictor.feature_mean) != num_features:

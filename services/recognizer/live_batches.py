@@ -11,7 +11,7 @@ from kouxing.shared.overload import MAX_HOP, NetworkPace, Work
 
 MAX_BATCH_S = 0.3  # of audio that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
-MIN_TOGETHER, MAX_TOGETHER = 4, 4  # sessions
+SESSIONS_TOGETHER = 4  # the ear processes these in one run
 NETWORK_WEIGHT = 0.25  # of the block network's time in the load of the service
 
 
@@ -75,8 +75,8 @@ class LiveBatches:
     def decode(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode a part of the queued audio of sessions; skip audio that is too old.
 
-        The thread of the block network continues with sessions that need the network. Meanwhile,
-        their further audio waits. Under load, their lips do not.
+        The network's thread decodes sessions that need the block network. Until it finishes,
+        their later audio stays queued. Under load, their lips are sent before it finishes.
         """
         # Under load, the network runs at the longest hop, and on another core.
         network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
@@ -89,8 +89,10 @@ class LiveBatches:
             is_behind = any(session.audio.overload.is_behind for session in sessions)
             self._pace.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
         part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
-        for begin in range(0, len(sessions), MAX_TOGETHER):  # the first ones do not wait for all
-            group = sessions[begin : begin + MAX_TOGETHER]
+        for begin in range(
+            0, len(sessions), SESSIONS_TOGETHER
+        ):  # the first ones do not wait for all
+            group = sessions[begin : begin + SESSIONS_TOGETHER]
             for session in group:
                 session.accept_waveform(part_s, now_s, self._pace.hop)
             self._recognizer.run_ear([session.stream for session in group])

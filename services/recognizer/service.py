@@ -20,7 +20,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.live_batches import MAX_BATCH_S, MIN_TOGETHER, LiveBatches
+from kouxing.services.recognizer.live_batches import MAX_BATCH_S, SESSIONS_TOGETHER, LiveBatches
 from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk
@@ -127,7 +127,7 @@ class RecognizerService(Service):
         """Wait for messages; with several sessions, also for those that arrive soon after."""
         sockets = super().wait(timeout_s)
         early_s = self._stepped_s + STEP_S - time.monotonic()
-        if sockets and early_s > 0.0 and len(self._sessions) >= MIN_TOGETHER:
+        if sockets and early_s > 0.0 and len(self._sessions) >= SESSIONS_TOGETHER:
             time.sleep(early_s)
             sockets = super().wait(0.0)
         self._stepped_s = time.monotonic()

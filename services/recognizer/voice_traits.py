@@ -115,9 +115,7 @@ def load_voice_readout(path: Path = TRAITS_PATH) -> VoiceReadout:
 
 
 def _readout_from(archive: Archive) -> VoiceReadout:
-    form = str(archive.array("format", ()))
-    if form != FORMAT:
-        raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
+    archive.check_format(FORMAT)
     return VoiceReadout(
         weights=archive.floats("weights", load_ear().state_width, NUM_TRAITS),
         bias=archive.floats("bias", NUM_TRAITS),

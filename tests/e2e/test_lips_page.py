@@ -112,18 +112,16 @@ def test_sound_before_a_click_gives_a_notice(browser: Browser, site: Path) -> No
 def test_a_blocked_microphone_gives_a_sentence(browser: Browser, site: Path) -> None:
     with serve_folder(site) as origin:
         open_demo(browser, origin)
-        browser.evaluate(
-            "navigator.mediaDevices.getUserMedia ="
-            " () => Promise.reject(new DOMException('', 'NotAllowedError')); 1"
-        )
-        browser.click("microphone")
-        browser.wait_for(f"{NOTE}.startsWith('the microphone is blocked; allow it')")
-        browser.evaluate(
-            "navigator.mediaDevices.getUserMedia ="
-            " () => Promise.reject(new DOMException('', 'NotFoundError')); 1"
-        )
-        browser.click("microphone")
-        browser.wait_for(f"{NOTE}.startsWith('no microphone was found')")
+        for error, text in (
+            ("NotAllowedError", "the microphone is blocked; allow it"),
+            ("NotFoundError", "no microphone was found"),
+        ):
+            browser.evaluate(
+                "navigator.mediaDevices.getUserMedia ="
+                f" () => Promise.reject(new DOMException('', '{error}')); 1"
+            )
+            browser.click("microphone")
+            browser.wait_for(f"{NOTE}.startsWith('{text}')")
 
 
 def test_wrong_files_give_a_sentence(browser: Browser, site: Path) -> None:

@@ -45,6 +45,12 @@ class Archive:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
         return array
 
+    def check_format(self, expected: str) -> None:
+        """Raise ValueError if the file has another format."""
+        form = str(self.array("format", ()))
+        if form != expected:
+            raise ValueError(f"it has the format {form!r}, expected {expected!r}")
+
     def floats(self, name: str, *shape: int) -> NDArray[np.float32]:
         """Return an array of finite numbers of a given shape; ValueError if it does not fit."""
         values = self.array(name, shape).astype(np.float32)

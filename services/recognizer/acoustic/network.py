@@ -44,7 +44,7 @@ class NetworkModel(AcousticModel):
 
 
 def integer_inputs(num_axes: Mapping[str, int]) -> bytes:
-    """Return bytes that turn integer constants of an ONNX file into inputs when appended to it.
+    """Return bytes to append to an ONNX file. They turn its integer constants into inputs.
 
     ``num_axes`` has the axes of each constant, by name; each axis has length 1. All inputs together
     need less than 128 bytes. Concatenated messages of Protocol Buffers are merged, so the bytes add
