@@ -4,12 +4,13 @@
 """
 
 import json
-import sys
 
 import msgspec
 
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import VERSION
+
+_FIELD_DEPTH = 4  # $defs, message, properties, field
 
 
 def schema() -> dict[str, object]:
@@ -26,6 +27,18 @@ def schema() -> dict[str, object]:
     }
 
 
+def to_text(value: object, depth: int = 0) -> str:
+    """Return the schema as JSON, with one line for each field of a message."""
+    if not isinstance(value, dict) or depth == _FIELD_DEPTH or not _has_maps(value):
+        return json.dumps(value, sort_keys=True)
+    indent = "\n" + " " * depth
+    members = (f"{json.dumps(key)}: {to_text(value[key], depth + 1)}" for key in sorted(value))
+    return "{" + ",".join(f"{indent} {member}" for member in members) + indent + "}"
+
+
+def _has_maps(value: dict[str, object]) -> bool:
+    return any(isinstance(member, dict) for member in value.values())
+
+
 if __name__ == "__main__":
-    json.dump(schema(), sys.stdout, indent=1, sort_keys=True)
-    print()
+    print(to_text(schema()))
