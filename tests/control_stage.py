@@ -1,6 +1,5 @@
 """Control with two services that start every session at once."""
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, OpenSession
+from tests.system import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
 PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
@@ -82,12 +82,24 @@ class Stage:
 
     def step_until(self, condition: Callable[[], object]) -> None:
         """Run control and the services until a condition holds."""
-        end_s = time.monotonic() + 20
-        while not condition():
-            assert time.monotonic() < end_s
+
+        def step() -> None:
             self.control.step(0.01)
             for service in self.services:
                 self._start(service)
+
+        wait_until(condition, step=step)
+
+    def receive(self, socket: Socket, num: int = 1) -> list[Message]:
+        """Run control until a number of messages have arrived at a socket; return them."""
+        received: list[Message] = []
+
+        def step() -> None:
+            self.control.step(0.01)
+            received.extend(item.message for item in socket.receive())  # type: ignore[misc]
+
+        wait_until(lambda: len(received) >= num, step=step)
+        return received
 
     def _start(self, service: Socket) -> None:
         for received in service.receive():

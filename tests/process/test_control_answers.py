@@ -174,10 +174,7 @@ def test_a_face_learns_when_the_session_that_it_listens_to_speaks(stage: Stage) 
     for active in (True, False):
         recognizer.send(Speech(session="speaker", epoch=1, sequence=1, active=active))
     heard: list[bool | None] = []
-    for _ in range(1000):
-        stage.control.step(0.01)
-        received = [item.message for item in synthesizer.receive()]
-        heard += [message.face.listening for message in received if isinstance(message, SetFace)]
-        if len(heard) == 2:
-            break
+    while len(heard) < 2:
+        told = stage.receive(synthesizer)
+        heard += [message.face.listening for message in told if isinstance(message, SetFace)]
     assert heard == [True, False]

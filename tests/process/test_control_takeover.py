@@ -8,7 +8,6 @@ from kouxing.services.control import lifecycle, move_repeats, takeover
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,
@@ -45,30 +44,19 @@ def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStart
     return SessionStarted(session="mine", request="r", start=start)
 
 
-def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
-    """Return the next messages from control on a socket."""
-    received: list[Message] = []
-    end_s = time.monotonic() + 20
-    while len(received) < num:
-        assert time.monotonic() < end_s
-        stage.control.step(0.01)
-        received += [item.message for item in socket.receive()]  # type: ignore[misc]
-    return received
-
-
 def test_restores_a_session_unchanged(stage: Stage, client: Socket) -> None:
     recognizer, synthesizer = stage.services
-    answers(stage, synthesizer)  # its heartbeat is answered
-    answers(stage, recognizer)
+    stage.receive(synthesizer)  # its heartbeat is answered
+    stage.receive(recognizer)
     face = FaceSettings(lip_model="learnt", expressiveness=1.5)
     recognizer.send(report(face=face))
     for service in stage.services:
-        (start,) = answers(stage, service)
+        (start,) = stage.receive(service)
         assert isinstance(start, StartSession)
         assert (start.session, start.epoch, start.token) == ("mine", 4, "t")
         assert start.face == face
     client.send(CloseSession(session="mine", token="t", request="1"))
-    assert answers(stage, client) == [Done(session="mine", request="1")]
+    assert stage.receive(client) == [Done(session="mine", request="1")]
 
 
 def test_defers_a_request_until_its_session_is_restored(stage: Stage, client: Socket) -> None:
@@ -76,7 +64,7 @@ def test_defers_a_request_until_its_session_is_restored(stage: Stage, client: So
     while not stage.control._requests._deferred:
         stage.control.step(0.01)
     stage.services[0].send(report())
-    assert answers(stage, client) == [Done(session="mine", request="1")]
+    assert stage.receive(client) == [Done(session="mine", request="1")]
 
 
 @pytest.mark.parametrize("sender", ["synthesizer", "recognizer elsewhere"])
@@ -90,7 +78,7 @@ def test_only_the_recognizer_of_a_session_may_report_it(
         recognizer.send(report({**PLACED, "audio": "tcp://127.0.0.1:2"}))
     stage.control._takeover.end_s = time.monotonic() + 0.5
     client.send(CloseSession(session="mine", token="t", request="1"))
-    (answer,) = answers(stage, client)
+    (answer,) = stage.receive(client)
     assert isinstance(answer, Error)
     assert answer.code == "unknown-session"
 
@@ -101,7 +89,7 @@ def test_moves_a_session_without_synthesizer_at_the_deadline(stage: Stage) -> No
     stage.control._takeover.end_s = time.monotonic() + 0.5
     starts: list[StartSession] = []
     while not starts or starts[-1].epoch == 4:
-        told = answers(stage, synthesizer)
+        told = stage.receive(synthesizer)
         starts += [message for message in told if isinstance(message, StartSession)]
     assert starts[-1].epoch == 5
     assert starts[-1].endpoints["faps"] == PLACED["faps"]
@@ -109,16 +97,16 @@ def test_moves_a_session_without_synthesizer_at_the_deadline(stage: Stage) -> No
 
 def test_stops_unknown_sessions_only_after_the_deadline(stage: Stage) -> None:
     recognizer, _ = stage.services
-    answers(stage, recognizer)
+    stage.receive(recognizer)
     serving = beat("recognizer", sessions={"mine": SessionInput()})
     recognizer.send(serving)
-    (seen,) = answers(stage, recognizer)
+    (seen,) = stage.receive(recognizer)
     assert not isinstance(seen, CloseSession)
     stage.control._takeover.end_s = 0.0
     while stage.control._takeover.is_active:
         stage.control.step(0.02)
     recognizer.send(serving)
-    assert CloseSession(session="mine") in answers(stage, recognizer, 2)
+    assert CloseSession(session="mine") in stage.receive(recognizer, 2)
 
 
 def test_repeats_session_moved_to_the_client(
@@ -128,24 +116,24 @@ def test_repeats_session_moved_to_the_client(
     recognizer, synthesizer = stage.services
     client.send(OpenSession(session="mine", request="1"))
     for service in stage.services:
-        _, start = answers(stage, service, 2)
+        _, start = stage.receive(service, 2)
         assert isinstance(start, StartSession)
         service.send(SessionStarted(session="mine", request=start.request))
-    answers(stage, client)
+    stage.receive(client)
     for media_time in (2840, 5000):  # said again, as one does that goes on
         speech = Speech(session="mine", epoch=1, sequence=1, media_time=media_time, active=True)
         recognizer.send(speech)
     recognizer.send(beat("recognizer"))
-    answers(stage, recognizer)  # the synthesizer's, over another connection, might overtake speech
+    stage.receive(recognizer)  # the synthesizer's, over another connection, might overtake speech
     synthesizer.send(beat("synthesizer", "tcp://127.0.0.1:9"))
     for service in reversed(stage.services):  # the recognizer last
         starts: list[StartSession] = []
         while not starts:
-            told = answers(stage, service)
+            told = stage.receive(service)
             starts = [message for message in told if isinstance(message, StartSession)]
         assert starts[0].speech_time == 2840
         service.send(SessionStarted(session="mine", request=starts[0].request))
-    first, *others = answers(stage, client, 3)
+    first, *others = stage.receive(client, 3)
     assert isinstance(first, SessionMoved)
     assert (first.epoch, first.faps) == (2, "tcp://127.0.0.1:9")
     assert others == [first, first]

@@ -4,9 +4,10 @@ import asyncio
 import contextlib
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import aiohttp
@@ -23,20 +24,22 @@ from kouxing.services.gateway.web_server import WebServer
 from kouxing.services.gateway.whip import MISSING, WhipClients
 from kouxing.shared.metrics import Metrics
 from tests.process.web_clients import async_test
-from tests.system import Gateway, port_of
+from tests.system import LIMIT_S, Gateway, port_of
 
 LONG = b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n"
 SLOW = b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n"
 UPGRADE = b"GET /long HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: upgrade\r\n\r\n"
 SDP = {"Content-Type": "application/sdp"}
+CHECK_S = 0.01
 UNUSED: Any = None
 
 
 @dataclass
 class Served:
-    """A server with short and endless answers."""
+    """A server with short and endless answers, whose time a test lets pass."""
 
     address: tuple[str, int]
+    now_s: float = 0.0
     writers: list[asyncio.StreamWriter] = field(default_factory=list)
     has_ended: asyncio.Event = field(default_factory=asyncio.Event)  # the endless answer
 
@@ -87,10 +90,11 @@ async def never_end(request: web.Request) -> web.StreamResponse:
 @asynccontextmanager
 async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[Served]:
     """Serve with other limits; ``/long`` has no time limit."""
-    for name, limit in {"_CHECK_S": 0.02, "_SHUTDOWN_S": 0.01, **limits}.items():
+    for name, limit in {"_CHECK_S": CHECK_S, "_SHUTDOWN_S": 0.01, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
     bound = web_server.bind_port("127.0.0.1", 0)
     served = Served(bound.getsockname())
+    monkeypatch.setattr(web_server, "time", SimpleNamespace(monotonic=lambda: served.now_s))
     server = WebServer(bound, None)
     application = web.Application()
     application.add_routes(
@@ -112,14 +116,34 @@ async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterat
 
 
 async def read_to_end(reader: asyncio.StreamReader) -> bytes:
-    return await asyncio.wait_for(reader.read(), 20)
+    with contextlib.suppress(ConnectionResetError):
+        return await asyncio.wait_for(reader.read(), LIMIT_S)
+    return b""
 
 
-async def check_open(reader: asyncio.StreamReader) -> None:
-    """Check that an endless answer has started and continues."""
-    await asyncio.wait_for(reader.readuntil(b"begun"), 20)
-    with pytest.raises(TimeoutError):
-        await asyncio.wait_for(reader.read(), 0.2)
+async def wait_for_answers(*readers: asyncio.StreamReader) -> None:
+    for reader in readers:
+        await asyncio.wait_for(reader.readuntil(b"begun"), LIMIT_S)
+
+
+async def check_open(*readers: asyncio.StreamReader) -> None:
+    """Check that endless answers continue."""
+    reading = [asyncio.ensure_future(reader.read()) for reader in readers]
+    ended, continuing = await asyncio.wait(reading, timeout=0.1)
+    assert not ended
+    for task in continuing:
+        task.cancel()
+
+
+async def pass_time(served: Served, ended: Awaitable[Any], timeout_s: float) -> None:
+    """Let time pass in steps until something has ended; it must end within a timeout."""
+    waiting = asyncio.ensure_future(ended)
+    step_s = timeout_s / 10
+    end_s = served.now_s + timeout_s + 2 * step_s
+    while not waiting.done():
+        assert served.now_s < end_s
+        served.now_s += step_s
+        await asyncio.wait([waiting], timeout=3 * CHECK_S)
 
 
 @async_test
@@ -130,8 +154,7 @@ async def test_closes_connections_with_long_heads_or_many_requests(
     headers = b"".join(b"X%d: %s\r\n" % (number, b"x" * 8000) for number in range(100))
     async with serve(monkeypatch) as served:
         for part in (request + headers, SLOW + 50 * (request + b"\r\n")):
-            with contextlib.suppress(ConnectionResetError):
-                await read_to_end(await served.connect(part))
+            await read_to_end(await served.connect(part))
         assert await served.answers()
 
 
@@ -140,24 +163,29 @@ async def test_closes_connections_with_long_heads_or_many_requests(
 async def test_closes_connections_without_a_request(
     monkeypatch: pytest.MonkeyPatch, part: bytes
 ) -> None:
-    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
-        assert await read_to_end(await served.connect(part)) == b""
+    async with serve(monkeypatch) as served:
+        reader = await served.connect(part)
+        assert await served.answers(), "it was accepted after the other one"
+        await pass_time(served, reader.read(), web_server.IDLE_TIMEOUT_S)
         assert await served.answers()
 
 
 @async_test
 async def test_ends_slow_answers_except_on_unlimited_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2, ANSWER_TIMEOUT_S=0.5) as served:
-        long = await served.connect(LONG)
-        slow = await served.connect(SLOW)
-        assert b"begun" in await read_to_end(slow)
+    async with serve(monkeypatch) as served:
+        long, slow = await served.connect(LONG), await served.connect(SLOW)
+        await wait_for_answers(long, slow)
+        await pass_time(served, slow.read(), web_server.ANSWER_TIMEOUT_S)
         await check_open(long)
+
+
+INCOMPLETE = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1"
 
 
 @pytest.mark.parametrize(
     "part",
     [
-        b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
+        INCOMPLETE,
         b"POST /long HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n1\r\n1\r\n",
         b"GET /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
     ],
@@ -166,19 +194,18 @@ async def test_ends_slow_answers_except_on_unlimited_paths(monkeypatch: pytest.M
 async def test_a_body_has_a_deadline_and_its_answer_has_none(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: bytes
 ) -> None:
-    async with serve(monkeypatch, BODY_TIMEOUT_S=0.3) as served:
+    async with serve(monkeypatch) as served:
         post = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n"
         complete = [await served.connect(post), await served.connect(UPGRADE)]
         served.writers[0].write(b"12")
+        await wait_for_answers(*complete)
         incomplete = await served.connect(part)
-        with contextlib.suppress(ConnectionResetError):
-            assert await read_to_end(incomplete) == b""
-        for reader in complete:
-            await check_open(reader)
+        assert await served.answers()
+        await pass_time(served, read_to_end(incomplete), web_server.BODY_TIMEOUT_S)
+        await check_open(*complete)
     assert not caplog.records
 
 
-INCOMPLETE = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1"
 MANY = [f"127.0.1.{number}" for number in range(9)]
 
 
@@ -198,11 +225,13 @@ async def test_a_client_takes_the_place_of_one_without_a_complete_request(
 ) -> None:
     async with serve(monkeypatch, MAX_CONNECTIONS=6) as served:
         clients = [await served.connect(LONG)]
+        await wait_for_answers(*clients)
         for n in range(9):
             await served.connect(part, sources[n % len(sources)])
-        clients += [await served.connect(LONG, source) for source in ("127.0.0.1", "127.0.0.3")]
-        for reader in clients:
-            await check_open(reader)
+            served.now_s += 1.0
+        late = [await served.connect(LONG, source) for source in ("127.0.0.1", "127.0.0.3")]
+        await wait_for_answers(*late)
+        await check_open(*clients, *late)
 
 
 @async_test
@@ -211,13 +240,11 @@ async def test_refuses_connections_while_all_places_have_complete_requests(
 ) -> None:
     async with serve(monkeypatch, MAX_CONNECTIONS=6) as served:
         clients = [await served.connect(LONG) for _ in range(5)]
-        for reader in clients:
-            await asyncio.wait_for(reader.readuntil(b"begun"), 20)
+        await wait_for_answers(*clients)
         for _ in range(2):
-            with contextlib.suppress(ConnectionResetError):
-                assert await read_to_end(await served.connect()) == b""
+            assert await read_to_end(await served.connect()) == b""
         served.writers[0].close()
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while not await served.answers():
                 await asyncio.sleep(0.02)
     assert [record.getMessage() for record in caplog.records] == [
@@ -227,9 +254,10 @@ async def test_refuses_connections_while_all_places_have_complete_requests(
 
 @async_test
 async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(monkeypatch, ANSWER_TIMEOUT_S=0.3) as served:
+    async with serve(monkeypatch) as served:
         await served.connect(b"GET /endless HTTP/1.1\r\nHost: a\r\n\r\n")
-        await asyncio.wait_for(served.has_ended.wait(), 20)
+        assert await served.answers()
+        await pass_time(served, served.has_ended.wait(), web_server.ANSWER_TIMEOUT_S)
 
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {
@@ -265,7 +293,7 @@ async def test_one_address_gets_only_its_share_unless_it_is_a_proxys(
         assert sum(client is not None for client in second) == 4 - num_per_address
         assert first[0] is not None
         await first[0].close()
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(LIMIT_S):
             while await connect("127.0.0.1") is None:
                 await asyncio.sleep(0.02)
 
@@ -297,7 +325,7 @@ async def test_one_address_gets_only_its_share_of_webrtc_clients(
         raise web.HTTPNotImplemented
 
     monkeypatch.setattr(clients, "_make_peer", make_peer)
-    async with whip_offer(clients) as offer, asyncio.timeout(20):
+    async with whip_offer(clients) as offer, asyncio.timeout(LIMIT_S):
         waiting = [asyncio.create_task(offer()) for _ in range(3)]
         while len(clients) < 3:
             await asyncio.sleep(0.01)

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.config import variable
 from tests.raw_bytes import pour
-from tests.system import CHAIN, ROOT, VOWELS_FILE, System, free_port
+from tests.system import CHAIN, LIMIT_S, ROOT, VOWELS_FILE, System, free_port
 
 ELSEWHERE = {  # metrics of other services, or of what does not happen here
     *("frames_missed", "videos", "video_seconds", "repeated", "other_epoch", "too_early"),
@@ -54,7 +54,7 @@ def _heartbeats(client: Client) -> float:
 
 
 def _page(port: int) -> str:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LIMIT_S) as page:
         text: str = page.read().decode()
         return text
 

@@ -192,9 +192,9 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     control: FakeControl, worker: Worker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_until(worker, lambda: control.heartbeats)
-    control.stops = ["s0"]
 
     def stall(*_: object) -> None:
+        control.stops = ["s0"]
         time.sleep(HEARTBEAT_S + RESYNC_AFTER_S + 0.1)
         worker.happened.append("input")
 

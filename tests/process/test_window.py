@@ -41,7 +41,7 @@ def test_on_a_display(display: str) -> None:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=250,
         check=False,
     )
     assert result.returncode == 0, result.stderr

@@ -3,7 +3,6 @@
 import io
 import os
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -142,24 +141,13 @@ def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
         write_media(path, "libopus", SPEECH.repeat(3), 48_000)
     else:
         soundfile.write(path, SPEECH, RATE_HZ)
+    data = path.read_bytes()
     os.mkfifo(tmp_path / "fifo")
-    is_read = threading.Event()
-
-    def write() -> None:
-        data = path.read_bytes()
-        with (tmp_path / "fifo").open("wb") as fifo:
-            fifo.write(data[: len(data) // 3])
-            fifo.flush()
-            is_read.wait()
-
-    writer = threading.Thread(target=write)
-    writer.start()
-    try:
-        source = open_audio(tmp_path / "fifo")
-        assert len(next(source.blocks)) == source.sample_rate_hz // 50
-    finally:
-        is_read.set()
-        writer.join()
+    writer = os.open(tmp_path / "fifo", os.O_RDWR)
+    os.write(writer, data[: len(data) // 3])
+    source = open_audio(tmp_path / "fifo")
+    assert len(next(source.blocks)) == source.sample_rate_hz // 50
+    os.close(writer)
     [*source.blocks]  # noqa: B018 - it ends in the middle of a packet
 
 

@@ -1,6 +1,5 @@
 """A tracker's packets with the mouth of the sound."""
 
-import asyncio
 import struct
 
 import numpy as np
@@ -16,6 +15,7 @@ from kouxing.services.senders.osc import bundles, message
 from kouxing.services.senders.protocols import connect, parse_target
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shapes import SHAPE_SETS
+from tests.fake_time import run
 from tests.receivers import LIVE_LINK_ORDER, read_live_link, read_osc
 
 
@@ -134,7 +134,7 @@ def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
             camera.datagram_received(b"good", None)
         assert camera.is_live
 
-    asyncio.run(receive())
+    run(receive())
     assert len(forwarded) == 600
 
 

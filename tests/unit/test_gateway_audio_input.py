@@ -2,8 +2,6 @@
 
 import asyncio
 import json
-import selectors
-from collections.abc import Coroutine
 
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from kouxing.services.gateway.audio_input import MAX_QUEUED_BYTES, AudioInput
 from kouxing.services.gateway.limits import RateLimit
 from kouxing.services.gateway.pcm_format import PcmFormat, check_text
 from kouxing.shared.errors import UserError
+from tests.fake_time import run
 
 PCM16 = PcmFormat(sample_rate_hz=16000)
 FLOAT = PcmFormat(sample_rate_hz=16000, encoding="f32le")
@@ -89,32 +88,6 @@ class FakeSession:
 
     async def flush(self) -> None:
         self.num_flushes += 1
-
-
-class InstantSelector(selectors.DefaultSelector):
-    """A selector that moves a fake clock instead of waiting."""
-
-    now_s = 0.0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self.now_s += timeout or 0.0
-        return super().select(0)
-
-
-class FakeTimeLoop(asyncio.SelectorEventLoop):
-    """An event loop in which waiting takes no time."""
-
-    def __init__(self) -> None:
-        self._clock = InstantSelector()
-        super().__init__(self._clock)
-
-    def time(self) -> float:
-        return self._clock.now_s
-
-
-def run(coroutine: Coroutine[None, None, None]) -> None:
-    with asyncio.Runner(loop_factory=FakeTimeLoop) as runner:
-        runner.run(coroutine)
 
 
 @pytest.mark.parametrize(("rate_hz", "chunk"), [(8000, 1234), (22050, 2), (48000, 100_000)])
