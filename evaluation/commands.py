@@ -207,13 +207,17 @@ def lips(
         list[str] | None,
         typer.Option(help='"clean", "babble 10 dB" or "music 10 dB"; repeatable. Default: all.'),
     ] = None,
+    from_csv: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder with CLIP.csv, the curves of another program; repeatable."),
+    ] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Compare live lips with the real ones on held-out clips, in one table.
 
     The sound is clean, or has babble or music 10 dB below the speech. The JSON file also contains
-    the figures by source and speaker.
+    the figures by source and speaker. docs/benchmark.md explains how to score another program.
     """
     from kouxing.evaluation.lips.lip_scores import CONDITIONS, score_lips
     from kouxing.evaluation.lips.lip_table import print_scores
@@ -223,9 +227,23 @@ def lips(
     conditions = condition or CONDITIONS
     check_conditions(conditions, CONDITIONS)
     music = music_from(_read_sounds(sounds))
-    results = score_lips(clips, lips or (), delay_ms or (), music, conditions)
+    results = score_lips(clips, lips or (), delay_ms or (), music, conditions, from_csv or ())
     print_scores(results, Console())
     write_json(json_file, results)
+
+
+@app.command(name="pack-clips")
+def pack_clips(
+    archive: Annotated[Path, typer.Argument(help="Archive to write (.zip).")],
+    clips: Clips,
+    force: Force = False,
+) -> None:
+    """Pack the clips whose licenses allow sharing, with their parts and licenses."""
+    from kouxing.corpora.clip_archive import write_clip_archive
+
+    check_output(archive, force=force)
+    num_clips = write_clip_archive(clips, archive)
+    print_message(f"wrote {plural(num_clips, 'clip')} to {archive}")
 
 
 @app.command()

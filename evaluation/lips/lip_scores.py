@@ -15,6 +15,7 @@ from kouxing.corpora.lip_clips import LipClip, aligned_phones, read_clips, train
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES, Take
 from kouxing.evaluation.lips.live_faces import Samples, events_of_faces, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth
+from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
 from kouxing.evaluation.lips.references import clips_to_score, reference_of
 from kouxing.evaluation.recognizer.disturbances import (
     BABBLE,
@@ -89,12 +90,19 @@ def score_lips(
     delays_ms: Sequence[float],
     music: Samples,
     conditions: Sequence[str],
+    tables: Sequence[Path] = (),
 ) -> Results:
-    """Score faces (see ``load_faces``) on the held-out clips of a folder."""
+    """Score faces (see ``load_faces``) on the held-out clips of a folder.
+
+    ``tables`` are folders with the curves of other programs, which are scored with clean sound.
+    With them, only the faces that are named are scored.
+    """
     model = load_model()
-    faces = load_faces(names, delays_ms, model.inventory)
+    faces = {} if tables and not names else load_faces(names, delays_ms, model.inventory)
     clips = clips_to_score(folder, [Path(name) for name in names if name.endswith(".json")])
-    known = known_speakers(folder)
+    training = training_clips(read_clips(folder, language=None))
+    programs = load_programs(tables, clips, training)
+    known = {clip.speaker for clip in training}
     voices = babble([clip.samples for clip in clips])
     disturbances: dict[str, Disturb] = {
         CLEAN: lambda samples: samples,
@@ -104,7 +112,7 @@ def score_lips(
     used = {name: disturbances[name] for name in CONDITIONS if name in (CLEAN, *conditions)}
     takes: dict[tuple[str, str, str], list[Take]] = {}
     for clip in track(clips, description="clips", transient=True):
-        for title, condition, take in takes_of(model, clip, faces, used):
+        for title, condition, take in takes_of(model, clip, faces, used, programs):
             for group in groups_of(clip, known):
                 takes.setdefault((title, condition, group), []).append(take)
     results: Results = {}
@@ -124,12 +132,13 @@ def takes_of(
     clip: LipClip,
     faces: Mapping[str, Face],
     disturbances: Mapping[str, Disturb],
+    programs: Mapping[str, MouthOf],
 ) -> Iterator[tuple[str, str, Take]]:
     """Yield title, condition and take of the real mouth, and of each face in each condition.
 
-    The first condition must be CLEAN.
+    The first condition must be CLEAN. Other programs follow in this condition.
     """
-    sources = [(face.predictor, face.delay_ms / 1e3) for face in faces.values()]
+    sources = [(None, 0.0), *((face.predictor, face.delay_ms / 1e3) for face in faces.values())]
     reference = None
     for condition, disturb in disturbances.items():
         events = events_of_faces(model, disturb(clip.samples), sources)
@@ -137,13 +146,10 @@ def takes_of(
             aligned = aligned_phones(model, clip)
             reference = reference_of(clip, events[0], model.inventory, aligned)
             yield REAL, condition, Take(reference, reference.mouth)
-        for (title, face), received in zip(faces.items(), events, strict=True):
+            for title, mouth_of in programs.items():
+                yield title, condition, Take(reference, mouth_of(clip))
+        for (title, face), received in zip(faces.items(), events[1:], strict=True):
             yield title, condition, Take(reference, face.mouth(received))
-
-
-def known_speakers(folder: Path) -> set[str]:
-    """Return the speakers of clips that a shipped model may be trained on."""
-    return {clip.speaker for clip in training_clips(read_clips(folder, language=None))}
 
 
 def groups_of(clip: LipClip, known: set[str]) -> list[str]:

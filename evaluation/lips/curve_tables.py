@@ -1,0 +1,126 @@
+"""Tables of curves that another program made for clips.
+
+The column ``t`` is the length of the audio that the program had received when it made the row,
+seconds. The other columns are ARKit's shapes (``jawOpen``), Oculus' visemes (``aa`` or
+``viseme_aa``) or ``opening``. Further columns are only inputs of the linear map.
+"""
+
+import csv
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.shapes import ARKIT, OCULUS
+from kouxing.shared.user_file import check_content, read_text, split_lines
+
+Array = NDArray[np.float64]
+
+TIME, OPENING = "t", "opening"
+_MAX_BYTES = 64 << 20
+_LOW, _HIGH = 1.0, 99.0  # percentiles
+_MAX_OPENING = 400.0  # FAP units, 12 mm on a face
+_LOWER_LIP = FAP_NUMBER["raise_b_midlip"] - 1
+
+
+@dataclass(frozen=True, slots=True)
+class CurveTable:
+    """Curves of a clip."""
+
+    time_s: Array  # (num_rows,), rising
+    names: tuple[str, ...]
+    values: Array  # (num_rows, num_curves)
+
+    def at(self, known_s: Array) -> Array:
+        """Return the newest rows, (..., num_curves), that need no audio after the given times."""
+        index = np.searchsorted(self.time_s, known_s + 1e-6, side="right") - 1
+        return np.asarray(self.values[np.clip(index, 0, None)])
+
+
+@dataclass(frozen=True, slots=True)
+class ShippedMouth:
+    """Converts curves to FAPs: ``basis`` (num_curves, 68) and ``offset`` (68,)."""
+
+    basis: Array
+    offset: Array
+
+    def faps(self, curves: Array) -> Array:
+        """Return FAPs (num_frames, 68) of curves (num_frames, num_curves)."""
+        return np.asarray(curves @ self.basis + self.offset)
+
+
+def read_tables(
+    folder: Path, held: Sequence[LipClip], training: Sequence[LipClip]
+) -> dict[str, CurveTable]:
+    """Read ``CLIP.csv`` of all held-out clips, and of those training clips that have one.
+
+    Raises UserError if a held-out clip has no table, a table cannot be read, or its columns differ
+    from those of the first one.
+    """
+    paths = {clip.name: folder / f"{clip.name}.csv" for clip in (*held, *training)}
+    missing = [paths[clip.name] for clip in held if not paths[clip.name].is_file()]
+    if missing:
+        raise UserError(
+            f"{folder}: {len(missing)} of {len(held)} held-out clips have no table; add"
+            f" {missing[0].name}"
+        )
+    tables = {name: read_table(path) for name, path in paths.items() if path.is_file()}
+    names = tables[held[0].name].names
+    for name, table in tables.items():
+        if table.names != names:
+            raise UserError(f"{paths[name]}: its columns differ from those of {held[0].name}.csv")
+    return tables
+
+
+def read_table(path: Path) -> CurveTable:
+    """Read a table; UserError if it cannot be read, or has an invalid row."""
+    with check_content(path, "a table with a column t and a column for each curve"):
+        rows = csv.reader(split_lines(path, read_text(path, _MAX_BYTES)))
+        names = [name.strip() for name in next(rows, [])]
+        if TIME not in names or len({*names}) < len(names) or len(names) < 2:
+            raise ValueError("the first line must name t and every curve once")
+        values = np.array([[float(cell) for cell in row] for row in rows if row])
+        if not len(values) or not np.isfinite(values).all():
+            raise ValueError("it has no rows, or a value is not finite")
+        time_s = values[:, names.index(TIME)]
+        if values.shape[1] != len(names) or not (np.diff(time_s) > 0.0).all():
+            raise ValueError("a row has too many or too few values, or the times do not ascend")
+    values = np.delete(values, names.index(TIME), axis=1)
+    return CurveTable(time_s, tuple(name for name in names if name != TIME), values)
+
+
+def shipped_mouth(folder: Path, tables: Collection[CurveTable]) -> ShippedMouth:
+    """Return how the curves of a folder move a face.
+
+    Shapes have the FAPs of this package's tables. An opening has no unit: over all tables, its
+    first percentile becomes 0 and its 99th 400 FAP units. Raises UserError if no column has a known
+    name.
+    """
+    names = next(iter(tables)).names
+    basis, offset = np.zeros((len(names), NUM_FAPS)), np.zeros(NUM_FAPS)
+    if OPENING in names:
+        column = names.index(OPENING)
+        low, high = np.percentile(
+            np.concatenate([table.values[:, column] for table in tables]), [_LOW, _HIGH]
+        )
+        scale = _MAX_OPENING / max(float(high - low), 1e-9)
+        basis[column, _LOWER_LIP], offset[_LOWER_LIP] = -scale, scale * low
+        return ShippedMouth(basis, offset)
+    known: Mapping[str, NDArray[np.float32]] = {
+        name: row
+        for shapes in (ARKIT, OCULUS)
+        for name, row in zip(shapes.names, shapes.basis, strict=True)
+    }
+    for row, name in zip(basis, names, strict=True):
+        row[:] = known.get(name.removeprefix("viseme_"), 0.0)
+    if not basis.any():
+        raise UserError(
+            f"{folder}: no column is a curve of a mouth; name a column {OPENING}, jawOpen or"
+            " another ARKit shape, or viseme_aa or another Oculus viseme"
+        )
+    return ShippedMouth(basis, offset)

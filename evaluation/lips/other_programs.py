@@ -1,0 +1,70 @@
+"""The mouths of other programs: as shipped and through a linear map, each at its best delay.
+
+A frame for time t of a face with delay d uses the rows of a table up to t + d. The correlation of
+the opening on the training clips decides the delay. Without tables of training clips,
+there is no linear map, and the delay is 0.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from kouxing.evaluation.lips.agreement import moments
+from kouxing.evaluation.lips.curve_tables import CurveTable, read_tables, shipped_mouth
+from kouxing.evaluation.lips.linear_map import fit_map
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
+
+MouthOf = Callable[[LipClip], Mouth]
+
+_DELAYS_S = tuple(step / 50.0 for step in range(16))  # 0 to 0.3 s
+_TAIL_S = 0.5  # frames after the end of a clip's audio
+
+
+def load_programs(
+    folders: Sequence[Path], held: Sequence[LipClip], training: Sequence[LipClip]
+) -> dict[str, MouthOf]:
+    """Load the mouths of the programs whose tables are in folders, by title.
+
+    Raises UserError if a table is missing or cannot be used (see ``read_tables``).
+    """
+    mouths: dict[str, MouthOf] = {}
+    for folder in folders:
+        tables = read_tables(folder, held, training)
+        fitting = [clip for clip in training if clip.name in tables and clip.is_in_sync]
+        mouths |= _mouths_of(folder, tables, fitting)
+    return mouths
+
+
+def _mouths_of(
+    folder: Path, tables: Mapping[str, CurveTable], fitting: Sequence[LipClip]
+) -> dict[str, MouthOf]:
+    shipped = shipped_mouth(folder, [*tables.values()])
+
+    reals = [real_mouth(clip.time_s, real_faps(clip)) for clip in fitting]
+
+    def as_shipped(clip: LipClip, delay_s: float) -> Mouth:
+        return made_mouth(shipped.faps(tables[clip.name].at(_frames_s(clip) + delay_s)))
+
+    def agreement(delay_s: float) -> float:
+        pairs = [
+            (as_shipped(clip, delay_s), real) for clip, real in zip(fitting, reals, strict=True)
+        ]
+        return moments(pairs, "opening").correlation or 0.0
+
+    delay_s = max(_DELAYS_S, key=agreement) if fitting else 0.0
+    title = f"{folder.name}, {1e3 * delay_s:.0f} ms"
+    mouths: dict[str, MouthOf] = {title: lambda clip: as_shipped(clip, delay_s)}
+    if fitting:
+        linear = fit_map(fitting, tables, _DELAYS_S)
+        title = f"{folder.name}, fitted, {1e3 * linear.delay_s:.0f} ms"
+        mouths[title] = lambda clip: made_mouth(linear.faps(tables[clip.name], _frames_s(clip)))
+    return mouths
+
+
+def _frames_s(clip: LipClip) -> NDArray[np.float64]:
+    duration_s = max(float(clip.time_s[-1]), len(clip.samples) / SAMPLE_RATE_HZ)
+    return np.arange(int((duration_s + _TAIL_S) * FRAME_RATE_HZ)) / FRAME_RATE_HZ

@@ -1,0 +1,31 @@
+"""The archive of clips contains only those whose licenses allow sharing, with their parts."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from kouxing.corpora.clip_archive import write_clip_archive
+from kouxing.corpora.lip_clips import read_clips
+from kouxing.shared.errors import UserError
+from tests.unit.test_lip_scores import write_clip
+
+
+def test_packs_the_clips_that_may_be_shared(tmp_path: Path) -> None:
+    folder, archive = tmp_path / "clips", tmp_path / "clips.zip"
+    folder.mkdir()
+    write_clip(folder)
+    about = folder / "cam_1.json"
+    for name in ("MIT; footage by third parties", "CC BY-NC 4.0"):
+        about.write_text(json.dumps({"language": "zh", "licence": name}))
+        with pytest.raises(UserError, match="no clip has a license that allows sharing"):
+            write_clip_archive(folder, archive)
+    assert not archive.exists()
+    about.write_text(json.dumps({"speaker": "ann", "language": "zh", "licence": "CC BY 4.0"}))
+    assert write_clip_archive(folder, archive) == 1
+    with zipfile.ZipFile(archive) as file:
+        file.extractall(tmp_path / "copy")
+    (copy,) = read_clips(tmp_path / "copy")
+    assert (copy.name, copy.part, copy.license) == ("cam_1", "held", "CC BY 4.0")
+    assert "cam_1\theld\tzh\tann\tCC BY 4.0" in (tmp_path / "copy" / "clips.tsv").read_text()
