@@ -8,6 +8,7 @@ from kouxing_client.follower import Follower
 
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Joined
 
@@ -15,36 +16,38 @@ from kouxing.shared.wire.session import Joined
 class ServiceFollower(Follower):
     """Passes a session's messages to handlers; counts missed frames in the service's metrics.
 
-    ``handlers`` has functions by class of message; these classes are subscribed to. The other
-    parameters are those of ``Follower``.
+    Control is notified when the subscriptions are in effect. ``session_start`` is control's newest
+    message about the session. ``handlers`` has functions by class of message; these classes are
+    subscribed to. ``on_new_epoch`` is that of ``Follower``.
     """
 
     def __init__(
         self,
         service: Service,
-        session: str,
+        session_start: StartSession,
         handlers: Mapping[type[Message], Callable[[Any], None]],
         *,
-        live: bool = True,
-        on_complete: Callable[[], None] = lambda: None,
         on_new_epoch: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(
             _ServiceTransport(service),
-            session,
+            session_start.session,
             handlers.keys(),
             self._handle,
-            live=live,
-            on_complete=on_complete,
+            live=session_start.paced,
+            on_complete=lambda: service.session_started(self.session_start),
             on_new_epoch=on_new_epoch,
         )
+        self.session_start = session_start
+        self.is_following = False
         self._service = service
         self._handlers = handlers
         self._counted = {"frames_missed": 0, "dropped_old_epoch": 0}
 
-    def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
-        """Subscribe, as ``Follower.start``."""
-        super().start(epoch, endpoints)
+    def follow(self) -> None:
+        """Subscribe at the endpoints of ``session_start``."""
+        self.is_following = True
+        self.start(self.session_start.epoch, self.session_start.endpoints)
         self._service.tick_callbacks.add(self.tick)
 
     def close(self) -> None:

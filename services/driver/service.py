@@ -42,7 +42,6 @@ RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
 class _FollowedSession:
     """One session that the driver follows."""
 
-    start: StartSession
     follower: ServiceFollower
     leave_by_s: float | None = None  # set once the session has closed
 
@@ -82,7 +81,7 @@ class DriverService(Service):
         The session has started once the subscriptions are in effect.
         """
         session = self._sessions.get(start.session)
-        if session is not None and session.start.token != start.token:
+        if session is not None and session.follower.session_start.token != start.token:
             self._leave(session)  # a different session with the same name
             session = None
         if session is None and not start.record and not self.view.is_live:
@@ -92,12 +91,19 @@ class DriverService(Service):
             if start.record and (reason := self.recordings.rejection_reason(key)):
                 self._refuse(start, reason)
                 return False
-            session = self._sessions[start.session] = self._make_session(start)
+            handlers: dict[type[Message], Callable[[Any], None]] = {
+                FapFrame: self._on_frame,
+                EndOfFaps: self._on_end,
+            }
+            if start.record:
+                handlers[Sound] = self._on_sound
+            session = _FollowedSession(ServiceFollower(self, start, handlers))
+            self._sessions[start.session] = session
             self.poses.add(start.session, time.monotonic())
             if start.record:
                 self.recordings.begin(start.session, key)
-        session.start = start
-        session.follower.start(start.epoch, start.endpoints)
+        session.follower.session_start = start
+        session.follower.follow()
         return False
 
     def stop_session(self, session: str) -> None:
@@ -154,20 +160,6 @@ class DriverService(Service):
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def _make_session(self, start: StartSession) -> _FollowedSession:
-        handlers: dict[type[Message], Callable[[Any], None]] = {
-            FapFrame: self._on_frame,
-            EndOfFaps: self._on_end,
-        }
-        if start.record:
-            handlers[Sound] = self._on_sound
-        follower = ServiceFollower(
-            self, start.session, handlers, live=start.paced,
-            on_complete=lambda: self.session_started(session.start),
-        )  # fmt: skip
-        session = _FollowedSession(start, follower)
-        return session
-
     def _on_frame(self, frame: FapFrame) -> None:
         faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
         self.poses.update(frame.session, faps, time.monotonic())
@@ -185,7 +177,7 @@ class DriverService(Service):
 
     def _leave(self, session: _FollowedSession) -> None:
         """Close a session's subscriptions and finish its video with the frames received so far."""
-        name = session.start.session
+        name = session.follower.session
         del self._sessions[name]
         session.follower.close()
         self.poses.remove(name)

@@ -60,10 +60,8 @@ CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes
 class _FollowedSession:
     """A session. The gateway subscribes to it when somebody first needs it, until it ends."""
 
-    start: StartSession
     follower: ServiceFollower
     syllables: SyllableTrack
-    is_followed: bool = False
 
 
 class GatewayService(Service):
@@ -204,16 +202,12 @@ class GatewayService(Service):
         session = self._sessions.get(start.session)
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
-        session.start = start
+        session.follower.session_start = start
         self._viewers.add_session(start.session, start.epoch, start.face.lip_model or "")
         is_needed = start.session in self._needed_sessions() or self._audio_sessions.num_opening
-        if session.is_followed or is_needed:
-            self._follow(session)
-        return not session.is_followed
-
-    def _follow(self, session: _FollowedSession) -> None:
-        session.is_followed = True
-        session.follower.start(session.start.epoch, session.start.endpoints)
+        if session.follower.is_following or is_needed:
+            session.follower.follow()
+        return not session.follower.is_following
 
     def _needed_sessions(self) -> set[str]:
         """Return the sessions that are shown or sent to other programs."""
@@ -246,9 +240,9 @@ class GatewayService(Service):
             self._senders.express(strengths, message.face.hold_s)
         session = self._sessions.get(message.session)
         if session is not None and message.face.lip_model is not None:
-            session.start = replace(
-                session.start, face=session.start.face.merged_with(message.face)
-            )
+            start = session.follower.session_start
+            face = start.face.merged_with(message.face)
+            session.follower.session_start = replace(start, face=face)
             self._viewers.set_lip_model(message.session, message.face.lip_model)
 
     def session_inputs(self) -> dict[str, SessionInput]:
@@ -258,8 +252,8 @@ class GatewayService(Service):
     def on_tick(self, now_s: float) -> float:
         """Follow sessions, move the face at rest, and request the status of the services."""
         for name in self._needed_sessions() & self._sessions.keys():
-            if not self._sessions[name].is_followed:
-                self._follow(self._sessions[name])
+            if not self._sessions[name].follower.is_following:
+                self._sessions[name].follower.follow()
         rest_due_s = max(self._rest_due_s, self._viewers.rest_from_s)
         if now_s >= rest_due_s:
             self._rest_due_s = rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
@@ -293,7 +287,7 @@ class GatewayService(Service):
     def _make_session(self, start: StartSession) -> _FollowedSession:
         follower = ServiceFollower(
             self,
-            start.session,
+            start,
             {
                 EndOfFaps: self._on_end,
                 FapFrame: self._on_frame,
@@ -302,14 +296,12 @@ class GatewayService(Service):
                 Speech: self._on_speech,
                 Acoustic: self._on_acoustic,
             },
-            live=start.paced,
-            on_complete=lambda: self.session_started(session.start),
             on_new_epoch=lambda: self._restart(session),
         )
         is_sample = self._sample is not None and self._sample[0].session == start.session
         characters = self._sample_characters if is_sample else ()
         track = SyllableTrack(self._inventory(start), characters)
-        session = _FollowedSession(start, follower, track)
+        session = _FollowedSession(follower, track)
         return session
 
     def _inventory(self, start: StartSession) -> PhoneInventory:
@@ -322,7 +314,7 @@ class GatewayService(Service):
     def _restart(self, session: _FollowedSession) -> None:
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
-        start = session.start
+        start = session.follower.session_start
         self._viewers.add_session(start.session, session.follower.epoch, start.face.lip_model or "")
 
     def _on_frame(self, frame: FapFrame) -> None:
