@@ -173,7 +173,7 @@ MANY = [{"attributes": {"POSITION": 0}}] * 2001
         (change("accessors", 0, count=-1), "an accessor has -1"),
         (change("meshes", 0, primitives=MANY), "more than 2000 meshes"),
         (change("nodes", 0, translation=[1e300, 0, 0]), "not finite or very large"),
-        (change("nodes", 0, translation=[float("nan"), 0, 0]), "glTF description is damaged"),
+        (change("nodes", 0, translation=[float("nan"), 0, 0]), "NaN is not valid JSON"),
         (change("nodes", 0, scale=[0, 0, 0]), "cannot speak: it has no shape jawOpen"),
         (change("accessors", 0, count=5), "larger than its buffer view"),
         (change("accessors", 0, byteOffset=-4), "larger than its buffer view"),
@@ -205,7 +205,7 @@ def test_rejects_bad_descriptions(
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
         (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "cut off after 20 of 99 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "description is damaged"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "file is damaged"),
     ],
 )
 def test_rejects_bad_bytes(tmp_path: Path, data: bytes, said: str) -> None:

@@ -6,9 +6,10 @@ pygltflib is not used because it does not check sizes and decodes neither access
 
 import base64
 import binascii
+import contextlib
 import struct
 import urllib.parse
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from kouxing.shared.user_file import parse_json, read_file
+from kouxing.shared.errors import UserError
+from kouxing.shared.user_file import check_content, parse_json, read_file
 
 MAX_BYTES = 512 << 20  # of all files, unpacked
 MAX_COUNT = 2_000_000  # elements of an accessor
@@ -34,13 +36,23 @@ Float64 = NDArray[np.float64]
 
 
 class BadGlbError(Exception):
-    """Says what is wrong with the file."""
+    """Says what is wrong with an undamaged file, and what to do."""
+
+
+@contextlib.contextmanager
+def naming_glb(path: Path) -> Iterator[None]:
+    """Raise ``UserError``, which names the file, for every error of the enclosed code."""
+    with check_content(path, "a GLB file; export it again"):
+        try:
+            yield
+        except BadGlbError as error:
+            raise UserError(f"{path}: {error}") from error
 
 
 def _chunks(data: bytes) -> dict[bytes, bytes]:
     """Return the chunks of a GLB by their kind."""
     if len(data) < 20 or data[:4] != b"glTF":
-        raise BadGlbError("it is not a binary glTF file")
+        raise ValueError("it is not a binary glTF file")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
         raise BadGlbError(f"it has version {version} of glTF; export it as glTF 2.0")
@@ -51,7 +63,7 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
     while at + 8 <= length:
         size, kind = struct.unpack_from("<I4s", data, at)
         if at + 8 + size > length:
-            raise BadGlbError("a chunk is cut off")
+            raise ValueError("a chunk is cut off")
         chunks.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
     return chunks
@@ -60,8 +72,8 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
 class Glb:
     """A file with its buffers.
 
-    Raises ``UserError`` if the file cannot be read, and ``BadGlbError`` if it is not a valid glTF
-    or requires an unsupported extension.
+    Raises ``UserError`` if the file cannot be read, ``BadGlbError`` if it requires an unsupported
+    extension, and any exception if it is damaged (``naming_glb``).
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,11 +84,8 @@ class Glb:
         if path.suffix.lower() != ".gltf":
             chunks = _chunks(data)
             text, self._binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
-        try:
-            self.json: dict[str, Any] = parse_json(text)
-            needed = set(self.json.get("extensionsRequired", ()))
-        except (ValueError, TypeError, AttributeError) as error:
-            raise BadGlbError("its glTF description is damaged") from error
+        self.json: dict[str, Any] = parse_json(text)
+        needed = set(self.json.get("extensionsRequired", ()))
         unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOKS)}
         if unknown:
             names = ", ".join(sorted(unknown))
@@ -87,7 +96,7 @@ class Glb:
     def _allow(self, num_bytes: int) -> None:
         self._num_bytes += num_bytes
         if self._num_bytes > MAX_BYTES:
-            raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB")
+            raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB; reduce it")
 
     def _read(self, path: Path) -> bytes:
         content = read_file(path, MAX_BYTES)
@@ -104,7 +113,9 @@ class Glb:
                 return b""
         path = Path(urllib.parse.unquote(uri))
         if path.is_absolute() or ".." in path.parts or ":" in uri or "\\" in uri:
-            raise BadGlbError(f"it refers to {uri!r}, which is not in its folder")
+            raise BadGlbError(
+                f"it refers to {uri!r}, which is not in its folder; export it as .glb"
+            )
         return self._read(self._folder / path)
 
     def _load_buffer(self, index: int) -> bytes:
@@ -115,7 +126,7 @@ class Glb:
         """Return an item of one of the lists in the description."""
         entries = self.json.get(kind, [])
         if not isinstance(index, int) or not 0 <= index < len(entries):
-            raise BadGlbError(f"{kind} has no item {index}")
+            raise ValueError(f"{kind} has no item {index}")
         entry: dict[str, Any] = entries[index]
         return entry
 
@@ -136,7 +147,7 @@ class Glb:
         start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
         buffer = self._buffer(int(view.get("buffer", 0)))
         if start < 0 or size < 0 or start + size > len(buffer):
-            raise BadGlbError("a buffer view is outside the file")
+            raise ValueError("a buffer view is outside the file")
         return buffer[start : start + size]
 
     def attributes(self, primitive: dict[str, Any], names: Iterable[str]) -> dict[str, Float64]:
@@ -146,8 +157,10 @@ class Glb:
             accessors["indices"] = primitive["indices"]
         decoded = {}
         if _DRACO in primitive.get("extensions", {}):
+            import DracoPy  # noqa: PLC0415 - few files need it
+
             compressed = primitive["extensions"][_DRACO]
-            mesh = _decode_draco(self.view(compressed["bufferView"]))
+            mesh = DracoPy.decode(self.view(compressed["bufferView"]))
             decoded["indices"] = np.asarray(mesh.faces, np.float64).reshape(-1, 1)
             for name in accessors.keys() & compressed["attributes"].keys():
                 item = self.item("accessors", accessors[name])
@@ -163,7 +176,7 @@ class Glb:
         width, count = _COMPONENTS[item["type"]], int(item["count"])
         kind = np.dtype(_TYPES[item["componentType"]])
         if not 0 <= count <= MAX_COUNT:
-            raise BadGlbError(f"an accessor has {count} elements")
+            raise ValueError(f"an accessor has {count} elements")
         values = np.zeros((count, width), kind)
         if "bufferView" in item:
             stride = int(self.item("bufferViews", item["bufferView"]).get("byteStride", 0))
@@ -181,7 +194,7 @@ class Glb:
                 np.dtype(_TYPES[where["componentType"]]),
             )
             if size and rows.max() >= count:
-                raise BadGlbError("a sparse accessor writes outside itself")
+                raise ValueError("a sparse accessor writes outside itself")
             values[rows[:, 0]] = self._strided(
                 what["bufferView"], int(what.get("byteOffset", 0)), (size, width), kind
             )
@@ -209,7 +222,7 @@ class Glb:
             number, parent = queue.pop(0)
             node = self.item("nodes", number)
             if number in worlds or len(worlds) > MAX_NODES:
-                raise BadGlbError("its nodes are not a tree")
+                raise ValueError("its nodes are not a tree")
             worlds[number] = parent @ _local_matrix(node)
             queue += [(int(child), worlds[number]) for child in node.get("children", [])]
         return list(worlds.items())
@@ -225,17 +238,8 @@ class Glb:
             or stride < width
             or (shape[0] and start + stride * (shape[0] - 1) + width > len(data))
         ):
-            raise BadGlbError("an accessor is larger than its buffer view")
+            raise ValueError("an accessor is larger than its buffer view")
         return np.ndarray(shape, kind, data, start, (stride, kind.itemsize))
-
-
-def _decode_draco(data: bytes) -> Any:
-    import DracoPy  # noqa: PLC0415 - few files need it
-
-    try:
-        return DracoPy.decode(data)
-    except Exception as error:  # of its own classes
-        raise BadGlbError("its Draco data is damaged") from error
 
 
 def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Float64:
@@ -244,7 +248,7 @@ def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Float64:
     if accessor.get("normalized") and values.dtype.kind in "iu":
         out = np.maximum(out / np.iinfo(values.dtype).max, -1.0)
     if not np.isfinite(out).all():
-        raise BadGlbError("a number is not finite")
+        raise ValueError("a number is not finite")
     return out
 
 

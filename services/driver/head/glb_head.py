@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb, naming_glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
 from kouxing.services.driver.head.head import Head, assemble
 from kouxing.services.driver.head.morphs import units_per_weight
@@ -39,7 +39,6 @@ from kouxing.shared.face.faps import (
 )
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
-from kouxing.shared.user_file import check_content
 
 EYE_DISTANCE_M = 0.055  # heads are scaled to this
 FAPU_SHARES = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
@@ -68,14 +67,10 @@ def read_glb(path: Path) -> Head:
 
     Raises ``UserError`` if the file is not such a GLB; the text says what is missing.
     """
-    with check_content(path, "a GLB file"):
-        try:
-            glb = Glb(path)
-            with np.errstate(invalid="ignore", over="ignore"):  # the results are checked
-                pieces = read_pieces(glb)
-                return _head(path.stem, glb, pieces, _recognize(pieces))
-        except BadGlbError as error:
-            raise UserError(f"{path}: {error}") from error
+    with naming_glb(path), np.errstate(invalid="ignore", over="ignore"):  # the results are checked
+        glb = Glb(path)
+        pieces = read_pieces(glb)
+        return _head(path.stem, glb, pieces, _recognize(pieces))
 
 
 def _recognize(pieces: list[Primitive]) -> Names:
@@ -138,7 +133,9 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
     eyes = eyes @ turn.T
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
-        raise BadGlbError("both eyes, found by shapes or names, are at the same place")
+        raise BadGlbError(
+            "both eyes, found by shapes or names, are at the same place; correct them"
+        )
     if eyes[0, 0] - eyes[1, 0] < 0.5 * unit:
         raise BadGlbError("its eyes are not side by side; y must be up and the face look along z")
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)

@@ -61,7 +61,7 @@ def read_pieces(glb: Glb) -> list[Primitive]:
             pieces.append(piece)
             num_triangles += len(piece.triangles)
     if not any(len(piece.triangles) for piece in pieces):
-        raise BadGlbError("it has no triangles")
+        raise BadGlbError("it has no triangles; export it with its mesh")
     _check_textures(pieces)
     return pieces
 
@@ -78,7 +78,9 @@ def _check_textures(pieces: list[Primitive]) -> None:
                 raise BadGlbError(str(error)) from error
             num_pixels += pixels.shape[0] * pixels.shape[1]
             if num_pixels > MAX_TEXTURE_PIXELS:
-                raise BadGlbError(f"its textures have more than {MAX_TEXTURE_PIXELS} pixels")
+                raise BadGlbError(
+                    f"its textures have more than {MAX_TEXTURE_PIXELS} pixels; reduce them"
+                )
             standard = piece.texture.startswith((b"\x89PNG", b"\xff\xd8"))
             known[piece.texture] = piece.texture if standard else picture.encode(pixels)
         piece.texture = known[piece.texture]
@@ -166,7 +168,7 @@ def _piece(
         given = attributes["indices"].astype(np.int64)
         index = given[:, 0] if given.shape[1] == 1 else np.array([-1])
     if points.shape[1] != 3 or (len(index) and not 0 <= index.min() <= index.max() < count):
-        raise BadGlbError("a triangle refers to a missing vertex")
+        raise ValueError("a triangle refers to a missing vertex")
     uv = _moved_uv(attributes.get(uv_name, np.zeros((count, 2)))[:, :2], base)
     factor = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4)
     colors = np.ones((count, 3)) * np.array(factor)[:3]
@@ -178,7 +180,7 @@ def _piece(
     if "skin" in node and "JOINTS_0" in attributes:
         placed, weight = _skinned(glb, node["skin"], attributes, places, turn_shares)
     if not len(uv) == len(colors) == len(placed) == count:
-        raise BadGlbError("the attributes of a mesh have different lengths")
+        raise ValueError("the attributes of a mesh have different lengths")
     shapes = _shapes(glb, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
     jaw = None if weight is None else _jaw_shift(glb, node["skin"], attributes, places, vertices)
@@ -186,7 +188,7 @@ def _piece(
         shapes = _eye_look_shapes(glb, node["skin"], attributes, places, vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
-            raise BadGlbError("a coordinate or color is not finite or very large")
+            raise ValueError("a coordinate or color is not finite or very large")
     return Primitive(
         name=str(node.get("name") or mesh.get("name") or "part"),
         vertices=vertices,
@@ -228,7 +230,7 @@ def _shapes(
         if "POSITION" in target:
             shift = glb.accessor(target["POSITION"])
             if shift.shape != placed.shape[:2]:
-                raise BadGlbError(f"morph target {number} does not match its mesh")
+                raise ValueError(f"morph target {number} does not match its mesh")
             shifts[number] = np.einsum("vij,vj->vi", placed, shift)
     shapes: dict[str, Float64] = {}
     for name, number, weight in binds:
@@ -281,7 +283,7 @@ def _skinned(
         bones = bones @ bind.reshape(-1, 4, 4).transpose(0, 2, 1)
     which, weights = attributes["JOINTS_0"].astype(np.int64), attributes["WEIGHTS_0"]
     if which.shape != weights.shape or (which.size and which.max() >= len(joints)):
-        raise BadGlbError("a mesh refers to a missing joint")
+        raise ValueError("a mesh refers to a missing joint")
     weights = _normalized(weights)
     share = np.array([turn_shares.get(joint, 0.0) for joint in joints])
     placed = np.einsum("vk,vkij->vij", weights, bones[which])

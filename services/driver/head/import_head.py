@@ -80,7 +80,7 @@ def _places(mesh: Path, path: Path, pieces: list[Primitive], points: Points) -> 
             if number >= len(candidates):
                 raise UserError(
                     f"{path}: {name} is vertex {number}, but the last vertex is"
-                    f" {len(candidates) - 1}"
+                    f" {len(candidates) - 1}; vertices count from 0"
                 )
             places[name] = candidates[number]
     return places

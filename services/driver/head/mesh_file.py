@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
+from kouxing.services.driver.head.glb_file import Float64, Glb, naming_glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
 from kouxing.services.driver.head.pieces import Primitive
 from kouxing.shared.errors import UserError
@@ -32,13 +32,11 @@ def read_mesh(path: Path) -> list[Primitive]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise UserError(f"{path}: give a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
-    with check_content(path, "a mesh"):
-        if suffix == ".glb":
-            try:
-                pieces = read_pieces(Glb(path))
-            except BadGlbError as error:
-                raise UserError(f"{path}: {error}") from error
-        else:
+    if suffix == ".glb":
+        with naming_glb(path):
+            pieces = read_pieces(Glb(path))
+    else:
+        with check_content(path, "a mesh; export it again"):
             meshes = _load(path, suffix)
             pieces = [_from_trimesh(mesh) for mesh in meshes if len(getattr(mesh, "faces", ()))]
     if not pieces:
@@ -72,7 +70,9 @@ class _NamedFiles(trimesh.resolvers.FilePathResolver):
         path = Path(self.parent, name.strip())
         try:
             if not path.resolve().is_relative_to(Path(self.parent).resolve()):
-                raise UserError(f"{self.file_path}: it refers to {name!r} outside its folder")
+                raise UserError(
+                    f"{self.file_path}: it refers to {name!r} outside its folder; copy it there"
+                )
             content = read_file(path, MAX_MESH_BYTES)
             if path.suffix.lower() != ".mtl":
                 _check_picture(path, content)
@@ -141,7 +141,9 @@ def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> tuple[Float64, dic
             try:
                 x, y, z = map(float, words[1:4])
             except ValueError:
-                raise UserError(f"{mesh}: {line.strip()!r} is not a valid vertex") from None
+                raise UserError(
+                    f"{mesh}: {line.strip()!r} is not a valid vertex; export the mesh again"
+                ) from None
             rows.append([x, y, z])
         elif words[:1] in (["o"], ["g"]) and len(words) > 1:
             starts.setdefault(words[1], len(rows))

@@ -59,7 +59,9 @@ def _from_lines(path: Path, text: str) -> Points:
         try:
             values = [float(word) for word in words[1:]]
         except ValueError:
-            raise UserError(f"{where}: {line.strip()!r} contains an invalid number") from None
+            raise UserError(
+                f"{where}: {line.strip()!r} contains an invalid number; correct it"
+            ) from None
         if len(values) == 3 and all(map(math.isfinite, values)):
             places[name] = np.array(values)
         elif len(values) == 1 and values[0] >= 0 and values[0] == int(values[0]):
@@ -75,7 +77,7 @@ def _from_xml(path: Path, text: str) -> Points:
     try:
         root = ET.fromstring(text)  # noqa: S314 - entities are refused above
     except ET.ParseError as error:
-        raise UserError(f"{path}: invalid XML: {error}") from error
+        raise UserError(f"{path}: invalid XML: {error}; export it again") from error
     places: dict[str, Place | tuple[str, int]] = {}
     for entry in root.iter("fdp"):
         if "name" not in entry.attrib:
@@ -85,9 +87,11 @@ def _from_xml(path: Path, text: str) -> Points:
         try:
             number = int(entry.attrib["index"])
         except (KeyError, ValueError):
-            raise UserError(f"{where}: the vertex index is missing or invalid") from None
+            raise UserError(
+                f"{where}: the vertex index is missing or invalid; export it again"
+            ) from None
         if number < 0:
-            raise UserError(f"{where}: the vertex index {number} is negative")
+            raise UserError(f"{where}: the vertex index {number} is negative; count from 0")
         places[name] = (entry.attrib.get("affects", ""), number)
     fapu = {}
     for entry in root.iter("fapu"):
@@ -104,7 +108,9 @@ def _from_xml(path: Path, text: str) -> Points:
 def _known(name: str, where: str, places: dict[str, Place | tuple[str, int]]) -> str:
     match = re.fullmatch(r"(\d+)\.(\d+)", name)
     if not match or not 1 <= int(match[2]) <= _GROUP_SIZES.get(int(match[1]), 0):
-        raise UserError(f"{where}: {name!r} is not an MPEG-4 feature point")
+        raise UserError(
+            f"{where}: {name!r} is not an MPEG-4 feature point, such as 2.1; correct it"
+        )
     if name in places:
-        raise UserError(f"{where}: {name} occurs twice")
+        raise UserError(f"{where}: {name} occurs twice; delete one line")
     return name
