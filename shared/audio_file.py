@@ -115,7 +115,7 @@ def _open_file(
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     if num_bytes == 0:
-        raise UserError(f"{path}: the file is empty")
+        raise UserError(f"{path}: the file is empty; record it again")
     begin = file.read(NUM_BEGIN_BYTES)
     file.seek(0)
     sound = MediaSound(file, path, begin, track, is_pipe=False)

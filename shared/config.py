@@ -83,9 +83,13 @@ def _check_endpoint(value: str) -> str:
 
 
 def _check_host(value: str) -> str:
-    if value:
+    if value:  # empty: not set, or all addresses
         _check_endpoint(with_host("tcp://*:*", value))
     return value
+
+
+def _check_hosts_of(values: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(map(_check_host, values))
 
 
 def _check_boolean(value: object) -> object:
@@ -103,18 +107,18 @@ def _split(value: object) -> object:
     return tuple(value.split()) if isinstance(value, str) else value
 
 
-_HOST = ValueHint("a host name or address")
 Switch = Annotated[bool, BeforeValidator(_check_boolean)]
 Endpoint = Annotated[
     str, AfterValidator(_check_endpoint), ValueHint("an endpoint, tcp://HOST:PORT")
 ]
 BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
-Host = Annotated[str, AfterValidator(_check_host), _HOST]
-BoundHost = Annotated[str, BindAddress.HOST, _HOST]
+Host = Annotated[str, AfterValidator(_check_host), ValueHint("a host name or address")]
+BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
 LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_lower)]
 Texts = Annotated[tuple[str, ...], BeforeValidator(_split)]
 """A list in a TOML file; elsewhere a text with spaces between the items."""
+HostNames = Annotated[Texts, AfterValidator(_check_hosts_of), ValueHint("a list of host names")]
 
 
 class ServiceConfig(BaseModel):
@@ -134,12 +138,12 @@ class ServiceConfig(BaseModel):
     """Accept unencrypted connections from anyone. docs/security.md describes the risks."""
     log_level: LogLevel = "info"
     """Lowest level of log messages to write."""
-    instance: str = ""
+    instance: Annotated[str, Field(max_length=128), ValueHint("text of up to 128 letters")] = ""
     """Name of this process. If empty, a name is generated."""
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
     """Port for Prometheus metrics (/metrics) and the health check (/healthz), over plain HTTP.
     0 turns both off. Services on one machine need different ports."""
-    metrics_host: Annotated[str, _HOST] = "127.0.0.1"
+    metrics_host: Host = "127.0.0.1"
     """Address to bind for the metrics. With 0.0.0.0, other machines can read them."""
 
     @property

@@ -27,10 +27,10 @@ import zmq
 from kouxing.shared import kernel_sockets
 from kouxing.shared.arrivals import Arrivals
 from kouxing.shared.budget import BUDGET, MIN_BUDGET, Budget
-from kouxing.shared.connection_quota import ConnectionQuota
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
+from kouxing.shared.peer_quota import PeerQuota
 from kouxing.shared.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.waker import Waker
 
@@ -238,13 +238,13 @@ class LimitedSocket:
 class ConnectionLimiter:
     """Watches the connections to all bound sockets of a process.
 
-    ``extra_connections`` and ``is_service`` are those of ``ConnectionQuota``.
+    ``extra_connections`` and ``is_service`` are those of ``PeerQuota``.
     """
 
     def __init__(
         self, extra_connections: int = 0, is_service: Callable[[str], bool] = lambda key: False
     ) -> None:
-        self._quota = ConnectionQuota(extra_connections, is_service)
+        self._quota = PeerQuota(extra_connections, is_service)
         self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
+from kouxing.shared.names import NAME, NAME_RULE, is_name
 from kouxing.shared.user_file import parse_json, read_text
 
 if TYPE_CHECKING:
@@ -44,8 +45,7 @@ _MAX_FILE_BYTES = 1 << 20
 _ALLOWED = "allowed"
 _SUBSCRIBER = "subscriber:"
 _PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_ROLE = re.compile(r"client|operator|service:[a-z-]{1,64}|subscriber:([A-Za-z0-9_-]{1,64}|\*)")
+_ROLE = re.compile(rf"client|operator|service:[a-z-]{{1,64}}|subscriber:({NAME}|\*)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,8 +274,8 @@ def _new_key(control: str = "") -> str:
 
 def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> None:
     """Write a new key to a file and allow it."""
-    if not _NAME.fullmatch(name):
-        raise UserError(f"{name!r} is not a valid name; use letters, digits, '-' and '_'")
+    if not is_name(name):
+        raise UserError(f"{name!r} is not a valid name; {NAME_RULE}")
     for role in roles:
         if not _ROLE.fullmatch(role):
             raise UserError(
@@ -334,7 +334,7 @@ def _parse_grants(path: Path) -> dict[str, Grant]:
     for line in _read(path).splitlines():
         public, *named = line.split() or [""]
         name, *roles = named or [""]
-        is_whole = _PUBLIC.fullmatch(public) and _NAME.fullmatch(name)
+        is_whole = _PUBLIC.fullmatch(public) and is_name(name)
         if not (is_whole and all(map(_ROLE.fullmatch, roles))):
             raise UserError(
                 f"{path}: {line!r} is not of the form PUBLIC-KEY NAME ROLE...; delete this line,"

@@ -16,7 +16,7 @@ FILES_PER_CLIENT = 6  # its own, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 
 
-class ConnectionQuota:
+class PeerQuota:
     """Limits the connections of clients and of services.
 
     The limit of clients is ``MAX_CONNECTIONS`` plus ``extra_connections``. The limit of services is

@@ -4,7 +4,6 @@ Undecodable messages are returned as ``BadMessage``.
 """
 
 import math
-import re
 import secrets
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from kouxing.shared.connections import KIB, LONG_PENALTY_S, PENALTY_S, Connectio
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Grant, Peer, may_follow
+from kouxing.shared.names import is_name
 from kouxing.shared.waker import Waker
 from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
 from kouxing.shared.wire.message import Message
@@ -29,7 +29,6 @@ MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
 MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
 T = TypeVar("T", int, str)
-_SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +253,7 @@ class Socket:
     def _confirm_subscription(self, wanted: bytes) -> None:
         prefix = f"{Joined.kind}/".encode()
         session = wanted.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
-        if wanted.startswith(prefix) and _SESSION.match(session):
+        if wanted.startswith(prefix) and is_name(session):
             self.send(Joined(session=session, publisher=self._name))
             self._on_joined(session)
 

@@ -64,7 +64,9 @@ def microphone(name: str = "") -> AudioSource:
             callback=lambda data, *_: recorded.put(data.copy()),
         )
     except (sounddevice.PortAudioError, ValueError) as error:
-        raise UserError(f"cannot open the microphone: {error}") from None
+        raise UserError(
+            f"cannot open the microphone: {error}; choose one of 'kouxing devices'"
+        ) from None
 
     def blocks() -> Iterator[Samples]:
         with stream:

@@ -32,7 +32,9 @@ def pair_outputs(
     for source in sources:
         target = (output or source.parent) / source.with_suffix(suffix).name
         if target in pairs:
-            raise UserError(f"{pairs[target]} and {source} would both be written to {target}")
+            raise UserError(
+                f"{pairs[target]} and {source} would both be written to {target}; rename one"
+            )
         pairs[target] = source
     return [(source, target) for target, source in pairs.items()]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,6 +24,7 @@ from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
+from kouxing.shared.names import NAME_RULE, is_name
 from kouxing.shared.terminal import (
     CONSOLE,
     Force,
@@ -97,9 +97,13 @@ def speak(
     if device and source not in ("mic", "monitor"):
         raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
     if source in ("mic", "monitor") and (raw or rate or channels or track):
-        raise UserError(f"--raw, --rate, --channels and --track do not apply to {source}")
+        raise UserError(
+            f"--raw, --rate, --channels and --track do not apply to {source}; leave them out"
+        )
     if source in ("mic", "monitor") and fast:
-        raise UserError(f"--fast does not apply to {source}: its sound arrives in real time")
+        raise UserError(
+            f"--fast does not apply to {source}: its sound arrives in real time; leave it out"
+        )
     if raw and track is not None:
         raise UserError("--track does not apply to raw samples; leave out --raw or --track")
     if source == "mic":
@@ -299,10 +303,8 @@ def doctor(control: Control = "") -> None:
 
 def _session_name(name: str) -> str:
     """Return a session name after checking it. An empty name is allowed."""
-    if not re.fullmatch("[A-Za-z0-9_-]{0,64}", name):
-        raise UserError(
-            f"{name!r} is not a session name; use up to 64 letters, digits, '-' and '_'"
-        )
+    if name and not is_name(name):
+        raise UserError(f"{name!r} is not a session name; {NAME_RULE}")
     return name
 
 
@@ -333,5 +335,5 @@ def find_system(given: str) -> tuple[str, ServiceConfig]:
     config = settings.load(ServiceConfig, overrides)
     if "*" in config.control:
         key = "--control" if given else "common.control"
-        raise UserError(f"{key}: {config.control!r} is not a host and port to connect to")
+        raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
     return running, config

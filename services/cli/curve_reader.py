@@ -62,9 +62,13 @@ def read_table(path: Path) -> FapAnimation:
             times.append(row[names.index(time_name)])
             values.append(np.array([row[column] for column in columns], np.float64))
         except (ValueError, TypeError, IndexError):
-            raise UserError(f"{path}, frame {number}: a value is missing or not a number") from None
+            raise UserError(
+                f"{path}, frame {number}: a value is missing or not a number; correct it"
+            ) from None
         if len(row) != len(names) or not (np.abs(values[-1]) <= _MAX_FAP).all():
-            raise UserError(f"{path}, frame {number}: a value is missing or not a number")
+            raise UserError(
+                f"{path}, frame {number}: a value is missing or not a number; correct it"
+            )
         if is_shapes and (np.abs(values[-1]) > _MAX_WEIGHT).any():
             raise UserError(
                 f"{path}, frame {number}: values of shapes must be from 0 to 1; divide percentages"
@@ -73,7 +77,7 @@ def read_table(path: Path) -> FapAnimation:
         if number > MAX_FRAMES:
             raise UserError(f"{path}: the table has more than {MAX_FRAMES} frames; split it")
     if not times:
-        raise UserError(f"{path}: the table has no frames with a face")
+        raise UserError(f"{path}: the table has no frames with a face; record it again")
     times_s = _times_s(path, times, is_time_code=time_name == "timecode")
     return _resample(path, times_s, np.array(values) @ basis)
 
@@ -135,7 +139,10 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
         ([(name, row) for name, row in table if name.lower() in names] for table in tables), key=len
     )
     if not known:
-        raise UserError(f"{path}: no column has the name of a FAP or of a shape such as jawOpen")
+        raise UserError(
+            f"{path}: no column has the name of a FAP or of a shape such as jawOpen; rename the"
+            " columns"
+        )
     for angle, fap in _HEAD_FAPS.items():
         if angle.lower() in names:
             known.append((angle, fap_rows[FAP_NUMBER[fap] - 1] / RADIANS_PER_ANGLE_UNIT))
@@ -166,12 +173,14 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
     steps_s = np.diff(times_s)
     if (steps_s < 0).any():
         number = int(np.argmax(steps_s < 0)) + 2
-        raise UserError(f"{path}, frame {number}: its time is earlier than the previous frame's")
+        raise UserError(
+            f"{path}, frame {number}: its time is earlier than the previous frame's; sort them"
+        )
     times_s, first = np.unique(times_s - times_s[0], return_index=True)
     rate_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 1 else 50.0
     num_frames = round(times_s[-1] * rate_hz) + 1
     if not 1.0 <= rate_hz <= 1000.0 or num_frames > 10 * len(times_s) + 1000:
-        raise UserError(f"{path}: the times do not match a rate of 1 to 1000 frames per second")
+        raise UserError(f"{path}: the times must match a rate of 1 to 1000 frames per second")
     grid_s = np.arange(num_frames) / rate_hz
     columns = [np.interp(grid_s, times_s, column) for column in faps[first].T]
     return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))

@@ -47,7 +47,7 @@ def follow(
     if alphabet is not None and shown is not ListenOutput.PHONES:
         raise UserError("--alphabet applies to phones; add --show phones")
     if shown is not ListenOutput.FAPS and (output is not None or form is not None):
-        raise UserError(f"--show {shown} cannot be combined with --output or --as")
+        raise UserError(f"--show {shown} cannot be combined with --output or --as; leave these out")
     if form is CurveForm.LIVELINK and output is None:
         raise UserError("--as livelink is a table; add --output face.csv")
     exporter = None if output is None else _open_exporter(output, form)

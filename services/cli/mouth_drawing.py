@@ -125,7 +125,7 @@ def draw_mouth(
     if write is None:
         raise UserError(f"{output}: give a name that ends in {', '.join(_WRITERS)}")
     if num_points is not None and suffix != ".csv":
-        raise UserError(f"{output}: --points applies to .csv")
+        raise UserError(f"{output}: --points applies to .csv; leave it out")
     if smooth and suffix not in (".mp4", ".csv"):
         raise UserError(f"{output}: --smooth applies to .mp4 and .csv; a picture has key frames")
     if text is not None and speech_to_text is not None:

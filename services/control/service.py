@@ -171,15 +171,13 @@ class ControlService(Service):
     def _close_session(self, message: CloseSession, _sender: Peer) -> Message | None:
         record = self._sessions.find_owned(message.session, message.token or "")
         self._lifecycle.end(record, "closed by its client")
-        if message.request is None:
-            return None
-        return Done(session=message.session, request=message.request)
+        return _done(message)
 
-    def _flush_session(self, message: FlushSession, _sender: Peer) -> Message:
+    def _flush_session(self, message: FlushSession, _sender: Peer) -> Message | None:
         record = self._sessions.find_owned(message.session, message.token)
         self._lifecycle.send_to_participants(record, replace(message, epoch=record.epoch))
         self._lifecycle.publish(EventName.SESSION_FLUSHED, record.name)
-        return Done(session=message.session, request=message.request)
+        return _done(message)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
         if message.session == "":  # the face at rest, which only observers show
@@ -193,9 +191,7 @@ class ControlService(Service):
             self._lifecycle.send_to_participants(
                 record, replace(message, epoch=record.epoch, request=None)
             )
-        if message.request is None:
-            return None
-        return Done(session=message.session, request=message.request)
+        return _done(message)
 
     def _report_status(self, message: StatusRequest, sender: Peer) -> Message:
         shows_token = self._requests.may_see_token(sender)
@@ -380,3 +376,10 @@ class ControlService(Service):
                 self._lifecycle.move(record)
         self._lifecycle.end_revoked()
         self._requests.retry_deferred()
+
+
+def _done(message: CloseSession | FlushSession | SetFace) -> Done | None:
+    """Return the answer to a request that was carried out; None if no answer is needed."""
+    if message.request is None:
+        return None
+    return Done(session=message.session, request=message.request)

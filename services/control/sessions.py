@@ -70,7 +70,10 @@ class Sessions:
         """
         record = self.find(name)
         if not secrets.compare_digest(record.token.encode(), token.encode()):
-            raise Refusal(ErrorCode.BAD_TOKEN, f"the token does not belong to session {name!r}")
+            raise Refusal(
+                ErrorCode.BAD_TOKEN,
+                f"this is not the token of session {name!r}; use that of session-opened",
+            )
         return record
 
     def find_by_request(self, opening: OpenSession, client: Peer) -> SessionRecord | None:

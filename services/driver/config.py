@@ -8,6 +8,7 @@ from pydantic import Field
 
 from kouxing.shared.config import Switch, ValueHint
 from kouxing.shared.face.config import FaceConfig
+from kouxing.shared.names import NAME
 
 HEAD_NAMES = tuple(
     sorted(path.stem for path in (Path(__file__).parent / "head" / "assets").glob("*.npz"))
@@ -29,7 +30,7 @@ class DriverConfig(FaceConfig):
     """Whether to open a window. auto opens one if a display is available."""
     session: Annotated[
         str,
-        Field(pattern="^[A-Za-z0-9_-]{1,64}$"),
+        Field(pattern=f"^{NAME}$"),
         ValueHint("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
     ] = "newest"
     """Session to show. "newest" shows the session that was opened last."""

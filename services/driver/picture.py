@@ -24,7 +24,7 @@ def decode(encoded: bytes, name: str) -> UInt8:
     """
     codec = next((codec for magic, codec in _CODECS.items() if encoded.startswith(magic)), None)
     if codec is None:
-        raise UserError(f"texture {name!r} is not PNG, JPEG or WebP")
+        raise UserError(f"texture {name!r} is not PNG, JPEG or WebP; convert it")
     decoder: Any = av.CodecContext.create(codec, "r")
     decoder.options = {"max_pixels": str(MAX_PIXELS)}
     decoder.thread_count = 1
@@ -33,7 +33,8 @@ def decode(encoded: bytes, name: str) -> UInt8:
         pixels = np.asarray(frames[0].to_ndarray(format="rgba"), dtype=np.uint8)
     except (av.FFmpegError, IndexError, ValueError, MemoryError) as error:
         raise UserError(
-            f"texture {name!r} is damaged or has more than {MAX_PIXELS / 1e6:.0f} million pixels"
+            f"texture {name!r} is damaged or has more than {MAX_PIXELS / 1e6:.0f} million pixels;"
+            " export a smaller one"
         ) from error
     return pixels
 

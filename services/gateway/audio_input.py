@@ -8,7 +8,7 @@ from aiohttp import WSMessage, WSMsgType, web
 from kouxing_client import KouxingError
 
 from kouxing.services.gateway.audio_sessions import AudioSession
-from kouxing.services.gateway.limits import COMMAND_S, RateLimit
+from kouxing.services.gateway.limits import COMMAND_S, RealTimeLimit
 from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
@@ -33,7 +33,7 @@ class AudioInput:
         self._is_first = True
         self._incomplete = b""  # part of a sample, or of a file's header
         self._drained: asyncio.Task[None] | None = None  # done when all audio is passed on
-        self._rate_limit = RateLimit()
+        self._rate_limit = RealTimeLimit()
         self._queue = RealTimeQueue(session, pcm_format, keep_alive=is_ahead)
 
     @contextlib.asynccontextmanager

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator
 
-from kouxing.shared.config import BoundHost, BoundPort, Switch, Texts, ValueHint
+from kouxing.shared.config import BoundHost, BoundPort, HostNames, Switch, Texts, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
@@ -43,7 +43,6 @@ Targets = Annotated[
     AfterValidator(_check_targets),
     ValueHint("a list of addresses such as vmc://127.0.0.1:39540"),
 ]
-Names = Annotated[Texts, ValueHint("a list of host names")]
 
 
 class GatewayConfig(FaceConfig):
@@ -69,7 +68,7 @@ class GatewayConfig(FaceConfig):
     plain_http: Switch = False
     """Serve unencrypted http at an address that other machines can reach. Use this only behind an
     encrypting proxy, or for a port that is published only to this machine."""
-    names: Names = ()
+    names: HostNames = ()
     """Additional host names of the page, such as that of a proxy."""
     allowed_origins: Origins = ()
     """Origins of other pages that may connect to the gateway's sessions."""

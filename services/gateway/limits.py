@@ -58,7 +58,7 @@ class ConnectionQuota:
             self.release(address)
 
 
-class RateLimit:
+class RealTimeLimit:
     """Limits one browser's data to real time, after an initial burst."""
 
     def __init__(self) -> None:

@@ -61,7 +61,9 @@ class Microphones:
         try:
             first = await browser.receive(HELLO_TIMEOUT_S)
         except TimeoutError:
-            raise UserError(f"no description of the audio came in {HELLO_TIMEOUT_S:g} s") from None
+            raise UserError(
+                f"no description of the audio came in {HELLO_TIMEOUT_S:g} s; send it first"
+            ) from None
         if first.type is not WSMsgType.TEXT:
             raise UserError("the first message must be a JSON object that describes the audio")
         hello = wire.parse_hello(first.data)

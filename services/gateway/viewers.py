@@ -11,14 +11,15 @@ from aiohttp import WSMsgType, web
 
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.http import WebSockets
-from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RateLimit
+from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.metrics import Metrics
+from kouxing.shared.names import NAME_RULE, is_name
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.speech import AcousticModel
+from kouxing.shared.wire.speech import AcousticModelName
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
@@ -30,7 +31,7 @@ PAUSE_S = 0.2  # time without a frame after which a viewer gets the face at rest
 class _ShownSession:
     epoch: int
     lip_model: str  # its name; empty: unknown
-    acoustic: str = AcousticModel.FULL
+    acoustic: str = AcousticModelName.FULL
 
 
 @dataclass(slots=True, eq=False)
@@ -173,10 +174,8 @@ class Viewers:
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one viewer until it disconnects."""
         chosen = request.query.get("session", "")
-        if chosen and not wire.SESSION_NAME.fullmatch(chosen):
-            raise web.HTTPBadRequest(
-                text="session must be a name of up to 64 letters, digits, '-' and '_'\n"
-            )
+        if chosen and not is_name(chosen):
+            raise web.HTTPBadRequest(text=f"session must be a name; {NAME_RULE}\n")
         try:
             shape_encoder = parse_shape_query(request.query)
         except UserError as error:
@@ -204,7 +203,7 @@ class Viewers:
 
     async def _serve_commands(self, viewer: Viewer, browser: web.WebSocketResponse) -> None:
         writer = asyncio.create_task(_write(browser, viewer.queue))
-        rate_limit = RateLimit()
+        rate_limit = RealTimeLimit()
         try:
             async for message in browser:
                 if message.type is WSMsgType.TEXT:
@@ -229,7 +228,7 @@ class Viewers:
                 if viewer.shown is None and settings.expressions is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
                 self._set_face(viewer.shown[0] if viewer.shown else "", settings)
-            elif isinstance(session, str) and (not session or wire.SESSION_NAME.fullmatch(session)):
+            elif isinstance(session, str) and (not session or is_name(session)):
                 viewer.chosen = session
             else:
                 raise UserError(

@@ -31,7 +31,7 @@ def use_addresses(addresses: Sequence[str]) -> None:
     aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [*addresses]
 
 
-class Peer:
+class WebRtcPeer:
     """The answering side of one connection.
 
     ``on_channel`` is called with each data channel that the client opens.

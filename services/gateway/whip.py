@@ -20,7 +20,7 @@ from kouxing_client import KouxingError, Refused
 
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
-from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RateLimit
+from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.services.gateway.viewers import Viewers
@@ -30,7 +30,7 @@ from kouxing.shared.logs import LOG
 if TYPE_CHECKING:
     from aiortc import RTCDataChannel
 
-    from kouxing.services.gateway.webrtc import Peer
+    from kouxing.services.gateway.webrtc import WebRtcPeer
 
 MAX_CLIENTS = 16
 SDP = "application/sdp"
@@ -45,7 +45,7 @@ MISSING = (
 @dataclass(slots=True, eq=False)
 class _Client:
     shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
-    peer: Peer | None = None
+    peer: WebRtcPeer | None = None
     session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session
     tasks: set[asyncio.Task[None]] = field(default_factory=set)  # of the data channel
@@ -131,7 +131,7 @@ class WhipClients:
         peers = [client.peer for client in self._clients.values() if client.peer is not None]
         await asyncio.gather(*(peer.close() for peer in peers), return_exceptions=True)
 
-    async def _make_peer(self, client: _Client) -> Peer:
+    async def _make_peer(self, client: _Client) -> WebRtcPeer:
         name = "kouxing.services.gateway.webrtc"
         try:
             webrtc = await asyncio.to_thread(importlib.import_module, name)
@@ -139,13 +139,13 @@ class WhipClients:
             raise web.HTTPNotImplemented(text=MISSING) from None
         if self._addresses:
             webrtc.use_addresses(self._addresses)
-        peer: Peer = webrtc.Peer(lambda channel: self._on_channel(client, channel))
+        peer: WebRtcPeer = webrtc.WebRtcPeer(lambda channel: self._on_channel(client, channel))
         return peer
 
     async def _stream(
         self,
         client: _Client,
-        peer: Peer,
+        peer: WebRtcPeer,
         session: AudioSession,
         stack: contextlib.AsyncExitStack,
     ) -> None:
@@ -200,7 +200,7 @@ class WhipClients:
     async def _handle_commands(
         self, session: AudioSession, channel: RTCDataChannel, commands: asyncio.Queue[str | bytes]
     ) -> None:
-        rate_limit = RateLimit()
+        rate_limit = RealTimeLimit()
         while True:
             message = await commands.get()
             try:

@@ -6,7 +6,6 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 
 import base64
 import json
-import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,9 +20,10 @@ from kouxing.shared.face.expressions import (
     check_feeling,
 )
 from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.names import is_name
 from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.speech import AcousticModel
+from kouxing.shared.wire.speech import AcousticModelName
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
@@ -32,7 +32,6 @@ REST_TYPE = 3  # payload as for FAP_TYPE: the face while no session moves it
 SHAPES_TYPE = 4  # payload: float32 weights of a shape set, for a frame
 REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at rest
 
-SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 
@@ -149,7 +148,7 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
         check_expressions(expressions, hold_s)
         settings.update(expressions=expressions, hold_s=hold_s)
     if (acoustic := fields.get("acoustic")) is not None:
-        if acoustic not in [*AcousticModel]:
+        if acoustic not in [*AcousticModelName]:
             raise UserError("acoustic must be full or light")
         settings["acoustic"] = acoustic
     if (amount := fields.get("expressiveness")) is not None:
@@ -162,7 +161,7 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
                 raise UserError(f"{name} must be true or false")
             settings[name] = value
     if (listen_to := fields.get("listen_to")) is not None:
-        if not isinstance(listen_to, str) or (listen_to and not SESSION_NAME.fullmatch(listen_to)):
+        if not isinstance(listen_to, str) or (listen_to and not is_name(listen_to)):
             raise UserError("listen_to must be the name of a session, or empty")
         settings["listen_to"] = listen_to
     return FaceSettings(**settings) if settings else None
@@ -174,7 +173,7 @@ def parse_object(message: str | bytes) -> dict[str, object]:
     Raises ``UserError`` if the message is not a JSON object, or too long.
     """
     if len(message) > MAX_OBJECT_BYTES:
-        raise UserError(f"a JSON message is longer than {MAX_OBJECT_BYTES >> 10} KiB")
+        raise UserError(f"a JSON message is longer than {MAX_OBJECT_BYTES >> 10} KiB; shorten it")
     try:
         fields = parse_json(message)
     except ValueError:

@@ -27,7 +27,13 @@ from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
-from kouxing.shared.wire.speech import Acknowledge, Acoustic, AcousticModel, AudioState, Progress
+from kouxing.shared.wire.speech import (
+    Acknowledge,
+    Acoustic,
+    AcousticModelName,
+    AudioState,
+    Progress,
+)
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
@@ -102,7 +108,7 @@ class RecognizerSession:
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
         self.is_laughing = False  # the speaker
-        self._published_acoustic = AcousticModel.FULL
+        self._published_acoustic = AcousticModelName.FULL
         self.sequence_out = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
@@ -128,7 +134,7 @@ class RecognizerSession:
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``AudioRejected`` if the sender may not send this message here."""
         if not secrets.compare_digest(self.start.token.encode(), message.token.encode()):
-            text = f"the token does not belong to session {self.name!r}"
+            text = f"this is not the token of session {self.name!r}; use that of session-opened"
             raise AudioRejected(ErrorCode.BAD_TOKEN, text)
         if socket is not self.socket:
             text = f"send the audio of session {self.name!r} to the endpoint in session-opened"
@@ -178,7 +184,7 @@ class RecognizerSession:
         self.accepted_s = now_s
         self.stream.set_hop(hop)
         has_skipped = self.audio.skip_old(now_s)
-        is_light = self.face.settings.acoustic == AcousticModel.LIGHT
+        is_light = self.face.settings.acoustic == AcousticModelName.LIGHT
         self.stream.set_light(is_light or self.audio.overload.needs_light_model(now_s))
         for media_time, samples in self.audio.take(max_s):
             if has_skipped:
@@ -237,7 +243,7 @@ class RecognizerSession:
 
     def acoustic_message(self, results: Sequence[StreamOutput]) -> Acoustic | None:
         """Return the message about the acoustic model in use, if these results make it due."""
-        model = AcousticModel.LIGHT if self.stream.is_light else AcousticModel.FULL
+        model = AcousticModelName.LIGHT if self.stream.is_light else AcousticModelName.FULL
         starts = any(isinstance(result, SpeechChange) and result.active for result in results)
         if model == self._published_acoustic and not starts:
             return None

@@ -39,7 +39,9 @@ class SherpaTranscriber:
         try:
             self._recognizer = _recognizer_in(folder)
         except (IndexError, RuntimeError, ValueError) as error:
-            raise UserError(f"{folder}: sherpa-onnx cannot load the model: {error}") from None
+            raise UserError(
+                f"{folder}: sherpa-onnx cannot load the model: {error}; copy it again"
+            ) from None
 
     def transcribe(self, samples: NDArray[np.float32]) -> str:
         """Return the text of audio, 16 kHz mono, shape (n,); empty without speech."""

@@ -15,6 +15,7 @@ from typing import Annotated, ClassVar
 from msgspec import Meta
 
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.names import NAME_OR_EMPTY
 
 VERSION = 3
 DOCUMENT = "proto/PROTOCOL.md"
@@ -23,7 +24,7 @@ MAX_COMMAND_BYTES = 256 * 1024  # a heartbeat that names 2000 sessions
 MAX_MESSAGE_BYTES = 1024 * 1024
 
 Version = Annotated[int, Meta(ge=1, le=65535)]
-SessionName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
+SessionName = Annotated[str, Meta(pattern=f"^{NAME_OR_EMPTY}$")]
 Name = Annotated[str, Meta(min_length=1, max_length=128)]
 Text = Annotated[str, Meta(max_length=2000)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]

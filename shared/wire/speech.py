@@ -33,7 +33,7 @@ class AudioState(StrEnum):
     ENDED = "ended"  # no more results follow
 
 
-class AcousticModel(StrEnum):
+class AcousticModelName(StrEnum):
     """The acoustic models of a session."""
 
     FULL = "full"  # the recognizer's
@@ -55,7 +55,7 @@ class Acoustic(Message):
 
     published_at: ClassVar[str | None] = "phones"
 
-    model: Name = AcousticModel.FULL
+    model: Name = AcousticModelName.FULL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

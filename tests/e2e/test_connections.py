@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from kouxing.evaluation.system.attackers import connected, frame
-from kouxing.shared import connection_quota, connections, tarpit
+from kouxing.shared import connections, peer_quota, tarpit
 from kouxing.shared.bus import Bus
 from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS
 from kouxing.shared.sockets import MAX_DROPPED, Poller, Received, Socket
@@ -133,7 +133,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
 
 
 def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_quota, "MAX_CONNECTIONS", 4)
+    monkeypatch.setattr(peer_quota, "MAX_CONNECTIONS", 4)
     monkeypatch.setattr(connections, "NEW_LOOKS", 10**6)
     monkeypatch.setattr(tarpit, "HOLD_S", 600.0)
     with contextlib.ExitStack() as stack:

@@ -489,7 +489,7 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
 @pytest.mark.parametrize(
     ("name", "content", "english", "chinese"),
     [
-        ("empty.wav", b"", "empty.wav: the file is empty", "empty.wav：文件是空的"),
+        ("empty.wav", b"", "empty.wav: the file is empty", "empty.wav：文件是空的，请重新录制"),
         (
             "text.mp3",
             b"hello",

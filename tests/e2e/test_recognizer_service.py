@@ -22,7 +22,7 @@ from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES
 from kouxing.shared.wire.session import SessionFacts
-from kouxing.shared.wire.speech import AcousticModel as AcousticModelName
+from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
 from tests.system import free_port
 

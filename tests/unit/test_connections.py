@@ -6,7 +6,7 @@ from unittest import mock
 
 import pytest
 
-from kouxing.shared import connection_quota, connections, kernel_sockets
+from kouxing.shared import connections, kernel_sockets, peer_quota
 from kouxing.shared.budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, Budget
 from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
@@ -37,7 +37,7 @@ class Scene:
         patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 5560)
         patch.setattr(kernel_sockets, "address_of", lambda d: self.addresses.get(d, "loopback"))
         patch.setattr(kernel_sockets, "traffic_of", lambda d: self.traffic.get(d, Traffic()))
-        patch.setattr(connection_quota, "MAX_CONNECTIONS", 10)
+        patch.setattr(peer_quota, "MAX_CONNECTIONS", 10)
         patch.setattr("threading.Thread.start", lambda _thread: None)
         self.limiter = ConnectionLimiter(is_service=lambda key: key == "service")
         monitor = SimpleNamespace(getsockopt=lambda _option: 10**6)

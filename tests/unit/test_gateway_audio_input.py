@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.gateway.audio_input import MAX_QUEUED_BYTES, AudioInput
-from kouxing.services.gateway.limits import RateLimit
+from kouxing.services.gateway.limits import RealTimeLimit
 from kouxing.services.gateway.pcm_format import PcmFormat, check_text
 from kouxing.shared.errors import UserError
 from tests.fake_time import run
@@ -133,7 +133,7 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
 
 def test_the_rate_limit_allows_a_burst_and_then_real_time() -> None:
     async def flood() -> None:
-        limit = RateLimit()
+        limit = RealTimeLimit()
         for _ in range(120):
             await limit.wait(0.05)
         assert asyncio.get_running_loop().time() == pytest.approx(1.0, abs=0.01)

@@ -24,7 +24,7 @@ from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
-from kouxing.shared.wire.speech import AcousticModel, Progress
+from kouxing.shared.wire.speech import AcousticModelName, Progress
 from tests.e2e.following import samples_of_file
 from tests.live_streams import START
 from tests.system import VOWELS_FILE
@@ -100,7 +100,7 @@ def test_reports_the_acoustic_model_in_use() -> None:
     samples = samples_of_file(VOWELS_FILE)[7_000:]
     models = []
     for number, start in enumerate(range(0, 32_000, 1600)):
-        light = AcousticModel.LIGHT if number >= 8 else AcousticModel.FULL
+        light = AcousticModelName.LIGHT if number >= 8 else AcousticModelName.FULL
         session.face.change(FaceSettings(acoustic=light), 0.0)
         session.audio.append((start, samples[start : start + 1600]), start / 16_000)
         session.accept_waveform(1.0, start / 16_000, hop=1)

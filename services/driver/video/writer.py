@@ -161,7 +161,9 @@ class VideoWriter:
                 f"cannot make a video of {width_px} x {height_px} pixels; give even, positive sizes"
             )
         if not 1 <= frame_rate_hz <= 1000:
-            raise UserError(f"the frame rate {frame_rate_hz} Hz is not between 1 and 1000")
+            raise UserError(
+                f"the frame rate {frame_rate_hz} Hz is not between 1 and 1000; choose one"
+            )
         sound_codec = None if sample_rate_hz is None else form.sound
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz

@@ -2,7 +2,7 @@
 
 const CHINESE = {
   // Files: the same texts as those of the commands
-  "the file is empty": "文件是空的",
+  "the file is empty; record it again": "文件是空的，请重新录制",
   "cannot read audio: this is {kind}": "无法读取声音：这是{kind}",
   "text, not sound: {text}": "文本，不是声音：{text}",
   "a zip archive; unpack it first": "zip 压缩包，请先解压",

@@ -100,7 +100,7 @@ def _low_pass_taps() -> NDArray[np.float64]:
 _TAPS = _low_pass_taps()
 
 
-class PitchTracker:
+class NccfPitchTracker:
     """Streaming pitch of every feature frame; any chunking gives the same frames.
 
     Frame ``t`` is the same as in ``features.LogMel`` and ready at the same sample.
@@ -168,7 +168,7 @@ class PitchedLogMel:
 
     def __init__(self) -> None:
         self._log_mel = LogMel()
-        self._pitch = PitchTracker()
+        self._pitch = NccfPitchTracker()
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take samples, shape (n,), 16 kHz, in [-1, 1].
