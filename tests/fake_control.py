@@ -4,6 +4,7 @@ import itertools
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self, TypeVar
 
 from kouxing.shared.bus import Bus
@@ -26,6 +27,7 @@ from kouxing.shared.wire.session import (
     StatusRequest,
 )
 from kouxing.shared.wire.speech import Acknowledge
+from tests.samples import START
 from tests.system import LIMIT_S, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -220,16 +222,13 @@ class FakeControl:
     def _start_message(
         self, session: str, *, epoch: int = EPOCH, record: bool = False
     ) -> StartSession:
-        return StartSession(
+        return replace(
+            START,
             session=session,
             epoch=epoch,
             request=f"start-{session}-{epoch}",
             token=TOKEN,
-            encoding="s16le",
-            sample_rate_hz=16000,
-            num_channels=1,
             record=record,
-            paced=True,
             facts=FACTS,
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
             face=FaceSettings(lip_model="dynamic-visemes"),

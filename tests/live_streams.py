@@ -1,5 +1,6 @@
 """Live streams for tests: every call returns the recognizer's new results."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,23 +10,14 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.session import SessionFacts
+from tests.samples import START as START_AT_16_KHZ
 
-START = StartSession(
-    session="s",
-    epoch=1,
-    request="r",
-    token="t",
-    encoding="s16le",
+START = replace(
+    START_AT_16_KHZ,
     sample_rate_hz=8000,
-    num_channels=1,
-    record=False,
-    paced=True,
     facts=SessionFacts(language="mandarin", delay_ms=0.0),
-    endpoints={},
 )
-
 RULE = OutputRuleConfig()
 
 

@@ -8,27 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import Head
+from tests import heads
 from tests.glb_writer import Mesh
 
+ORIGINAL = heads.load("woman", "coarse")
 STIFF = ("brows", "lashes")  # transparent parts that move, which these meshes omit
 
 
-def meshes(head: Head, shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
+def meshes(shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
     """Return the parts with morph targets, given as FAPs (68,) by name."""
-    shown = [part for part in head.parts if not part.name.startswith(STIFF)]
+    shown = [part for part in ORIGINAL.parts if not part.name.startswith(STIFF)]
     made = {
         part.name: Mesh(
             part.name,
-            head.vertices[part.vertices],
-            head.triangles[part.triangles].astype(np.int64) - part.vertices.start,
-            uv=head.uv[part.vertices],
-            colors=head.colors[part.vertices],
-            texture=head.textures[part.texture],
+            ORIGINAL.vertices[part.vertices],
+            ORIGINAL.triangles[part.triangles].astype(np.int64) - part.vertices.start,
+            uv=ORIGINAL.uv[part.vertices],
+            colors=ORIGINAL.colors[part.vertices],
+            texture=ORIGINAL.textures[part.texture],
         )
         for part in shown
     }
     for name, faps in (shapes or {}).items():
-        shift = (head.basis @ np.asarray(faps, np.float32)).reshape(-1, 3)
+        shift = (ORIGINAL.basis @ np.asarray(faps, np.float32)).reshape(-1, 3)
         for part in shown:
             if np.abs(shift[part.vertices]).max() > 1e-6:
                 made[part.name].targets[name] = shift[part.vertices]
@@ -53,3 +55,13 @@ def write_obj(path: Path, parts: list[Mesh]) -> None:
             lines.append("f " + " ".join(words))
         first += count
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def shape_error(head: Head, faps: NDArray[np.floating]) -> float:
+    """Return the difference of the skins' displacements from the original's, relative to these."""
+    shift, wanted = (
+        (model.deform(np.asarray(faps, np.float32)) - model.vertices)[model.part("skin").vertices]
+        / np.linalg.norm(model.eye_centers[0] - model.eye_centers[1])
+        for model in (head, ORIGINAL)
+    )
+    return float(np.linalg.norm(shift - wanted) / np.linalg.norm(wanted))

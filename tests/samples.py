@@ -1,15 +1,32 @@
-"""One message of every kind, as ``proto/golden`` has them."""
+"""One message of every kind, as ``proto/golden`` has them, and builders of frequent messages."""
 
 import json
 from pathlib import Path
 
 import msgspec
 
+from kouxing.shared.face.faps import MASK_BYTES
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import VERSION, Message
+from kouxing.shared.wire.session import SessionFacts
 
 FILE = Path(__file__).parents[1] / "proto" / "golden" / f"version{VERSION}.json"
 STORED = json.loads(FILE.read_text(encoding="utf-8"))
 SAMPLES: dict[str, Message] = {
     kind: msgspec.convert(stored["message"], MESSAGES[kind]) for kind, stored in STORED.items()
 }
+
+START = StartSession(
+    session="s", epoch=1, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
+    num_channels=1, record=False, paced=True, facts=SessionFacts(language="mandarin"), endpoints={},
+)  # fmt: skip
+
+
+def fap_frame(session: str, number: int, values: bytes, epoch: int = 1) -> FapFrame:
+    """Return the ``number``-th frame of a session at 50 Hz, from 0."""
+    return FapFrame(
+        session=session, epoch=epoch, sequence=number + 1, media_time=number * 320, values=values,
+        mask=bytes(MASK_BYTES),
+    )  # fmt: skip

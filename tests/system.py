@@ -221,6 +221,11 @@ class System(LocalSystem):
                 time.sleep(0.05)
         raise AssertionError(f"the condition does not become true: {client}")
 
+    def status(self) -> Status:
+        """Return the status report of control."""
+        with Client(self.control, timeout_s=LIMIT_S) as client:
+            return client.status()
+
     def endpoints(self) -> dict[str, str]:
         """Return the endpoint of every socket of the services, with its key, by name."""
         services = self.status().services

@@ -69,12 +69,20 @@ def set_min_rate(browser: Browser, rate_hz: float) -> None:
 
 
 def read_aloud(browser: Browser) -> None:
-    """Record for two seconds, also on a busy machine, and wait for the outcome."""
+    """Record until enough images were taken, however slowly, and wait for the outcome."""
     set_min_rate(browser, 0)
-    browser.evaluate("window.kouxing.readingS = 2")
+    browser.evaluate(
+        "import('/face-recording.js').then(({ FaceRecording: { prototype } }) => {"
+        " const { addFace } = prototype; window.numFaces = 0;"
+        " prototype.addFace = function (...image) {"
+        "   window.numFaces += 1; addFace.apply(this, image); }; })"
+    )
+    browser.evaluate("window.kouxing.readingS = 600")
     browser.click("learn")
     browser.click("lesson-start")
-    browser.wait_for("document.getElementById('lesson-reading').classList.contains('due')", 90)
+    is_due = "document.getElementById('lesson-reading').classList.contains('due')"
+    browser.wait_for(f"{is_due} && window.numFaces > 80", 180)
+    browser.evaluate("window.kouxing.readingS = 0.001")
     browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
 
 

@@ -29,7 +29,7 @@ from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.page_heads import page_heads_folder
 from tests.glb_writer import write_glb
-from tests.meshes import meshes
+from tests.meshes import ORIGINAL, meshes
 from tests.system import VOWELS_FILE, kouxing
 
 SENTENCE = VOWELS_FILE
@@ -164,11 +164,10 @@ def test_a_mouth_profile_changes_the_face(tmp_path: Path) -> None:
 
 
 def test_renders_an_imported_mesh(face: Path, tmp_path: Path) -> None:
-    head = Head.load(detail="coarse")
-    write_glb(tmp_path / "mesh.glb", meshes(head))
+    write_glb(tmp_path / "mesh.glb", meshes())
     rows = [
-        f"{name} {' '.join(map(str, head.vertices[vertex]))}"
-        for name, vertex in head.feature_points.items()
+        f"{name} {' '.join(map(str, ORIGINAL.vertices[vertex]))}"
+        for name, vertex in ORIGINAL.feature_points.items()
     ]
     (tmp_path / "points.tsv").write_text("\n".join(rows), encoding="utf-8")
     imported = tmp_path / "mine.npz"

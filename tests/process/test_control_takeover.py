@@ -1,6 +1,7 @@
 """A restarted control learns the sessions from the services."""
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -13,11 +14,11 @@ from kouxing.shared.wire.session import (
     Done,
     Error,
     OpenSession,
-    SessionFacts,
     SessionMoved,
 )
 from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage, beat
+from tests.samples import START
 
 PLACED = {
     "audio": "tcp://127.0.0.1:1",
@@ -36,11 +37,7 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
     """Return the report of a session that an earlier control has placed on these services."""
-    start = StartSession(
-        session="mine", epoch=4, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
-        num_channels=1, record=False, paced=True, endpoints=endpoints,
-        facts=SessionFacts(language="mandarin"), **fields,  # type: ignore[arg-type]
-    )  # fmt: skip
+    start = replace(START, session="mine", epoch=4, endpoints=endpoints, **fields)  # type: ignore[arg-type]
     return SessionStarted(session="mine", request="r", start=start)
 
 

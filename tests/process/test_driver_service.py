@@ -12,11 +12,12 @@ import pytest
 from kouxing.services.driver import poses, recordings
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
-from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
+from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.wire.control import Event, SessionInput, SessionStarted
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.face import EndOfFaps
 from kouxing.shared.wire.session import Error
 from tests.fake_control import FakeControl
+from tests.samples import fap_frame
 from tests.system import wait_until
 
 
@@ -59,14 +60,8 @@ class Stage:
         return list(self.folder.glob(".*.part"))
 
     def publish(self, session: str, number: int, value: float, epoch: int = 1) -> None:
-        frame = FapFrame(
-            session=session,
-            epoch=epoch,
-            sequence=number + 1,
-            media_time=number * 320,
-            values=np.full(NUM_FAPS, value, "<f4").tobytes(),
-            mask=bytes(MASK_BYTES),
-        )
+        values = np.full(NUM_FAPS, value, "<f4").tobytes()
+        frame = fap_frame(session, number, values, epoch)
         self.control.publish(self.control.faps, frame)
 
     def end(self, session: str, epoch: int = 1) -> None:

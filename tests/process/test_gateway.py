@@ -15,11 +15,11 @@ from pythonosc.osc_bundle import OscBundle
 
 from kouxing.services.gateway.microphone import MAX_MESSAGE_BYTES
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
-from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
+from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionStarted
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
+from kouxing.shared.wire.face import EndOfFaps, SetFace
 from kouxing.shared.wire.session import CloseSession, FlushSession
 from kouxing.shared.wire.speech import Acoustic
 from tests.fake_control import EPOCH, FakeControl
@@ -34,6 +34,7 @@ from tests.process.web_clients import (
     receive_of_session,
     until,
 )
+from tests.samples import fap_frame
 from tests.system import LIMIT_S, Gateway, free_port, port_of
 
 PONG = b"\x8a\x80" + bytes(4)  # of a client
@@ -81,18 +82,6 @@ def own_gateway(own_control: FakeControl) -> Iterator[Gateway]:
 
 
 # --- viewers
-
-
-def publish_frame(control: FakeControl, session: str, media_time: int) -> None:
-    frame = FapFrame(
-        session=session,
-        epoch=EPOCH,
-        sequence=media_time // 320,
-        media_time=media_time,
-        values=FACE,
-        mask=bytes(MASK_BYTES),
-    )
-    control.publish(control.faps, frame)
 
 
 def media_time_of(message: bytes) -> float:
@@ -231,7 +220,7 @@ async def test_a_slow_viewer_gets_the_newest_frames(control: FakeControl, gatewa
             control.start("long")
             await receive_json(viewer, "session", session="long")
             for media_time in times:
-                publish_frame(control, "long", media_time)
+                control.publish(control.faps, fap_frame("long", media_time // 320, FACE))
                 if media_time % 6400 == 0:  # the gateway and this viewer keep up
                     while media_time_of(await receive_binary(viewer, FAP_TYPE)) < media_time:
                         pass

@@ -5,6 +5,7 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,11 +25,11 @@ from kouxing.shared.service import (
 )
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted, StartSession
-from kouxing.shared.wire.session import SessionFacts
+from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
+from tests.samples import START
 from tests.system import LIMIT_S, wait_until
 
 
@@ -214,10 +215,7 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
 def test_a_restarted_control_learns_the_sessions(
     monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker
 ) -> None:
-    start = StartSession(
-        session="s0", epoch=3, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
-        num_channels=1, record=False, paced=True, facts=SessionFacts(), endpoints={},
-    )  # fmt: skip
+    start = replace(START, session="s0", epoch=3)
     monkeypatch.setattr(worker, "served_sessions", lambda: [start])
     run_until(worker, lambda: control.heartbeats)
     assert not control.of(SessionStarted)

@@ -19,6 +19,7 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO
 from tests.unit.test_face_landmarks import FACE, landmark_file
+from tests.videos import write_video
 
 PICTURES = Path(__file__).parents[1] / "golden"
 RUNNER = CliRunner()
@@ -28,14 +29,6 @@ def picture(name: str) -> NDArray[np.uint8]:
     return np.array(Image.open(PICTURES / f"render_{name}.png").convert("RGB"))
 
 
-def write_video(path: Path, pictures: list[NDArray[np.uint8]], *, sound: bool = True) -> None:
-    with VideoWriter(path, 192, 144, 25.0, 16_000 if sound else None) as writer:
-        for image in pictures:
-            writer.write_image(image)
-            if sound:
-                writer.write_sound(np.zeros(640, np.float32))
-
-
 def run(app: object, *arguments: object) -> None:
     RUNNER.invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)  # type: ignore[arg-type]
 
@@ -43,7 +36,10 @@ def run(app: object, *arguments: object) -> None:
 def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
     nobody = np.zeros((144, 192, 3), np.uint8)
     shut, wide = picture("woman_rest"), picture("woman_a")
-    write_video(tmp_path / "me.mp4", [*[shut] * 30, *[wide] * 25, *[nobody] * 3])
+    with VideoWriter(tmp_path / "me.mp4", 192, 144, 25.0, 16_000) as writer:
+        for image in [*[shut] * 30, *[wide] * 25, *[nobody] * 3]:
+            writer.write_image(image)
+            writer.write_sound(np.zeros(640, np.float32))
     run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me")
     clip = read_clip(tmp_path / "me.json")
     assert clip.time_s == pytest.approx(np.arange(58) / 25, abs=0.03)
@@ -57,10 +53,9 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
 
 
 def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
-    video = tmp_path / "me.mp4"
-    write_video(video, [np.zeros((144, 192, 3), np.uint8)] * 3)
+    write_video(tmp_path / "me.mp4")
     (tmp_path / "text.mp4").write_bytes(b"no video")
-    write_video(tmp_path / "silent.mp4", [picture("woman_rest")] * 3, sound=False)
+    write_video(tmp_path / "silent.mp4", has_sound=False)
     for name, message in (
         ("me", "a face was found in only 0 images"),
         ("silent", "must have images and audio"),
@@ -69,11 +64,6 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
     ):
         with pytest.raises(UserError, match=message):
             run(track_app, tmp_path / f"{name}.mp4", "-o", tmp_path / "out")
-
-
-def test_names_a_file_that_is_not_a_clip(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"notes.txt: not a clip; give the .json file"):
-        run(adapt_app, tmp_path / "notes.txt", "-o", tmp_path / "me.mouth")
 
 
 def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:

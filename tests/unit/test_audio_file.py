@@ -1,7 +1,6 @@
 import tracemalloc
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import soundfile
@@ -10,6 +9,7 @@ from kouxing.shared.audio_file import open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
 from tests.unit.media import write_media
+from tests.videos import write_video
 
 
 def test_resamples_rates_above_48_khz(tmp_path: Path) -> None:
@@ -155,14 +155,7 @@ def test_does_not_guess_the_rate_of_samples_without_a_header(tmp_path: Path, suf
         open_audio(path)
 
 
-def test_rejects_media_without_audio_and_playlists(tmp_path: Path) -> None:
-    with av.open(tmp_path / "mute.mp4", "w") as container:
-        stream = container.add_stream("mpeg4", rate=25)
-        assert isinstance(stream, av.VideoStream)
-        stream.width = stream.height = 32
-        stream.pix_fmt = "yuv420p"
-        picture = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), format="rgb24")
-        container.mux(stream.encode(picture))
-        container.mux(stream.encode(None))
+def test_rejects_a_video_without_sound(tmp_path: Path) -> None:
+    write_video(tmp_path / "mute.mp4", has_sound=False)
     with pytest.raises(UserError, match="has no audio"):
         open_audio(tmp_path / "mute.mp4")

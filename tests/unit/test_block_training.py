@@ -97,18 +97,3 @@ def test_batches_of_a_step_have_one_shape_and_can_be_drawn_again() -> None:
         array = getattr(step[0], name)
         np.testing.assert_array_equal(array, getattr(again, name))
         assert np.isfinite(array).all()
-
-
-@pytest.mark.parametrize(("tempo", "shortening"), [(0.8, 0.0), (1.3, 0.0), (1.2, 0.8)])
-def test_faster_speech_keeps_the_order_of_its_frames(tempo: float, shortening: float) -> None:
-    frames = np.random.default_rng(0).normal(size=(300, 160)).astype(np.float32)
-    frames[60:200] = 0.5  # steady
-    kept = batches._shorten(frames, tempo, shortening, 100)
-    assert len(kept) == 100
-    assert (np.diff(kept) >= 0).all()
-    assert kept[-1] < 300
-    if shortening:
-        steps = np.diff(kept)
-        assert steps[(kept[1:] > 70) & (kept[1:] < 190)].mean() > 2 * steps[kept[1:] < 50].mean()
-    else:
-        assert kept[-1] == pytest.approx(100 * tempo, abs=2)

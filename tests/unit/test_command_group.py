@@ -1,6 +1,5 @@
 """Commands that other packages add as entry points."""
 
-import re
 import subprocess
 import sys
 from importlib.metadata import EntryPoint, version
@@ -53,13 +52,6 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
     result = CliRunner().invoke(command_line.app, ["--version"])
     assert result.output == f"kouxing {version('kouxing')}\n"
     assert added == []
-
-
-def test_help_names_values_instead_of_python_types() -> None:
-    for command in ("render", "speak", "run", "phones", "align"):
-        text = CliRunner().invoke(command_line.app, [command, "-h"]).output
-        assert "PATH" in text
-        assert not re.search(r"<(bool|str|float|int|path|list)", text)
 
 
 @pytest.mark.parametrize(

@@ -18,42 +18,23 @@ from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
 from tests.glb_writer import Mesh, add_skeleton, read_chunks, write_chunks, write_glb
 from tests.heads import neutral_faps
-from tests.meshes import meshes
+from tests.meshes import ORIGINAL, meshes, shape_error
 
 SHAPES = {name: ARKIT.basis[row] for row, name in enumerate(ARKIT.names)}
 VISEME_SHAPES = dict(zip(OCULUS.names, OCULUS.basis, strict=True))
 ORDER = np.random.default_rng(3).permutation(52)
 
 
-@pytest.fixture(scope="module")
-def original() -> Head:
-    return Head.load(detail="coarse")
-
-
-def skin(head: Head, faps: np.ndarray) -> np.ndarray:
-    """Return the displacement of the skin (V, 3) in eye distances."""
-    moved = head.deform(np.asarray(faps, np.float32)) - head.vertices
-    unit = np.linalg.norm(head.eye_centers[0] - head.eye_centers[1])
-    shift: np.ndarray = moved[head.part("skin").vertices] / unit
-    return shift
-
-
-def off(head: Head, original: Head, faps: np.ndarray) -> float:
-    """Return the difference of two heads, relative to their displacement."""
-    wanted = skin(original, faps)
-    return float(np.linalg.norm(skin(head, faps) - wanted) / np.linalg.norm(wanted))
-
-
-def test_reads_an_exported_head_unchanged(original: Head, tmp_path: Path) -> None:
-    export_glb(original, tmp_path / "original.glb")
+def test_reads_an_exported_head_unchanged(tmp_path: Path) -> None:
+    export_glb(ORIGINAL, tmp_path / "original.glb")
     head = load_head(str(tmp_path / "original.glb"))
-    assert [part.name for part in head.parts] == [part.name for part in original.parts]
+    assert [part.name for part in head.parts] == [part.name for part in ORIGINAL.parts]
     rng = np.random.default_rng(0)
     faps = rng.uniform(-200, 200, NUM_FAPS)
     faps[22:26] = faps[47:50] = 10_000
-    assert off(head, original, faps) < 0.01
+    assert shape_error(head, faps) < 0.01
     pictures = []
-    for model in (original, head):
+    for model in (ORIGINAL, head):
         renderer = Renderer(model, 96, 72, samples=0, camera=camera(model))
         pictures.append(renderer.draw(faps.astype(np.float32)).astype(float))
         renderer.close()
@@ -70,43 +51,43 @@ def test_reads_an_exported_head_unchanged(original: Head, tmp_path: Path) -> Non
     ids=["plain", "prefixed", "sides"],
 )
 def test_reads_arkit_shapes_in_any_order_unit_and_position(
-    original: Head, tmp_path: Path, rename: Callable[[str], str], unit: tuple[int, int, int]
+    tmp_path: Path, rename: Callable[[str], str], unit: tuple[int, int, int]
 ) -> None:
     shapes = {rename(ARKIT.names[row]): ARKIT.basis[row] for row in ORDER}
-    parts = meshes(original, shapes | {"somethingElse": ARKIT.basis[0]})
+    parts = meshes(shapes | {"somethingElse": ARKIT.basis[0]})
     for part in parts:
         part.vertices = (part.vertices + np.array([0.01, 6, -0.2])) * unit
         part.targets = {name: shift * unit for name, shift in part.targets.items()}
     head = read_glb(write_glb(tmp_path / "my.glb", parts))
-    same_place(head, original)
+    same_place(head)
     for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
-        assert off(head, original, SHAPES[name]) < 0.25, name
+        assert shape_error(head, SHAPES[name]) < 0.25, name
     for viseme in ("PP", "aa", "ou", "ih"):
-        assert off(head, original, VISEME_SHAPES[viseme]) < 0.5, viseme
+        assert shape_error(head, VISEME_SHAPES[viseme]) < 0.5, viseme
 
 
 @pytest.mark.parametrize("short", [False, True], ids=["oculus", "ready player me"])
-def test_reads_oculus_visemes(original: Head, tmp_path: Path, short: bool) -> None:
+def test_reads_oculus_visemes(tmp_path: Path, short: bool) -> None:
     names = {"ih": "I", "oh": "O", "ou": "U"} if short else {}
     shapes = {f"viseme_{names.get(n, n)}": faps for n, faps in VISEME_SHAPES.items()}
     shapes |= {name: SHAPES[name] for name in ("eyeBlinkLeft", "eyeBlinkRight")}
-    head = read_glb(write_glb(tmp_path / "my.glb", meshes(original, shapes)))
+    head = read_glb(write_glb(tmp_path / "my.glb", meshes(shapes)))
     for viseme in ("PP", "FF", "kk", "aa", "ih", "oh", "ou"):
-        assert off(head, original, VISEME_SHAPES[viseme]) < 0.15, viseme
-    assert off(head, original, neutral_faps(close_t_l_eyelid=700, close_t_r_eyelid=700)) < 0.4
+        assert shape_error(head, VISEME_SHAPES[viseme]) < 0.15, viseme
+    assert shape_error(head, neutral_faps(close_t_l_eyelid=700, close_t_r_eyelid=700)) < 0.4
 
 
-def same_place(head: Head, original: Head) -> None:
+def same_place(head: Head) -> None:
     """Compare the vertices of the parts in the GLB, except for their size and pivot."""
-    rows = [original.vertices[original.part(part.name).vertices] for part in head.parts]
+    rows = [ORIGINAL.vertices[ORIGINAL.part(part.name).vertices] for part in head.parts]
     first, second = np.concatenate(rows), head.vertices
     shift = second - first * np.ptp(second[:, 1]) / np.ptp(first[:, 1])
     assert np.ptp(shift, axis=0).max() < 1e-4
     assert np.abs(shift).max() < 0.01
 
 
-def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_path: Path) -> None:
-    path = write_glb(tmp_path / "my.glb", meshes(original, SHAPES))
+def test_skeleton_rotates_the_head_but_not_the_shoulders(tmp_path: Path) -> None:
+    path = write_glb(tmp_path / "my.glb", meshes(SHAPES))
     bones = [
         {"name": "Hips", "translation": [0, -1, 0]},
         {"name": "Neck", "translation": [0, 0.9, 0]},
@@ -116,14 +97,14 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(original: Head, tmp_pat
     bind[0, 3, 1] = 1.0  # column-major: the bind pose cancels the position of the hips
     add_skeleton(path, bones, lambda name: 0 if name == "garment" else 2, bind)
     head = read_glb(path)
-    same_place(head, original)
+    same_place(head)
     moved = np.abs(head.deform(neutral_faps(head_yaw=40_000)) - head.vertices).max(axis=1)
     assert moved[head.part("garment").vertices].max() == 0
     assert moved[head.part("hair").vertices].max() > 0.02
 
 
-def test_a_jaw_bone_moves_teeth_without_shapes(original: Head, tmp_path: Path) -> None:
-    whole = meshes(original, SHAPES)
+def test_a_jaw_bone_moves_teeth_without_shapes(tmp_path: Path) -> None:
+    whole = meshes(SHAPES)
     for mesh in whole:
         if mesh.name.startswith("teeth"):
             mesh.targets = {}
@@ -239,8 +220,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
         (PNG + b"\0\0\0\rIHDR" + struct.pack(">IIB", 30_000, 30_000, 8), "million pixels"),
     ],
 )
-def test_rejects_bad_textures(tmp_path: Path, original: Head, texture: bytes, said: str) -> None:
-    parts = meshes(original, SHAPES)
+def test_rejects_bad_textures(tmp_path: Path, texture: bytes, said: str) -> None:
+    parts = meshes(SHAPES)
     parts[0].texture = texture
     with pytest.raises(UserError, match=said):
         read_glb(write_glb(tmp_path / "my.glb", parts))

@@ -13,14 +13,9 @@ from kouxing.shared.errors import UserError
 from tests import heads
 from tests.glb_writer import write_glb
 from tests.heads import OPEN, neutral_faps
-from tests.meshes import meshes, write_obj
+from tests.meshes import ORIGINAL, meshes, write_obj
 
 TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
-
-
-@pytest.fixture(scope="module")
-def original() -> Head:
-    return Head.load(detail="coarse")
 
 
 def lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
@@ -32,18 +27,18 @@ def lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
 
 
 @pytest.fixture(scope="module")
-def imported(original: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Head:
     """Return a longer face in centimeters, moved and facing backwards."""
     folder = tmp_path_factory.mktemp("import")
 
     def place(points: np.ndarray) -> np.ndarray:
         return points * [100, 112, 100] * TURN + [30, 150, -7]  # type: ignore[no-any-return]
 
-    parts = meshes(original)
+    parts = meshes()
     for part in parts:
         part.vertices = place(part.vertices)
     write_glb(folder / "face.glb", parts)
-    (folder / "points.tsv").write_text(lines(original, place), encoding="utf-8")
+    (folder / "points.tsv").write_text(lines(ORIGINAL, place), encoding="utf-8")
     remarks = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
     assert remarks == [
         "no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"
@@ -55,16 +50,16 @@ def moved(head: Head, faps: np.ndarray) -> np.ndarray:
     return head.deform(np.asarray(faps, np.float32)) - head.vertices
 
 
-def test_parts_textures_and_units(imported: Head, original: Head) -> None:
+def test_parts_textures_and_units(imported: Head) -> None:
     assert {"skin", "eye_left", "eye_right", "teeth_lower", "tongue"} <= {
         part.name for part in imported.parts
     }
-    skin, other = imported.part("skin"), original.part("skin")
-    assert imported.textures[skin.texture] == original.textures["skin"]
+    skin, other = imported.part("skin"), ORIGINAL.part("skin")
+    assert imported.textures[skin.texture] == ORIGINAL.textures["skin"]
     np.testing.assert_allclose(
-        imported.colors[skin.vertices], original.colors[other.vertices], atol=0.01
+        imported.colors[skin.vertices], ORIGINAL.colors[other.vertices], atol=0.01
     )
-    ratios = [head.fapu["MNS"] / head.fapu["MW"] for head in (imported, original)]
+    ratios = [head.fapu["MNS"] / head.fapu["MW"] for head in (imported, ORIGINAL)]
     assert ratios[0] == pytest.approx(1.12 * ratios[1], rel=0.01)
 
 
@@ -91,16 +86,16 @@ def test_jaw_eyes_head_and_shoulders(imported: Head) -> None:
     assert nod[np.argmin(imported.vertices[:, 1])] < 0.001
 
 
-def test_obj_with_vertex_numbers_and_seams(original: Head, tmp_path: Path) -> None:
-    parts = [part for part in meshes(original) if part.name in ("garment", "skin")][::-1]
+def test_obj_with_vertex_numbers_and_seams(tmp_path: Path) -> None:
+    parts = [part for part in meshes() if part.name in ("garment", "skin")][::-1]
     write_obj(tmp_path / "face.obj", parts)
     first = len(parts[0].vertices) if parts[0].name == "garment" else 0
     rows = [
         f"{name} {first + vertex}"
-        for name, vertex in original.feature_points.items()
-        if vertex < original.part("skin").vertices.stop
+        for name, vertex in ORIGINAL.feature_points.items()
+        if vertex < ORIGINAL.part("skin").vertices.stop
     ]
-    eyes = {"3.5": original.eye_centers[0], "3.6": original.eye_centers[1]}
+    eyes = {"3.5": ORIGINAL.eye_centers[0], "3.6": ORIGINAL.eye_centers[1]}
     rows += [f"{name} {' '.join(map(str, place))}  # inside" for name, place in eyes.items()]
     (tmp_path / "points.txt").write_text("\n".join(rows), encoding="utf-8")
     remarks = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
@@ -119,26 +114,26 @@ def test_obj_with_vertex_numbers_and_seams(original: Head, tmp_path: Path) -> No
         assert np.abs(first_of[group] - values).max() < 1e-4
 
 
-def test_reads_an_fdp_file(original: Head, face: Path, tmp_path: Path) -> None:
-    skin = original.part("skin").vertices
+def test_reads_an_fdp_file(face: Path, tmp_path: Path) -> None:
+    skin = ORIGINAL.part("skin").vertices
     entries = "".join(
         f'<fdp name="{name}" affects="skin" index="{vertex}"><indices>1 2 3</indices></fdp>'
-        for name, vertex in original.feature_points.items()
+        for name, vertex in ORIGINAL.feature_points.items()
         if skin.start <= vertex < skin.stop and name != "9.15"
     )
-    mns = original.fapu["MNS"]
+    mns = ORIGINAL.fapu["MNS"]
     text = f'<?xml version="1.0"?><xfdp><head><fapu MNS0="{mns}" MW0="1"/></head>{entries}</xfdp>'
     (tmp_path / "face.fdp").write_text(text, encoding="utf-8")
     import_head(face, tmp_path / "face.fdp", tmp_path / "out.npz")
     head = Head.load(tmp_path / "out.npz")
-    scale = head.fapu["ES"] / original.fapu["ES"]
+    scale = head.fapu["ES"] / ORIGINAL.fapu["ES"]
     assert head.fapu["MNS"] == pytest.approx(mns * scale, rel=0.02)
     assert moved(head, OPEN)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
 
 
 @pytest.fixture
-def face(original: Head, tmp_path: Path) -> Path:
-    return write_glb(tmp_path / "face.glb", meshes(original))
+def face(tmp_path: Path) -> Path:
+    return write_glb(tmp_path / "face.glb", meshes())
 
 
 @pytest.mark.parametrize(
@@ -172,9 +167,9 @@ def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, said: str) ->
     ],
 )
 def test_rejects_points_that_are_not_a_face(
-    original: Head, face: Path, tmp_path: Path, change: Callable[[str], str], said: str
+    face: Path, tmp_path: Path, change: Callable[[str], str], said: str
 ) -> None:
-    (tmp_path / "points.tsv").write_text(change(lines(original, lambda p: p)), encoding="utf-8")
+    (tmp_path / "points.tsv").write_text(change(lines(ORIGINAL, lambda p: p)), encoding="utf-8")
     with pytest.raises(UserError, match=said):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
     assert not (tmp_path / "out.npz").exists()
@@ -222,11 +217,11 @@ def test_rejects_bad_meshes(tmp_path: Path, name: str, text: str, said: str) -> 
         import_head(mesh, tmp_path / "points.tsv", tmp_path / "out.npz")
 
 
-def test_reports_joined_lips(original: Head, tmp_path: Path) -> None:
-    part = meshes(original)[0]
+def test_reports_joined_lips(tmp_path: Path) -> None:
+    part = meshes()[0]
     points = {
         name: vertex
-        for name, vertex in original.feature_points.items()
+        for name, vertex in ORIGINAL.feature_points.items()
         if vertex < len(part.vertices)
     }
     strip = [[points["2.2"], points["2.3"], points["2.6"]]]  # from lip to lip

@@ -6,15 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from rich.console import Console
 from typer.testing import CliRunner
 
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
-from kouxing.evaluation.lips.lip_scores import Scores, groups_of
-from kouxing.evaluation.lips.lip_table import print_scores
-from kouxing.evaluation.recognizer.disturbances import BABBLE, CLEAN, MUSIC
+from kouxing.evaluation.lips.lip_scores import groups_of
+from kouxing.evaluation.recognizer.disturbances import CLEAN, MUSIC
 from kouxing.shared.errors import UserError
 from tests.lips import clip_of
 from tests.system import DEMO
@@ -49,32 +47,6 @@ def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
         assert {*results[title][CLEAN]["all"]} == {"clips", *MEASURES}
     assert results["learnt, 0 ms"][CLEAN]["all"] != results["learnt, 60 ms"][CLEAN]["all"]
     assert "A: learnt, 0 ms, B: learnt, 60 ms" in result.output
-
-
-def test_the_table_fits_a_screen() -> None:
-    scores: Scores = {
-        "clips": 99.0,
-        **dict.fromkeys(MEASURES, 0.99),
-        "effort_correlation": -0.99,
-        "slcc": -0.99,
-    }
-    scores |= {
-        "closing_time_ms": 1200.0,
-        "phone_spread": 180.0,
-        "turns_per_s": 11.9,
-        "mtm_ms": 99.0,
-    }
-    clean = dict.fromkeys(
-        ("all", "zh", "zh known", "zh new", "en", "en known", "en new", "mocap"), scores
-    )
-    face = dict.fromkeys((CLEAN, BABBLE, MUSIC), clean)
-    results = {"real": {CLEAN: clean}, **{f"face {number}, 60 ms": face for number in range(3)}}
-    console = Console(width=80, record=True)
-    print_scores(results, console)
-    lines = console.export_text().strip("\n").split("\n")
-    assert len(lines) <= 40
-    assert max(map(len, lines)) <= 80
-    assert "clips: en 99, en new 99, zh 99, zh new 99, mocap 99, all 99" in lines
 
 
 def test_groups_of_a_clip() -> None:

@@ -1,4 +1,4 @@
-"""Peers with a key that say what only others may say: it counts for nothing."""
+"""Clients that send bad input, speak for others or attack: the services continue for all others."""
 
 import contextlib
 from collections.abc import Iterator
@@ -6,19 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import pytest
-from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, find_key
+from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, Sound, find_key
 
+from kouxing.evaluation.system import attackers
+from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
+from kouxing.evaluation.system.attacks import Memory
 from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
 from kouxing.shared.sockets import Socket
+from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionInput
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
-from kouxing.shared.wire.speech import AudioState, Phone, Progress, Speech
-from tests.e2e.following import samples_of_file
+from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
+from tests.e2e.following import Stream, samples_of_file
+from tests.raw_bytes import pour
 from tests.system import DEMO, LIMIT_S, System, wait_until
 
 M = TypeVar("M", bound=Message)
@@ -28,13 +34,12 @@ HEARTBEAT = Heartbeat(
 ENDPOINTS = {"audio": "tcp://127.0.0.1:1", "phones": "tcp://127.0.0.1:1"}
 
 
-def answer(socket: Socket, kind: type[M]) -> M:
-    """Return the next message of a kind."""
+def answers(socket: Socket, kind: type[M]) -> Iterator[M]:
+    """Yield the messages of a kind that arrive at a socket."""
     while socket.wait(LIMIT_S):
         for received in socket.receive():
             if isinstance(received.message, kind):
-                return received.message
-    raise AssertionError(f"no {kind.kind} came")
+                yield received.message
 
 
 def instances(client: Client) -> set[str]:
@@ -59,7 +64,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
     with Bus(load_key(name, ())) as bus:
         stranger = bus.connect_dealer(system.control)
         stranger.send(replace(HEARTBEAT, **forged))  # type: ignore[arg-type]
-        assert answer(stranger, Error).code == "not-allowed"
+        assert next(answers(stranger, Error)).code == "not-allowed"
     assert instances(client) == before
     session = client.open_session(paced=False)
     assert session.info["audio"] == witness.info["audio"]
@@ -135,7 +140,7 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
         key_folder().mkdir(mode=0o700)
         (tmp_path / "laptop.key").rename(key_folder() / "client.key")
         key = find_key()
-    with Client(system.control, key=key, timeout_s=LIMIT_S) as made:
+    with Client(system.control, key=key, timeout_s=10.0) as made:
         yield made
     with contextlib.suppress(UserError):  # revoked already
         revoke_key("laptop")
@@ -173,6 +178,112 @@ def test_a_revoked_key_is_cut_while_it_follows(
     shown.close()
 
 
+def test_rejects_nan_and_accepts_empty_chunks_silence_and_clipping(
+    client: Client, witness: Session
+) -> None:
+    with client.open_session(encoding="f32le", paced=False) as session:
+        sent = Stream(session)
+        session.push(np.array([0.0, np.nan, 0.0], np.float32))
+        errors: list[Refused] = []
+        wait_until(lambda: errors, step=lambda: errors.extend(session.take_errors()))
+        assert [error.code for error in errors] == ["bad-audio"]
+        for samples in (np.zeros(0), np.zeros(8000), np.full(8000, 1e9)):
+            session.push(samples.astype(np.float32))
+        sent.finish()
+    assert sent.times[-1] >= 16000
+    assert np.isfinite(sent.faps).all()
+
+
+def test_names_an_unknown_session(client: Client, bus: Bus, witness: Session) -> None:
+    audio = bus.connect_dealer(witness.info["audio"])
+    audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))
+    error = next(answers(audio, Error))
+    assert (error.code, error.session) == ("unknown-session", "nobody")
+    with pytest.raises(Refused, match="nobody") as caught:
+        client.request("close-session", "nobody", token="t")
+    assert caught.value.code == "unknown-session"
+
+
+def test_rejects_a_foreign_token_and_drops_a_replay(
+    client: Client, bus: Bus, witness: Session
+) -> None:
+    thief = bus.connect_dealer(witness.info["audio"])
+    thief.send(AudioChunk(session=witness.name, token="guess", sequence=1, pcm=b""))
+    thief.send(AudioChunk(session=witness.name, token="guess", sequence=2, last=True))
+    codes = answers(thief, Error)
+    assert [next(codes).code, next(codes).code] == ["bad-token", "bad-token"]
+    with pytest.raises(Refused) as caught:
+        client.request("close-session", witness.name, token="guess")
+    assert caught.value.code == "bad-token"
+    token = witness.info["token"]
+    output = witness.results(Sound)
+    witness.push(np.zeros(320, np.float32))
+    assert list(output.available(LIMIT_S))
+    replay = AudioChunk(session=witness.name, token=token, sequence=1, pcm=bytes(1280))
+    thief.send(replace(replay, acknowledge=True))
+    assert thief.wait(LIMIT_S)
+    (answer,) = thief.receive()
+    assert isinstance(answer.message, Acknowledge)
+    assert answer.message.sequence == 1
+    assert output.get(0.2) is None
+
+
+def test_an_observer_that_never_answers_delays_no_session(system: System, client: Client) -> None:
+    with Bus(load_key("gateway", ("service:gateway",))) as bus:
+        mute = bus.connect_dealer(system.control)
+        heartbeat = Heartbeat(
+            service="gateway", instance="mute", role="observer", state="ready", sent_ns=0
+        )
+        mute.send(heartbeat)
+        assert mute.wait(LIMIT_S), "control has registered it"
+        client.open_session(encoding="f32le").close()
+        mute.send(replace(heartbeat, state="draining"))
+
+
+def test_a_client_that_vanishes_disturbs_no_other(system: System, witness: Session) -> None:
+    with Client(system.control) as vanishing:
+        vanishing.open_session(encoding="f32le").push(np.zeros(320, np.float32))
+
+
+SERVICES = {"commands": "control", "audio": "recognizer", "faps": "synthesizer"}  # by target
+MAX_GROWTH_MB = {False: 8.0, True: 64.0}  # without a key, with a key
+MAX_KEPT_MB = 8.0
+SECONDS = 0.5
+RUNS = [
+    (name, [target for target in attack.targets if target in SERVICES][-1])
+    for name, attack in ATTACKS.items()
+    if name != BUSY_PROCESSOR and SERVICES.keys() & {*attack.targets}
+]
+
+
+@pytest.mark.parametrize(("name", "target"), RUNS)
+def test_limits_the_damage_of_an_attack(
+    system: System, witness: Session, name: str, target: str
+) -> None:
+    attack = ATTACKS[name]
+    memory = Memory(system.process(SERVICES[target]).pid)
+    source = f"127.0.1.{2 + RUNS.index((name, target))}"
+    attack.run(system.endpoints()[target], source, SECONDS)
+    assert memory.growth_mb < MAX_GROWTH_MB[attack.has_key]
+    assert memory.wait_until_kept(MAX_KEPT_MB, 60.0), memory.kept_mb
+
+
+@pytest.mark.parametrize(
+    ("target", "kind"), [("commands", "DEALER"), ("audio", "DEALER"), ("faps", "SUB")]
+)
+def test_rejects_a_handshake_without_a_key(system: System, target: str, kind: str) -> None:
+    port = int(system.endpoints()[target].partition(" ")[0].rpartition(":")[2])
+    with pytest.raises(OSError, match=r".+"):
+        attackers.connected(port, kind, "127.0.2.1")
+
+
+def test_survives_random_bytes_at_every_port(system: System, witness: Session) -> None:
+    for port in system.ports:
+        pour(port, SECONDS / 4)
+    system.assert_all_alive()
+
+
+# The last test, because these services never answer, and every new session waits for them.
 def test_very_many_false_services_leave_the_status_readable(system: System, client: Client) -> None:
     with Bus(load_key("lamp", ("service:lamp",))) as bus:
         stranger = bus.connect_dealer(system.control)
@@ -180,8 +291,8 @@ def test_very_many_false_services_leave_the_status_readable(system: System, clie
         heartbeat = replace(HEARTBEAT, service="lamp", metrics=metrics)
         for number in range(MAX_SERVICES_PER_KEY):
             stranger.send(replace(heartbeat, instance=f"{number:0128}"))
-            answer(stranger, HeartbeatReply)
+            next(answers(stranger, HeartbeatReply))
         stranger.send(replace(heartbeat, instance="one-too-many"))
-        assert answer(stranger, Error).code == "too-many-services"
+        assert next(answers(stranger, Error)).code == "too-many-services"
         lamps = [item for item in client.status().services if item.service == "lamp"]
         assert len(lamps) == MAX_SERVICES_PER_KEY
