@@ -2,32 +2,63 @@
 
 import asyncio
 import secrets
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
-from kouxing.services.gateway.audio_sessions import AudioSessions
+from kouxing_client import KouxingError
+
+from kouxing.services.gateway.audio_sessions import AudioSessions, error_text
 from kouxing.shared.audio_file import open_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.known_text import Characters, characters_of
 
 SAMPLE_FILE = Path(str(resources.files("kouxing.shared") / "demo" / "hello-female.wav"))
 SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
 
 
-class Sample:
-    """One playback of the sample sentence.
+class SampleSentence:
+    """Speaks the sample sentence in real time, at most once at a time."""
 
-    ``lip_model`` is empty for the system's default. It can be changed during playback.
-    """
-
-    def __init__(self, audio_sessions: AudioSessions, lip_model: str) -> None:
-        self.session = f"sample-{secrets.token_hex(4)}"
-        self.lip_model = lip_model
+    def __init__(self, audio_sessions: AudioSessions) -> None:
+        self.session = ""  # while it is spoken
+        self.lip_model = ""  # empty: the default; it can change while the sentence is spoken
+        self.characters: Characters = ()  # known before the session starts
         self._audio_sessions = audio_sessions
+        self._task: asyncio.Task[None] | None = None
 
-    async def speak(self) -> None:
-        """Speak the sentence in real time.
+    def play(self, lip_model: str, on_end: Callable[[str, str], None]) -> None:
+        """Start the sentence, unless it is playing.
 
-        Raises ``KouxingError`` if no session can be opened.
+        ``on_end`` is called at the end with the session and an error message, which is empty if the
+        sentence was played.
         """
+        if not self.session:
+            self.session = f"sample-{secrets.token_hex(4)}"
+            self.lip_model = lip_model
+            self._task = asyncio.get_running_loop().create_task(self._play(on_end))
+
+    def stop(self) -> None:
+        """End the sentence early."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _play(self, on_end: Callable[[str, str], None]) -> None:
+        error = ""
+        try:
+            if not self.characters:  # takes 0.3 s
+                self.characters = await asyncio.to_thread(
+                    characters_of, SAMPLE_TEXT, load_inventory()
+                )
+            await self._speak()
+        except (UserError, KouxingError) as refusal:
+            error = error_text(refusal)
+        finally:
+            session, self.session = self.session, ""
+            on_end(session, error)
+
+    async def _speak(self) -> None:
         loop = asyncio.get_running_loop()
         source = open_audio(SAMPLE_FILE)
         async with self._audio_sessions.open(

@@ -15,16 +15,15 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, replace
 
 from aiohttp import web
-from kouxing_client import KouxingError
 
 from kouxing.services.gateway import http, wire
-from kouxing.services.gateway.audio_sessions import AudioSessions, error_text
+from kouxing.services.gateway.audio_sessions import AudioSessions
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.kind import KIND
 from kouxing.services.gateway.learn_mouth import MouthLearner
 from kouxing.services.gateway.microphone import Microphones
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
-from kouxing.services.gateway.sample import SAMPLE_TEXT, Sample
+from kouxing.services.gateway.sample import SampleSentence
 from kouxing.services.gateway.senders_api import SendersApi
 from kouxing.services.gateway.sound_upload import SoundUpload
 from kouxing.services.gateway.viewer_queue import MessageKind
@@ -37,7 +36,6 @@ from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
-from kouxing.shared.phones.known_text import Characters, characters_of
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
@@ -84,16 +82,16 @@ class GatewayService(Service):
         self._sessions: dict[str, _FollowedSession] = {}
         self._web_sockets = http.WebSockets()
         share = config.address_share
+        self._audio_sessions = AudioSessions(self.control_endpoint, self.key, self.warn)
+        self._sample = SampleSentence(self._audio_sessions)
         self._viewers = Viewers(
             self._web_sockets,
             share,
             self.metrics,
-            self._play_sample,
-            self._choose_sample_lip_model,
+            self._sample,
             self._set_face,
             self.waker.wake,
         )
-        self._audio_sessions = AudioSessions(self.control_endpoint, self.key, self.warn)
         self._microphones = Microphones(self._web_sockets, share, self._audio_sessions)
         self._whip_clients = WhipClients(
             share,
@@ -122,8 +120,6 @@ class GatewayService(Service):
         )
         self._server = WebServer(listening, endpoint.tls, share)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is playing
-        self._sample_characters: Characters = ()  # computed on first use
         self._closing: asyncio.Task[None] | None = None
         self._resting_face = RestingFace(config.idle_motion_seed)
         self._rest_due_s = 0.0
@@ -166,12 +162,10 @@ class GatewayService(Service):
             self._create_task(self._whip_clients.close_all())
             self._mouth_learner.close()
             self._sound_upload.close()
-            if self._sample is not None:
-                self._sample[1].cancel()
+            self._sample.stop()
         is_uploading = self._mouth_learner.is_running or self._sound_upload.is_running
-        is_busy = is_uploading or self._sample is not None
-        is_connected = self._web_sockets or self._whip_clients
-        return self._closing.done() and not is_busy and not is_connected
+        is_connected = self._web_sockets or self._whip_clients or self._sample.session
+        return self._closing.done() and not is_uploading and not is_connected
 
     def on_shutdown(self) -> None:
         """Stop HTTP and the senders."""
@@ -298,8 +292,7 @@ class GatewayService(Service):
             },
             on_new_epoch=lambda: self._restart(session),
         )
-        is_sample = self._sample is not None and self._sample[0].session == start.session
-        characters = self._sample_characters if is_sample else ()
+        characters = self._sample.characters if self._sample.session == start.session else ()
         track = SyllableTrack(self._inventory(start), characters)
         session = _FollowedSession(follower, track)
         return session
@@ -362,30 +355,3 @@ class GatewayService(Service):
         self._audio_sessions.on_last_frame(end.session)
         message = wire.text("end", media_time=end.media_time)
         self._viewers.forward(end.session, MessageKind.TEXT, message)
-
-    # --- the sample sentence ---------------------------------------------------------------------
-
-    def _play_sample(self, lip_model: str) -> str:
-        """Start the sample sentence, unless it is playing; return its session."""
-        if self._sample is None:
-            sample = Sample(self._audio_sessions, lip_model)
-            self._sample = sample, self._create_task(self._speak(sample))
-        return self._sample[0].session
-
-    def _choose_sample_lip_model(self, lip_model: str) -> None:
-        if self._sample is not None:
-            self._sample[0].lip_model = lip_model
-
-    async def _speak(self, sample: Sample) -> None:
-        error = ""
-        try:
-            if not self._sample_characters:  # takes 0.3 s
-                self._sample_characters = await asyncio.to_thread(
-                    characters_of, SAMPLE_TEXT, load_inventory()
-                )
-            await sample.speak()
-        except (UserError, KouxingError) as refusal:
-            error = error_text(refusal)
-        finally:
-            self._sample = None
-            self._viewers.end_sample(error)

@@ -12,6 +12,7 @@ from aiohttp import WSMsgType, web
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
+from kouxing.services.gateway.sample import SampleSentence
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.shared.errors import UserError
@@ -49,9 +50,8 @@ class Viewer:
 class Viewers:
     """Sends every viewer the messages of the session that it requested, or of the newest.
 
-    ``play_sample`` starts the sample sentence with a lip model, unless it is playing, and returns
-    its session. This session counts as the newest only if there is no other. ``set_face`` sends
-    control the settings of a session's face, or of the face at rest (""). ``on_connected`` is
+    The session of the sample sentence counts as the newest only if there is no other. ``set_face``
+    sends control the settings of a session's face, or of the face at rest (""). ``on_connected`` is
     called for each new viewer.
     """
 
@@ -60,21 +60,18 @@ class Viewers:
         web_sockets: WebSockets,
         address_share: float,
         metrics: Metrics,
-        play_sample: Callable[[str], str],
-        choose_sample_lips: Callable[[str], None],
+        sample: SampleSentence,
         set_face: Callable[[str, FaceSettings], None],
         on_connected: Callable[[], None],
     ) -> None:
         self._web_sockets = web_sockets
         self._quota = ConnectionQuota(MAX_VIEWERS, "viewers", address_share)
         self._metrics = metrics
-        self._play_sample = play_sample
-        self._choose_sample_lip_model = choose_sample_lips
+        self._sample = sample
         self._set_face = set_face
         self._on_connected = on_connected
         self._viewers: set[Viewer] = set()
         self._sessions: dict[str, _ShownSession] = {}  # in the order in which they were opened
-        self._sample = ""  # session of the sample sentence while it is playing
         self._missing: tuple[str, ...] = ("control",)
 
     # --- sessions ------------------------------------------------------------------------------
@@ -100,19 +97,6 @@ class Viewers:
     def remove_session(self, session: str) -> None:
         """Announce to a session's viewers that it has ended."""
         self._sessions.pop(session, None)
-        self._notify_viewers()
-
-    def end_sample(self, error: str = "") -> None:
-        """Show the newest session again to viewers of the sample sentence, with an error message.
-
-        The message is empty if the sentence was played.
-        """
-        for viewer in self._viewers:
-            if self._sample and viewer.chosen == self._sample:
-                viewer.chosen = ""
-                if error:
-                    self._put(viewer, MessageKind.TEXT, error)
-        self._sample = ""
         self._notify_viewers()
 
     def set_missing(self, missing: tuple[str, ...]) -> None:
@@ -156,8 +140,8 @@ class Viewers:
     @property
     def newest(self) -> str:
         """The session shown to viewers that requested none; empty if there is no session."""
-        names = (name for name in reversed(self._sessions) if name != self._sample)
-        return next(names, self._sample)
+        sample = self._sample.session
+        return next((name for name in reversed(self._sessions) if name != sample), sample)
 
     @property
     def shown_sessions(self) -> Iterator[str]:
@@ -219,11 +203,12 @@ class Viewers:
             settings = wire.parse_face_settings(command)
             lip_model = settings.lip_model if settings is not None else None
             if command.get("play") == "sample":
-                self._sample = viewer.chosen = self._play_sample(lip_model or "")
+                self._sample.play(lip_model or "", self._on_sample_end)
+                viewer.chosen = self._sample.session
             elif lip_model:
-                if not self._sample or viewer.chosen != self._sample:
+                if not self._sample.session or viewer.chosen != self._sample.session:
                     raise UserError("a viewer can choose lips only for the sample sentence")
-                self._choose_sample_lip_model(lip_model)
+                self._sample.lip_model = lip_model
             elif settings is not None:
                 if viewer.shown is None and settings.expressions is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
@@ -239,6 +224,15 @@ class Viewers:
         except UserError as error:
             self._put(viewer, MessageKind.TEXT, wire.error_text(str(error)))
         self._notify_viewer(viewer)
+
+    def _on_sample_end(self, session: str, error: str) -> None:
+        """Show the newest session again to viewers of the sample sentence, with the error."""
+        for viewer in self._viewers:
+            if viewer.chosen == session:
+                viewer.chosen = ""
+                if error:
+                    self._put(viewer, MessageKind.TEXT, error)
+        self._notify_viewers()
 
     def _notify_viewers(self) -> None:
         for viewer in self._viewers:
@@ -258,7 +252,7 @@ class Viewers:
                 epoch=session.epoch if session else 0,
                 lips=session.lip_model if session else "",
                 acoustic=session.acoustic if session else "",
-                sample=session is not None and name == viewer.chosen == self._sample,
+                sample=session is not None and name == viewer.chosen == self._sample.session,
             )
             self._put(viewer, MessageKind.TEXT, message)
 

@@ -261,7 +261,7 @@ async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch)
 
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {
-    "viewers": lambda share: Viewers(WebSockets(), share, Metrics(), *(UNUSED,) * 4).serve,
+    "viewers": lambda share: Viewers(WebSockets(), share, Metrics(), *(UNUSED,) * 3).serve,
     "microphones": lambda share: Microphones(WebSockets(), share, UNUSED).serve,
 }
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway.sample import SampleSentence
 from kouxing.services.gateway.viewers import PAUSE_S, Viewer, Viewers
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.metrics import Metrics
@@ -24,7 +25,7 @@ def binary_types(viewer: Viewer) -> list[int]:
 
 
 def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
-    viewers = Viewers(WebSockets(), 1.0, Metrics(), *(UNUSED,) * 4)
+    viewers = Viewers(WebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED)
     face = RestingFace(seed=0)
     frame = np.zeros(68, "<f4").tobytes()
     viewers.add_session("talk", 1, "learnt")
