@@ -14,7 +14,7 @@ from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import align_phones
+from kouxing.services.recognizer.alignment import align_syllables
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -54,7 +54,7 @@ def corpus_sentences(
     for utterance in choose(utterances):
         clip = _clip(model, utterance.path, utterance.utterance_id, utterance.speaker)
         syllables = syllables_of(utterance, model.inventory)
-        phones = align_phones(model, clip.samples, SAMPLE_RATE_HZ, syllables)
+        phones = align_syllables(model, clip.samples, SAMPLE_RATE_HZ, syllables).phones
         sentences.append(Sentence(clip, phones))
     return sentences
 

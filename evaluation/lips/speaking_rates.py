@@ -35,7 +35,7 @@ from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline import recognize
@@ -164,7 +164,7 @@ def _text(
     if clip.transcript:
         with contextlib.suppress(UserError):  # a transcript with words in another language
             syllables = model.inventory.pronounce(clip.transcript)
-            phones = align_phones(model, samples, SAMPLE_RATE_HZ, syllables)
+            phones = align_syllables(model, samples, SAMPLE_RATE_HZ, syllables).phones
             return syllables, spoken(phones, model.inventory)
     phones = spoken(recognize(model, samples, SAMPLE_RATE_HZ), model.inventory)
     groups = group_syllables(phones, model.inventory)

@@ -14,7 +14,7 @@ from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
@@ -62,7 +62,7 @@ def align_corpus(
         try:
             samples = read_audio(utterance.path)
             syllables = syllables_of(utterance, model.inventory)
-            phones = align_phones(model, samples, SAMPLE_RATE_HZ, syllables)
+            phones = align_syllables(model, samples, SAMPLE_RATE_HZ, syllables).phones
         except (UserError, ValueError) as error:
             errors.add(utterance.utterance_id, str(error))
             continue

@@ -66,16 +66,6 @@ def align_text(
     syllables = model.inventory.pronounce(text)
     if not syllables:
         raise UserError("the text is empty; enter the spoken words")
-    return align_phones(model, samples, sample_rate_hz, syllables)
-
-
-def align_phones(
-    model: AcousticModel,
-    samples: NDArray[np.float32],
-    sample_rate_hz: int,
-    syllables: Sequence[Syllable],
-) -> list[Phone]:
-    """Like :func:`align_text`, for the phones of known syllables."""
     return align_syllables(model, samples, sample_rate_hz, syllables).phones
 
 
@@ -86,7 +76,10 @@ def align_syllables(
     syllables: Sequence[Syllable],
     with_progress: WithProgress = iter,
 ) -> Alignment:
-    """Like :func:`align_phones`, with the fit. ``with_progress`` shows the progress."""
+    """Like :func:`align_text`, for known syllables, with the fit.
+
+    ``with_progress`` shows the progress.
+    """
     inventory, topology = model.inventory, model.topology
     silence = inventory.index[inventory.silence]
     graph = utterance_graph(

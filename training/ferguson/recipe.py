@@ -27,7 +27,7 @@ from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
@@ -299,7 +299,7 @@ def aligned_speech(
         syllables = syllables_of(row, model.inventory)
         try:
             samples = read_audio(row.path)
-            phones = align_phones(model, samples, MEDIA_RATE_HZ, syllables)
+            phones = align_syllables(model, samples, MEDIA_RATE_HZ, syllables).phones
         except (UserError, OSError, ValueError) as error:
             errors.add(row.utterance_id, str(error))
             continue
