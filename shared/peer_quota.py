@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from kouxing.shared.keys import MAX_KEY_SHARE
+
 if TYPE_CHECKING:
     from kouxing.shared.connections import Connection
 
 MAX_CONNECTIONS = 400  # of clients; libzmq takes up to 0.1 MB for each
-MAX_SHARE = 0.75  # of them, for one key; until the key is known, for one address
 FILES_PER_CLIENT = 6  # its own, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 
@@ -37,7 +38,7 @@ class PeerQuota:
         those of the owner with the most connections. An owner first loses its oldest silent
         connection, then its newest one.
         """
-        if len(connections) <= MAX_SHARE * self.max_clients:
+        if len(connections) <= MAX_KEY_SHARE * self.max_clients:
             return
         services, known, silent = [], [], []
         for connection in connections:
@@ -60,6 +61,6 @@ class PeerQuota:
             for connection in reversed(group[limit:]):
                 yield connection, "too many connections"
             for connection in group[:limit]:
-                if ranks[connection] > MAX_SHARE * limit:
+                if ranks[connection] > MAX_KEY_SHARE * limit:
                     owner = "key" if connection.key else "address"
                     yield connection, f"its {owner} has too many connections"

@@ -14,13 +14,11 @@ from kouxing.services.control.refusal import Refusal
 from kouxing.services.control.registry import Registry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Peer
+from kouxing.shared.keys import MAX_KEY_SHARE, Peer
 from kouxing.shared.phones.inventory import find_language
 from kouxing.shared.wire.control import Heartbeat, StartSession
 from kouxing.shared.wire.face import CurrentFace, FaceSettings
 from kouxing.shared.wire.session import ErrorCode, OpenSession
-
-MAX_KEY_SHARE = 0.75  # of the sessions, for one key
 
 
 class Sessions:

@@ -13,8 +13,8 @@ from typing import Any
 from kouxing.services.driver import recorder
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.video.writer import remove_unfinished
+from kouxing.shared.keys import MAX_KEY_SHARE
 
-MAX_KEY_SHARE = 0.75  # of the videos, for one key
 MAX_QUEUED = 100_000  # unread commands
 IDLE_S = 10.0  # without a video, after which the process ends and frees its memory
 REPORT_S = 0.02  # interval of reading the reports of the process
