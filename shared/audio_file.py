@@ -1,20 +1,26 @@
 """Audio of files and pipes as blocks of samples."""
 
 import io
-import math
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 import soxr
 
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.media_file import MediaSound, RawFormat, has_video, pcm_of_wav, to_float
+from kouxing.shared.media_file import (
+    MediaSound,
+    RawFormat,
+    WavPcm,
+    has_video,
+    pcm_of_wav,
+    to_float,
+)
 from kouxing.shared.sound_formats import (
     NUM_BEGIN_BYTES,
     is_sound,
@@ -24,6 +30,7 @@ from kouxing.shared.sound_formats import (
     stated_bytes,
 )
 from kouxing.shared.user_file import check_content, open_file
+from kouxing.shared.wav_parts import Readable, WavParts, num_parts
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # of a session; files above are resampled to it
@@ -35,14 +42,6 @@ _MAX_SPOOLED_BYTES = 64 << 20  # of a pipe that must be read to its end first; m
 MAX_FILE_BYTES = 8 << 30
 MAX_DURATION_S = 3 * 3600.0  # of a recording that is held in memory
 _PIPE = Path("-")
-
-
-class Readable(Protocol):
-    """A stream of bytes."""
-
-    def read(self, size: int, /) -> bytes:
-        """Return up to ``size`` bytes; empty at the end."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +116,12 @@ def _open_file(
     if num_bytes == 0:
         raise UserError(f"{path}: the file is empty; record it again")
     begin = file.read(NUM_BEGIN_BYTES)
+    if num_parts(file) > 1:  # FFmpeg reads one of them
+        if wav := pcm_of_wav(begin):
+            return _wav_audio(file, begin, wav, path)
+        raise UserError(
+            f"{path}: joined WAV files; convert each part alone, or join them as 16-bit"
+        )
     file.seek(0)
     sound = MediaSound(file, path, begin, track, is_pipe=False)
     return _source(sound, path, name, block_s, begin, lambda: num_bytes)
@@ -152,10 +157,15 @@ def _open_pipe(
         file.seek(0)
         return _with_file(file, lambda: _open_file(file, name, name, block_s, track))
     if wav := pcm_of_wav(begin):  # without FFmpeg's delay of 64 KiB
-        pipe.read(wav.place)
-        return raw_audio(pipe, wav.format, name, wav.num_bytes)
+        return _wav_audio(pipe, begin, wav, name)
     sound = MediaSound(pipe, name, begin, track, is_pipe=True)  # type: ignore[arg-type]
     return _source(sound, name, name, block_s, begin, lambda: pipe.num_bytes)
+
+
+def _wav_audio(stream: Readable, begin: bytes, wav: WavPcm, name: str) -> AudioSource:
+    stream.read(wav.place)
+    parts = WavParts(stream, begin, wav.num_bytes, name)
+    return raw_audio(parts, wav.format, name, lambda: parts.num_missing)
 
 
 class _Pipe:
@@ -252,9 +262,12 @@ def clipping_remarks(name: str, share: float) -> list[str]:
 
 
 def raw_audio(
-    stream: Readable, raw: RawFormat, name: str, num_bytes: int | None = None
+    stream: Readable, raw: RawFormat, name: str, num_missing: Callable[[], int] = lambda: 0
 ) -> AudioSource:
-    """Read raw samples until the end of a stream, or only ``num_bytes`` bytes."""
+    """Read raw samples until the end of a stream.
+
+    ``num_missing`` returns the number of bytes that the stream then lacks.
+    """
     rate_hz, num_channels = min(raw.sample_rate_hz, MAX_RATE_HZ), raw.num_channels
     num_mixed = min(2, num_channels)
     _check_rate(name, raw.sample_rate_hz)
@@ -264,17 +277,16 @@ def raw_audio(
 
     def pieces() -> Iterator[tuple[int, Samples]]:
         guard = CancellationGuard(name, num_mixed, remarks)
-        rest, num_read, num_left = b"", 0, math.inf if num_bytes is None else num_bytes
-        while num_left and (more := stream.read(int(min(block_bytes, num_left)))):
-            num_left -= len(more)
+        rest, num_read = b"", 0
+        while more := stream.read(block_bytes):
             num_read += len(more)
             data = rest + more
             whole = len(data) - len(data) % frame_bytes
             rest = data[whole:]
             channels = to_float(np.frombuffer(data[:whole], raw.dtype)).reshape(-1, num_channels)
             yield raw.sample_rate_hz, guard.mix(channels, channels)
-        read_s, stated_s = (size / frame_bytes / rate_hz for size in (num_read, num_bytes or 0))
-        remarks.extend(_cut_off(name, read_s, stated_s))
+        sizes = (num_read, num_read + num_missing())
+        remarks.extend(_cut_off(name, *(size / frame_bytes / rate_hz for size in sizes)))
 
     blocks = _blocks(pieces(), name, rate_hz, num_mixed, BLOCK_S)
     return AudioSource(name, rate_hz, num_mixed, None, blocks, remarks)

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.sound_formats import (
+    MAX_OGG_PAGE_BYTES,
     MIN_UNKNOWN_BYTES,
     codec_of_padded_wav,
+    is_cut_ogg,
     is_sound,
     is_transport_stream,
     unprobed_format,
@@ -275,6 +277,8 @@ class MediaSound:
                 f"{self._name}: the file is cut off after {read_s:.1f} s of"
                 f" {read_s + missing_s:.1f} s"
             )
+        elif self._container.format.name == "ogg" and is_cut_ogg(self._file.end):
+            self.remarks.append(f"{self._name}: the file is cut off after {read_s:.1f} s")
         elif self._is_stopped:
             self.remarks.append(
                 f"{self._name}: the file cannot be read after {read_s:.1f} s; export it again"
@@ -324,6 +328,7 @@ class _GuardedFile:
 
     def __init__(self, file: BinaryIO, *, can_seek: bool) -> None:
         self.name = str(getattr(file, "name", ""))
+        self.end = b""  # the bytes that were read last
         self._failure: BaseException | None = None
         self._read = file.read
         self.read = partial(self._call, self._read)
@@ -340,7 +345,10 @@ class _GuardedFile:
     def _call(self, function: Callable[..., Any], *arguments: int) -> Any:
         if self._failure is None:
             try:
-                return function(*arguments)
+                result = function(*arguments)
+                if function is self._read:
+                    self.end = (self.end + result)[-MAX_OGG_PAGE_BYTES:]
+                return result
             except BaseException as failure:
                 self._failure = failure
         return b"" if function is self._read else -1

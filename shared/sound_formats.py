@@ -16,6 +16,7 @@ _SOUND = (
     (0, b"nut/multimed"), (0, b"\0\0\0\0\1\xbc"), (0, b"\6\x0e\x2b\x34"), (0, b"NIST_1A"),
     (0, b"\xb7\xd8\0\x20\x37\x49\xda\x11"), (0, b".SoX"), (0, b"XoS."), (0, b"MMMD"),
     (0, b"STRM\0"), (0, b"DSD "), (0, b"FRM8"), (0, b"tBaK"), (0, b"MPCK"), (0, b"#!iLBC"),
+    (0, b" paf"), (0, b"fap "), (0, b"PVF1"), (0, b"2BIT"),
     (0, b"\2dss"), (0, b"\3ds2"), (0, b"\x72\xf8\x1f\x4e"), (0, b"MP+"), (0, b"ajkg"),
     *((0, bytes([0x64, 0xA3, kind, 0])) for kind in (1, 2, 3, 4)),  # IRCAM
     *((0, bytes([0, kind, 0xA3, 0x64])) for kind in (1, 2, 3, 4)),
@@ -37,6 +38,7 @@ _FRAMED = (
 )
 _TS_SYNC = 0x47
 _TS_PACKETS = ((0, 188), (4, 192))  # the place of the first byte, and the packet's size
+MAX_OGG_PAGE_BYTES = 27 + 255 + 255 * 255
 MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
 # The place of a file's size, its number of bytes and their order, and the bytes that it leaves out.
 _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
@@ -46,6 +48,7 @@ _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
     b"RF64": (20, 8, "little", 8),
     b"riff": (16, 8, "little", 0),
 }
+_ASF_PROPERTIES = b"\xa1\xdc\xab\x8c\x47\xa9\xcf\x11"  # its size of the file follows
 _OTHER = {
     b"PK\3\4": "a zip archive; unpack it first",
     b"\x1f\x8b": "a gzip archive; unpack it first",
@@ -115,12 +118,21 @@ def why_unreadable(begin: bytes, reason: str) -> str:
 
 
 def stated_bytes(begin: bytes) -> int | None:
-    """Return the size that the header of a WAV, W64, AVI or AIFF file states; None if unknown."""
+    """Return the size that a WAV, W64, AVI, AIFF or WMA header states; None if unknown."""
     for mark, (start, size, order, num_before) in _SIZES.items():
         if begin.startswith(mark):
             stated = int.from_bytes(begin[start : start + size], order) + num_before
             return stated if stated < MIN_UNKNOWN_BYTES else None
+    if (place := begin.find(_ASF_PROPERTIES)) > 0:
+        return int.from_bytes(begin[place + 40 : place + 48], "little")
     return None
+
+
+def is_cut_ogg(end: bytes) -> bool:
+    """Return whether the last page of an Ogg stream is incomplete."""
+    page = end[end.rfind(b"OggS") :]
+    num_segments = page[26] if len(page) > 26 else 1
+    return b"OggS" in end and len(page) < 27 + num_segments + sum(page[27:][:num_segments])
 
 
 def codec_of_padded_wav(begin: bytes) -> str | None:

@@ -18,6 +18,7 @@ const keyFile = join(state, "kouxing", "client.key");
 const key = JSON.parse(await readFile(keyFile, "utf8").catch(() => {
   fail(`${keyFile} does not exist; start kouxing, or copy the file from its machine`);
 }));
+process.stdout.on("error", () => process.exit()); // its reader has ended, such as `head`
 
 function fail(text) {
   console.error(text);
@@ -38,22 +39,20 @@ async function readWav(path) {
   if (!header || !data) fail(`${path} is not a wav file; convert yours: ffmpeg -i FILE speech.wav`);
   const code = header.readUInt16LE(0) === EXTENSIBLE ? header.readUInt16LE(24) : header.readUInt16LE(0);
   const width = header.readUInt16LE(14) / 8;
+  const [numChannels, rate] = [header.readUInt16LE(2), header.readUInt32LE(4)];
   const isFloat = code === 3 && width === 4;
-  if (!isFloat && (code !== 1 || ![2, 3, 4].includes(width))) {
-    fail(`${path}: convert it to 16 bits: ffmpeg -i ${path} -c:a pcm_s16le speech.wav`);
+  const isKnown = isFloat || (code === 1 && [2, 3, 4].includes(width));
+  if (!isKnown || ![1, 2].includes(numChannels) || rate < 8000 || rate > 48_000) {
+    fail(`${path}: convert it: ffmpeg -i ${path} -c:a pcm_s16le -ar 16000 -ac 1 speech.wav`);
   }
   let pcm = data;
   if (!isFloat) {
     pcm = Buffer.alloc(2 * Math.floor(data.length / width)); // the upper 16 bits
     for (let i = 0; 2 * i < pcm.length; i++) data.copy(pcm, 2 * i, (i + 1) * width - 2, (i + 1) * width);
   }
-  const numChannels = header.readUInt16LE(2);
+  const encoding = isFloat ? "f32le" : "s16le";
   return {
-    format: {
-      encoding: isFloat ? "f32le" : "s16le",
-      sample_rate_hz: header.readUInt32LE(4),
-      num_channels: numChannels,
-    },
+    format: { encoding, sample_rate_hz: rate, num_channels: numChannels },
     pcm,
     frameBytes: numChannels * (isFloat ? 4 : 2),
   };
@@ -63,7 +62,11 @@ function connect(Kind, endpoint) {
   const [address, curveServerKey] = endpoint.split(" ");
   const socket = new Kind({ curveServerKey, curvePublicKey: key.public, curveSecretKey: key.secret });
   if (Kind === Dealer) socket.routingId = randomBytes(16).toString("hex");
-  socket.connect(address);
+  try {
+    socket.connect(address);
+  } catch (error) {
+    fail(`${address}: ${error.message}; an address looks like tcp://127.0.0.1:5550`);
+  }
   return socket;
 }
 

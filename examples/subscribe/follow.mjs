@@ -21,6 +21,7 @@ const keyFile = join(state, "kouxing", "client.key");
 const key = JSON.parse(await readFile(keyFile, "utf8").catch(() => {
   fail(`${keyFile} does not exist; start kouxing, or copy the file from its machine`);
 }));
+process.stdout.on("error", () => process.exit()); // its reader has ended, such as `head`
 
 let numRequests = 0;
 
@@ -34,7 +35,11 @@ function fail(text) {
 function connect(Kind, endpoint) {
   const [address, curveServerKey] = endpoint.split(" ");
   const socket = new Kind({ curveServerKey, curvePublicKey: key.public, curveSecretKey: key.secret });
-  socket.connect(address);
+  try {
+    socket.connect(address);
+  } catch (error) {
+    fail(`${address}: ${error.message}; an address looks like tcp://127.0.0.1:5550`);
+  }
   return socket;
 }
 

@@ -12,11 +12,14 @@ import array
 import asyncio
 import itertools
 import math
+import signal
 import sys
 import threading
 from urllib.parse import urlsplit, urlunsplit
 
 import aiohttp
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program without a traceback
 
 RATE_HZ = 16000
 PITCH_HZ = 140

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from itertools import groupby, pairwise
 from typing import NamedTuple
 
+from kouxing.services.cli.text_columns import without_columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import parse_json
 
@@ -68,6 +69,9 @@ _CUE_TIMES = re.compile(rf"^[ \t]*{_TIME}[ \t]*-->[ \t]*{_TIME}", re.MULTILINE)
 _SBV_TIMES = re.compile(r"^\d+:\d{2}:\d{2}\.\d{3},\d+:\d{2}:\d{2}\.\d{3}[ \t]*$", re.MULTILINE)
 _LRC_FIELD = re.compile(r"\[[A-Za-z#]+:[^\]]*\]")
 _LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
+_COMMAND = re.compile(  # [laughter], [pause:500], [S1], <#0.5#>, <|zh|>, and prosody: #1 to #4
+    r"\[/?[A-Za-z_]\w*(?:[ :=]+[\w.]+)?\]|<#[\d.]+#>|<\|[^|<>]*\|>|(?<=[^\0-\x7f])#[1-4](?!\d)"
+)
 _BRACES = re.compile(r"\{[^{}]*\}")
 _CUE_NUMBER = re.compile(rf"^\d+[ \t]*\n\s*(?={_TIME}[ \t]*-->)", re.MULTILINE)
 _SOUND_NAME = re.compile(r"\[[^][\n]*\]|【[^【】\n]*】|[♪♫]")
@@ -145,7 +149,8 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
                 raise UserError(f"this is not valid {form}; give the spoken text alone") from None
             break
     else:
-        form, spoken = "", text
+        spoken = without_columns(text)
+        form = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
         raise UserError("the text has times of an unknown format; give the spoken text alone")
     return SpokenText(spoken, form)
@@ -272,6 +277,10 @@ def _read_text_grid(text: str) -> str:
     return "\n".join(label for label in labels if label.lower() not in _UNSPOKEN_LABELS)
 
 
+def _read_commands(text: str) -> str:
+    return without_columns(_COMMAND.sub("", text))
+
+
 def _read_json(text: str) -> str:
     return _json_text(parse_json(text))
 
@@ -367,6 +376,7 @@ _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (
     ("XML", re.compile(r"\A<\?xml"), _reject_xml),
     ("Markdown", re.compile(r"^#{1,6} |^```|\]\([^)\s]+\)", re.MULTILINE), _read_markdown),
     ("text with tags", _TAG, _read_markup),
+    ("text with commands of a synthesizer", _COMMAND, _read_commands),
     (
         "a transcript with times",
         re.compile(

@@ -92,6 +92,18 @@ def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, sub
     np.testing.assert_allclose(samples, 0.25, atol=0.01)
 
 
+def test_reads_all_parts_of_a_wav_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "a.wav"
+    soundfile.write(path, SPEECH, RATE_HZ)
+    data = path.read_bytes()
+    data = data[:4] + (2 * len(data)).to_bytes(4, "little") + data[8:]
+    path.write_bytes(data + b"LIST\4\0\0\0abcd" + data[data.index(b"data") :])
+    for source in (open_audio(path), _open(monkeypatch, path.read_bytes())):
+        samples = np.concatenate([*source.blocks])[:, 0]
+        np.testing.assert_allclose(samples, np.tile(SPEECH, 2), atol=1e-4)
+        assert source.remarks == []
+
+
 @pytest.mark.parametrize(("bits", "valid_bits"), [(32, 24), (32, 20), (32, 16), (24, 20)])
 def test_reads_wav_samples_with_unused_bits(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bits: int, valid_bits: int

@@ -75,7 +75,8 @@ def test_honors_the_start_of_the_only_track(
 @pytest.mark.parametrize(
     ("name", "codec", "rates_hz"),
     [("a.ogg", "libopus", [48_000, 48_000]), ("a.ts", "aac", [48_000, 48_000]),
-     ("a.aac", "aac", [16_000, 44_100]), ("a.mp3", "libmp3lame", [44_100, 44_100])],
+     ("a.aac", "aac", [16_000, 44_100]), ("a.mp3", "libmp3lame", [44_100, 44_100]),
+     ("a.wav", "pcm_s16le", [16_000, 16_000])],
 )  # fmt: skip
 def test_reads_files_that_were_joined(
     tmp_path: Path, name: str, codec: str, rates_hz: list[int]
@@ -148,11 +149,13 @@ def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["a.wav", "a.rf64", "a.w64", "a.aiff", "a.flac", "a.mp3", "a.mkv", "a.mp4", "a.avi"]
+    "name",
+    [f"a.{suffix}" for suffix in "wav rf64 w64 aiff flac mp3 mkv mp4 avi wma ogg".split()],
 )
 def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     path, samples = tmp_path / name, np.tile(TONE, 3)
-    codecs = {".mkv": "pcm_s16le", ".mp4": "aac", ".avi": "pcm_s16le"}
+    codecs = {".mp4": "aac", ".wma": "wmav2", ".ogg": "libopus"}
+    codecs |= dict.fromkeys((".mkv", ".avi"), "pcm_s16le")
     if codec := codecs.get(path.suffix):
         write_media(path, codec, samples, RATE_HZ, options={"movflags": "faststart"})
     else:
@@ -163,10 +166,13 @@ def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2 + 1])
     source = open_audio(path)
-    assert _spans(_read(source)[:RATE_HZ]) == [pytest.approx((0.0, 1.0), abs=0.06)]
+    delay_s = 0.08 if name == "a.wma" else 0.0  # of its encoder
+    samples = _read(source)[:RATE_HZ]
+    spans = _spans(samples[: len(samples) // 480 * 480])
+    assert spans == [pytest.approx((delay_s, 1.0), abs=0.06)]
     (remark,) = source.remarks
-    assert "cut off" in remark
-    assert "of 3.0 s" in remark
+    assert "cut off after" in remark
+    assert "of 3." in remark or name == "a.ogg"  # its header states no length
 
 
 def test_a_track_that_ends_before_the_video_is_not_cut_off(tmp_path: Path) -> None:

@@ -126,6 +126,7 @@ def test_reads_numbers(text: str, read: str) -> None:
         ("nihao, hello", ""),
         ("no so", ""),
         ("他說ㄏㄠˇ ㄖㄜˋ，你ㄋㄧˇ好(ㄏㄠˇ)", "ta1 shuo1 hao3 re4 ni3 hao3"),
+        ("重(chong2 qing4)庆，说ma1和mp", "chong2 qing4 qing4 shuo1 ma1 he2"),
         ("重（ㄔㄨㄥˊ）慶", "chong2 qing4"),
         ("Nihao Zhongguo! Tom", "ni hao zhong guo"),
         ("tiananmen fangan yidianr lüxing", "tian an men fan gan yi dian r lv xing"),

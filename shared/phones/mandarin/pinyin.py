@@ -65,6 +65,8 @@ _SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
 
 _CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
 _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
+_TONED_WORDS = r"[(（]?(?<![A-Za-z])[a-zü:]+[1-5](?:[ ']?[a-zü:]+[1-5])*(?![A-Za-z\d])[)）]?"
+_ANNOTATION = re.compile(f"{WORDS_IN_BOPOMOFO.pattern}|{_TONED_WORDS}")
 _MAX_WORD_LETTERS = 500
 _MAX_LETTERS = 10  # of a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
@@ -168,7 +170,8 @@ def write(spelling: str) -> str:
 def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
 
-    Bopomofo gives the reading of the characters before it if it is in brackets or sounds like them.
+    Bopomofo, or pinyin with digits, gives the reading of the characters before it if it is in
+    brackets or sounds like them.
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
     dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
     (``nihao``) are split only if most letters are pinyin, because words of other languages may look
@@ -183,7 +186,7 @@ def transcribe(text: str) -> Transcript:
     """
     text = _KEYCAP.sub(" ", text)
     if _CHINESE.search(text):
-        return _read_with_bopomofo(text)
+        return _read_annotated(text)
     if not any(letter.isalpha() for letter in text):
         return _read_characters(text)
     text = read_bopomofo(text, spell)
@@ -265,20 +268,26 @@ def _is_syllable(word: str) -> bool:
     return True
 
 
-def _read_with_bopomofo(text: str) -> Transcript:
-    """Read characters with words in bopomofo, or with bopomofo as the reading of characters."""
+def _read_annotated(text: str) -> Transcript:
+    """Read characters with words in bopomofo or pinyin with digits, or with such readings."""
     syllables: list[SpokenSyllable] = []
     dropped: list[str] = []
-    for place, part in enumerate(WORDS_IN_BOPOMOFO.split(text)):
-        transcript = transcribe(part) if place % 2 else _read_characters(part)
-        if place % 2:
-            before = max(0, len(syllables) - len(transcript.syllables))
-            annotated = [syllable.phones for syllable in syllables[before:]]
-            if part[0] in "(（" or annotated == transcript.phones:
-                del syllables[before:]
-        syllables += transcript.syllables
-        dropped += transcript.dropped
-    return Transcript(tuple(syllables), tuple(dropped))
+    end = 0
+    for match in _ANNOTATION.finditer(text):
+        reading = transcribe(match[0])
+        if reading.dropped and match[0].isascii():  # not pinyin, such as mp3
+            continue
+        before = _read_characters(text[end : match.start()])
+        syllables += before.syllables
+        dropped += before.dropped + reading.dropped
+        first = max(0, len(syllables) - len(reading.syllables))
+        annotated = [syllable.phones for syllable in syllables[first:]]
+        if match[0][0] in "(（" or annotated == reading.phones:
+            del syllables[first:]
+        syllables += reading.syllables
+        end = match.end()
+    rest = _read_characters(text[end:])
+    return Transcript((*syllables, *rest.syllables), (*dropped, *rest.dropped))
 
 
 def _read_characters(text: str) -> Transcript:
