@@ -48,7 +48,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     from kouxing.shared.errors import UserError, with_name
     from kouxing.shared.logs import LOG, configure
     from kouxing.shared.metrics import use_single_malloc_arena
-    from kouxing.shared.service import PARENT_VARIABLE
+    from kouxing.shared.parent_process import PARENT_VARIABLE
 
     configure(name, log_level)
     use_single_malloc_arena()

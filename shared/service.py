@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from kouxing_client.keys import Key
 
+from kouxing.shared import parent_process
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
@@ -62,10 +63,7 @@ DRAIN_TIMEOUT_S = 5.0
 HAND_OVER_S = 3.0  # time for control to move the sessions of a stopping worker
 MAX_LATE_S = 5.0  # delay of a heartbeat above which a service is not healthy
 EXIT_AFTER_S = 15.0  # delay of a heartbeat above which a health check ends the process
-PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id; the underscore: not a setting
 _BUILD = version("kouxing")
-PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
-IDLE_PULSE = b"-"  # the byte for a heartbeat without sessions
 
 
 class Service(MessageLoop):
@@ -248,8 +246,7 @@ class Service(MessageLoop):
     @property
     def should_exit(self) -> bool:
         """Whether the main loop ends: a signal arrived, or the supervisor is gone."""
-        parent = os.environ.get(PARENT_VARIABLE)
-        return self._exit_requested or (parent is not None and os.getppid() != int(parent))
+        return self._exit_requested or parent_process.has_exited()
 
     def step(self, timeout_s: float) -> None:
         """Wait up to the timeout for messages, handle them, then tick."""
@@ -356,7 +353,7 @@ class Service(MessageLoop):
         self._sent_ns = now_ns()
         sessions, load = self.session_inputs(), self.busy.share(now_s)
         self._heartbeat_due_s = now_s + (HEARTBEAT_S if sessions else IDLE_HEARTBEAT_S)
-        _pulse_supervisor(is_idle=not sessions)
+        parent_process.send_pulse(is_idle=not sessions)
         for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
             self.metrics.set(name, value)
         self.deliver_heartbeat(
@@ -442,10 +439,3 @@ class Service(MessageLoop):
         except UserError as error:
             LOG.error("cannot save the allowed keys; they apply until this process ends: %s", error)
             self.bus.zap.allow(grants)
-
-
-def _pulse_supervisor(*, is_idle: bool) -> None:
-    """Write a heartbeat byte to the supervisor's pipe, if the pipe exists."""
-    if pulse := os.environ.get(PULSE_VARIABLE):
-        with contextlib.suppress(OSError):  # the pipe is full, or the supervisor is gone
-            os.write(int(pulse), IDLE_PULSE if is_idle else b".")

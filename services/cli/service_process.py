@@ -11,13 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.clock import StallDetector
-from kouxing.shared.service import (
-    HEARTBEAT_S,
-    IDLE_HEARTBEAT_S,
-    IDLE_PULSE,
-    PARENT_VARIABLE,
-    PULSE_VARIABLE,
-)
+from kouxing.shared.parent_process import IDLE_PULSE, PARENT_VARIABLE, PULSE_VARIABLE
+from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 
 POLL_S = 0.5  # between two checks of a process
 SILENT_S = 1.0  # without a heartbeat; a loop that is silent for longer may hang

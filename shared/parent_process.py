@@ -1,0 +1,24 @@
+"""The link of a service to the process that started it, if that process restarts services.
+
+Two environment variables describe it. Their names start with an underscore: they are no settings.
+"""
+
+import contextlib
+import os
+
+PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id
+PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
+IDLE_PULSE = b"-"  # the byte for a heartbeat without sessions
+
+
+def has_exited() -> bool:
+    """Return whether the process that started this one has exited."""
+    parent = os.environ.get(PARENT_VARIABLE)
+    return parent is not None and os.getppid() != int(parent)
+
+
+def send_pulse(*, is_idle: bool) -> None:
+    """Write the byte of a heartbeat to the pipe, if the pipe exists."""
+    if pulse := os.environ.get(PULSE_VARIABLE):
+        with contextlib.suppress(OSError):  # the pipe is full, or the process has exited
+            os.write(int(pulse), IDLE_PULSE if is_idle else b".")
