@@ -229,7 +229,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     times = np.arange(0, 40_000, 16_000 / 44_100)  # of 2.5 s
     stereo = np.interp(times, np.arange(len(samples)), samples)[:, None] * [1.5, 0.4]
     soundfile.write(folder / "stereo.wav", stereo, 44100, subtype="FLOAT")
-    demos = [DEMO / f"{name}.wav" for name in ("lake-male", "hello-female", "bilabials-female")]
+    demos = [DEMO / f"{name}.wav" for name in ("lake-male", "hello-female")]
     return [*demos, VOWELS_FILE, folder / "stereo.wav"]
 
 
@@ -247,17 +247,6 @@ def spoken(phones: list[events.Phone]) -> list[events.Phone]:
 def line(phone: events.Phone) -> str:
     """Return a phone as ``kouxing listen`` prints it."""
     return f"{phone.onset_s:9.3f} s  {phone.duration_s:6.3f} s  {phone.symbol}"
-
-
-def test_recordings_have_phones_in_order(expected: dict[str, list[events.Phone]]) -> None:
-    for name, phones in expected.items():
-        assert len(spoken(phones)) >= 6, name
-        assert [phone.index for phone in phones] == [*range(len(phones))]
-        assert all(phone.duration_s > 0 for phone in phones)
-        ends_s = [0.0, *(phone.onset_s + phone.duration_s for phone in phones)]
-        assert all(
-            end_s <= phone.onset_s + 1e-9 for end_s, phone in zip(ends_s, phones, strict=False)
-        )
 
 
 def test_phones_and_render_return_them(

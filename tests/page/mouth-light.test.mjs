@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { mouthLight } from "../../services/gateway/page/mouth-light.js";
 
-// The same values as in tests/unit/test_mouth_light.py.
+// The same values as in tests/unit/test_mouth_pictures.py.
 for (const [upper, lower, pushed, light] of [
   [0, 0, 0, 0.08],
   [0, -120, 0, 0.5698],

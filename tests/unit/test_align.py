@@ -92,7 +92,6 @@ def test_the_fit_shows_whether_the_text_was_spoken(text: str, *, fits: bool) -> 
     model = load_model("blocks")
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     syllables = model.inventory.pronounce(text)
-    assert align_syllables(model, samples, rate_hz, syllables).fits is fits
     padded = np.concatenate([np.zeros((3 * rate_hz, 1), np.float32), samples])
     assert align_syllables(model, padded, rate_hz, syllables).fits is fits, "pauses do not count"
 

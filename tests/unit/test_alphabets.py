@@ -38,11 +38,6 @@ def test_every_english_phone_is_in_arpabet() -> None:
     assert len(arpabet(" ".join(ENGLISH.phones), gap_s=0.05).split()) == len(ENGLISH) - 1
 
 
-def test_phones_of_other_languages_become_the_nearest_english_ones() -> None:
-    phones = respell(spoken("y beta"), load_inventory("universal"), Alphabet.ARPABET)
-    assert [phone.symbol for phone in phones] == ["UW", "B"]
-
-
 def test_live_phones_come_as_soon_as_they_are_certain() -> None:
     given: list[str] = []
 

@@ -1,8 +1,14 @@
+"""Clock offsets, stalls, hanging services, and the report of lost services."""
+
+import logging
 import math
 
 import pytest
 
+from kouxing.services.cli.service_process import POLL_S, SilenceMeter
+from kouxing.services.control.faults import Faults
 from kouxing.shared.clock import ClockOffset, StallDetector
+from kouxing.shared.logs import LOG
 
 
 def test_the_exchange_with_the_shortest_round_trip_gives_the_offset() -> None:
@@ -27,3 +33,32 @@ def test_a_pause_beyond_the_limit_is_a_stall_unless_the_clock_restarts() -> None
     assert stall.elapsed_s(60.0) == 0.5, "without the stall"
     stall.restart(80.0)
     assert stall.check(80.1) == 0.0
+
+
+@pytest.mark.parametrize("waiting", [0.0, 0.5, 1.0])
+def test_time_without_a_processor_does_not_count_as_silence(waiting: float) -> None:
+    meter = SilenceMeter(0.0)
+    for number in range(1, 21):
+        meter.update(POLL_S * number, waiting * POLL_S * number)
+    assert meter.duration_s == pytest.approx((1.0 - waiting) * POLL_S * 20)
+
+
+@pytest.mark.parametrize(
+    ("lasts_s", "level", "is_back_logged"),
+    [(0.8, logging.INFO, "recognizer-1 is back after 0.8 s"),
+     (2.0, logging.WARNING, "recognizer-1 is back after 2.0 s")],
+)  # fmt: skip
+def test_only_long_faults_are_reported_with_their_end(
+    caplog: pytest.LogCaptureFixture, lasts_s: float, level: int, is_back_logged: str
+) -> None:
+    faults = Faults()
+    with caplog.at_level(logging.INFO, LOG.name):
+        LOG.addHandler(caplog.handler)
+        faults.begin("recognizer-1", "no heartbeat", 10.0)
+        for tick in range(1, 20):
+            faults.report(10.0 + min(tick * 0.1, lasts_s))
+        faults.end("recognizer-1", 10.0 + lasts_s)
+        faults.end("recognizer-1", 20.0)
+        LOG.removeHandler(caplog.handler)
+    texts = {record.getMessage(): record.levelno for record in caplog.records}
+    assert texts == {"lost recognizer-1: no heartbeat": level, is_back_logged: level}

@@ -12,7 +12,6 @@ from kouxing.corpora.emotions import read_emotions
 from kouxing.evaluation import face
 from kouxing.evaluation.face import measure_face, print_face
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
 
@@ -55,18 +54,6 @@ def test_movements_match_the_stressed_vowels_that_they_follow() -> None:
     assert nods.at_end == pytest.approx(0.2)
     silent = face._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([]))
     assert face._movements([np.array([1.0])], [silent], minutes=1.0).matched is None
-
-
-def test_counts_blinks_and_still_frames() -> None:
-    faps = np.zeros((100, 68), np.float32)
-    faps[20:28, face._LID] = 900.0
-    faps[60:, face._PITCH] = np.linspace(0.0, 1000.0, 40)
-    rate_hz = SynthesizerConfig().frame_rate_hz
-    np.testing.assert_allclose(face._blinks(faps, rate_hz), [8 / rate_hz])
-    still = face._is_still(faps)
-    assert np.count_nonzero(~still) == 2 + 39
-    assert face._longest_run(still) == 32
-    assert face._longest_run(np.array([True] * 5)) == 5
 
 
 def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:

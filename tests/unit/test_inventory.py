@@ -30,6 +30,8 @@ def test_mandarin_has_the_phones_of_the_paper() -> None:
     assert len(MANDARIN) == 60
     assert MANDARIN.pronounce("你好") == [("n", "i"), ("h", "ao")]
     assert MANDARIN.pronounce("ni3 hǎo") == [("n", "i"), ("h", "ao")]
+    with pytest.raises(UserError, match="'abc'"):
+        MANDARIN.pronounce("你abc，x")
 
 
 @pytest.mark.parametrize(

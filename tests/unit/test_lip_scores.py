@@ -1,4 +1,4 @@
-"""The command ``kouxing evaluate lips`` on one short clip, and the groups of clips."""
+"""The commands that compare lips with real ones, and their measures."""
 
 import json
 from pathlib import Path
@@ -12,8 +12,11 @@ from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
 from kouxing.evaluation.lips.lip_scores import groups_of
+from kouxing.evaluation.lips.speaking_rates import accuracy_of
 from kouxing.evaluation.recognizer.disturbances import CLEAN, MUSIC
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.lips import clip_of
 from tests.system import DEMO
 
@@ -60,3 +63,15 @@ def test_figures_need_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     with pytest.raises(UserError, match="pip install"):
         new_figure(1.0, 1.0)
+
+
+def test_accuracy_is_one_minus_the_relative_error_of_the_measured_heights() -> None:
+    real = faps_of(np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0]))
+    assert accuracy_of(real, real) == pytest.approx(1.0)
+    assert accuracy_of(-real, real) == pytest.approx(-1.0)
+    made = 0.75 * real
+    real[2] = np.nan
+    real[:, MOUTH_FAPS.index(52)] = np.nan
+    made[:, MOUTH_FAPS.index(3)] = 1e4  # the jaw is no lip
+    made[:, MOUTH_FAPS.index(6)] = 1e4  # the paper moves lips vertically
+    assert accuracy_of(made, real) == pytest.approx(0.75)

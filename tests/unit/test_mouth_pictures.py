@@ -1,4 +1,4 @@
-"""Mouths can be distinguished in pictures at viewing distance."""
+"""Mouths can be distinguished in pictures; light on teeth and tongue."""
 
 from itertools import combinations
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import Head
-from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.renderer import Renderer, mouth_light
 from kouxing.services.driver.render.scene import camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
@@ -41,3 +41,16 @@ def test_any_two_mouths_differ(head: Head) -> None:
         change = np.abs(pictures[one] - pictures[other])[240:420, 220:420].max(axis=2)
         brightness = pictures[one][240:420, 220:420].max(axis=2).mean()
         assert (change > MIN_CHANGE * brightness).sum() > MIN_PIXELS, (one, other)
+
+
+# same values as in tests/page/mouth-light.test.mjs
+@pytest.mark.parametrize(
+    ("upper", "lower", "pushed", "light"),
+    [(0, 0, 0, 0.08), (0, -120, 0, 0.5698), (-20, -120, 260, 0.4065), (-280, -600, 70, 0.9242)],
+)
+def test_small_mouths_and_protruding_lips_admit_little_light(
+    upper: float, lower: float, pushed: float, light: float
+) -> None:
+    faps = np.zeros(68, np.float32)
+    faps[[3, 4, 15, 16]] = upper, lower, pushed, pushed
+    assert mouth_light(faps) == pytest.approx(light, abs=1e-4)

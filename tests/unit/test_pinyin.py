@@ -72,13 +72,6 @@ def test_splits_a_syllable_into_phones() -> None:
             phones_of_syllable(wrong)
 
 
-def test_pronounces_text() -> None:
-    for text in ("你好，绿！", "ni3 hao3 lü4"):
-        assert MANDARIN.pronounce(text) == [("n", "i"), ("h", "ao"), ("l", "v")]
-    with pytest.raises(UserError, match="'abc'"):
-        MANDARIN.pronounce("你abc，x")
-
-
 @pytest.mark.parametrize(
     ("text", "read"),
     [

@@ -1,10 +1,11 @@
-"""A service requests a higher priority, and continues without it."""
+"""What a process sets up: its priority, and the folder of compiled functions."""
 
 import os
 from pathlib import Path
 
 import pytest
 
+import kouxing
 from kouxing.shared import priority
 
 
@@ -23,3 +24,17 @@ def test_raises_the_session_only_if_the_process_leads_it(
     assert autogroup.exists() == leads_session
     monkeypatch.setattr(priority, "AUTOGROUP", tmp_path / "none" / "autogroup")
     priority.raise_priority()
+
+
+def test_compiled_functions_go_to_a_temporary_folder_if_no_other_can_be_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    kouxing._choose_numba_folder()
+    assert "NUMBA_CACHE_DIR" not in os.environ, "numba chooses the folder"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    kouxing._choose_numba_folder()
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    assert folder.stat().st_mode & 0o777 == 0o700
