@@ -6,6 +6,7 @@
 # make check        style, types and import rules
 # make check-wheel  installs the wheel in an empty environment, and runs it
 # make lips-demo    writes the page with lip sync in the browser to dist/lips-demo
+# make report       measures everything that is out of date, and writes docs/results.md (CLIPS, CORPUS, NATURAL, STEPS, QUICK, FRESH)
 # make lock         updates the locked versions and hashes of all Python packages
 #
 # test and check run all their stages, report each failure, and then exit with an error.
@@ -25,6 +26,7 @@ CLIENT := proto/node
 JAVASCRIPT := clients/javascript
 LIPS := clients/kouxing-lips
 LIPS_MODELS := $(LIPS)/models/model.json
+RIVALS := evaluation/rivals
 AVATAR := examples/browser-vrm
 BLENDER := examples/blender/.venv
 BLENDER_LOCK := examples/blender/requirements.lock
@@ -36,6 +38,7 @@ LOCK_TORCH := requirements-torch.lock
 LOCK_TORCH_CPU := requirements-torch-cpu.lock
 TORCH := torch==2.13.0
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --retries 0 --timeout 10
+RIVAL_PACKAGES := pylipsync==0.2.1 openfacefx==0.24.0
 BPY := bpy==4.5.15
 INSTALL := -m pip install --quiet
 PIP := $(BIN)/python $(INSTALL)
@@ -48,7 +51,7 @@ CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos java
 STAGES = $(MAKE) --keep-going --no-print-directory
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo lock clean $(TEST_STAGES) $(CHECK_STAGES)
+.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo report lock clean $(TEST_STAGES) $(CHECK_STAGES)
 
 run: setup
 	$(BIN)/kouxing run --play $(SAMPLE)
@@ -113,6 +116,7 @@ check-mos:
 check-javascript:
 	$(NPM) $(JAVASCRIPT) run lint
 	$(NPM) $(LIPS) run lint
+	$(NPM) $(RIVALS) run lint
 
 check-compose:
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
@@ -125,6 +129,11 @@ check-wheel: wheel
 
 lips-demo: setup $(LIPS_MODELS) $(JAVASCRIPT)/node_modules/.package-lock.json
 	$(BIN)/node $(LIPS)/demo/build.mjs dist/lips-demo
+
+# CLIPS, CORPUS and NATURAL are folders of recordings. STEPS names steps; QUICK=1 and FRESH=1 are options.
+report: .venv/installed-dev setup $(LIPS_MODELS) $(RIVALS)/node_modules/.package-lock.json $(RIVALS)/.venv/installed
+	$(BIN)/kouxing evaluate report $(STEPS) $(CLIPS:%=--lips %) $(CORPUS:%=--corpus %) $(NATURAL:%=--natural %) \
+		$(QUICK:1=--quick) $(FRESH:1=--fresh)
 
 # The locks suit every system and Python >= 3.11. The version of torch is fixed: training depends on it.
 # When it changes, copy the hashes of its CPU builds from the index of TORCH_CPU to LOCK_TORCH_CPU.
@@ -139,10 +148,12 @@ lock: .venv/installed-dev
 		--output-file $(LOCK_DEV) pyproject.toml -
 	$(BUILD_REQUIRES) | $(COMPILE) --extra page --constraint $(LOCK_DEV) --output-file $(LOCK) pyproject.toml -
 	echo '$(BPY)' | $(COMPILE) --output-file $(BLENDER_LOCK) -
+	printf '%s\n' $(RIVAL_PACKAGES) | $(COMPILE) --output-file $(RIVALS)/requirements.lock -
 
 clean:
 	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
 		$(JAVASCRIPT)/node_modules $(LIPS)/node_modules $(LIPS)/models $(AVATAR)/node_modules \
+		$(RIVALS)/node_modules $(RIVALS)/.venv \
 		$(PAGE)/head*.glb build dist out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
@@ -166,9 +177,14 @@ $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
 	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
 
-$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR)): \
+$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR) $(RIVALS)): \
 		%/node_modules/.package-lock.json: %/package-lock.json | .venv/installed
 	$(NPM) $* ci
+	touch $@
+
+$(RIVALS)/.venv/installed: $(RIVALS)/requirements.lock
+	$(PYTHON) -m venv $(RIVALS)/.venv
+	$(RIVALS)/.venv/bin/python $(INSTALL) --require-hashes --requirement $<
 	touch $@
 
 # Blender needs Python 3.11 and an older numpy. Without it, its test is skipped.

@@ -211,6 +211,7 @@ def lips(
         list[Path] | None,
         typer.Option(help="Folder with CLIP.csv, the curves of another program; repeatable."),
     ] = None,
+    every: Annotated[int, typer.Option(min=1, help="Score only each N-th clip.")] = 1,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -227,7 +228,9 @@ def lips(
     conditions = condition or CONDITIONS
     check_conditions(conditions, CONDITIONS)
     music = music_from(_read_sounds(sounds))
-    results = score_lips(clips, lips or (), delay_ms or (), music, conditions, from_csv or ())
+    results = score_lips(
+        clips, lips or (), delay_ms or (), music, conditions, from_csv or (), every
+    )
     print_scores(results, Console())
     write_json(json_file, results)
 
@@ -244,6 +247,61 @@ def pack_clips(
     check_output(archive, force=force)
     num_clips = write_clip_archive(clips, archive)
     print_message(f"wrote {plural(num_clips, 'clip')} to {archive}")
+
+
+@app.command()
+def rivals(
+    output: Annotated[
+        Path, typer.Argument(help="Folder for PROGRAM/CLIP.csv; existing ones stay.")
+    ],
+    clips: Clips,
+    program: Annotated[
+        list[str] | None, typer.Option(help="Name of a program; repeatable. Default: all.")
+    ] = None,
+) -> None:
+    """Run other lip sync on the clips, and write its curves for ``lips --from-csv``.
+
+    Programs: headaudio, wlipsync, wawa, live2d, pylipsync, openfacefx and loudness.
+    """
+    from kouxing.evaluation.rivals.tables import PROGRAMS, write_tables
+
+    write_tables(clips, output, program or PROGRAMS)
+
+
+@app.command()
+def report(
+    step: Annotated[list[str] | None, typer.Argument(help="Name of a step. Default: all.")] = None,
+    lips: Annotated[Path | None, typer.Option(help="Folder of clips with tracked lips.")] = None,
+    corpus: Annotated[Path | None, typer.Option(help="Corpus of read speech.")] = None,
+    natural: Annotated[Path | None, typer.Option(help="Folder of conversation.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Parts of the data; ten minutes.")] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Also run steps that are up to date.")
+    ] = False,
+) -> None:
+    """Run the evaluations that are out of date, and write docs/results.md.
+
+    A step is out of date if the code or the models that it depends on have changed. A quick report
+    is written to out/report.
+    """
+    from kouxing.evaluation.report.page import write_page
+    from kouxing.evaluation.report.run import run_steps
+    from kouxing.evaluation.report.steps import ROOT, STEPS
+    from kouxing.shared.errors import UserError
+
+    unknown = {*(step or ())} - {*STEPS}
+    if unknown:
+        raise UserError(f"no step {min(unknown)!r}; choose from {', '.join(STEPS)}")
+    if not (ROOT / "docs").is_dir():
+        raise UserError("the report needs the source tree; run 'make report' there")
+    folder = ROOT / "out" / "report" if quick else ROOT / "docs"
+    data = {"lips": lips, "corpus": corpus, "natural": natural, "rivals": ROOT / "out" / "rivals"}
+    results = folder / "results"
+    failed = run_steps(step or STEPS, data, results, is_quick=quick, is_fresh=fresh)
+    write_page(results, folder / "results.md")
+    print_message(f"wrote {folder / 'results.md'}")
+    if failed:
+        raise UserError(f"these steps failed: {', '.join(failed)}; their messages are above")
 
 
 @app.command()
@@ -453,6 +511,18 @@ def lips_page(
     figures = measure(audio, package)
     show(figures, Console())
     write_json(json_file, asdict(figures))
+
+
+@bench_app.command()
+def sizes(json_file: JsonFile = None, force: Force = False) -> None:
+    """Measure sizes of the models, and the least processor time of their networks here."""
+    from kouxing.evaluation.system.sizes import measure, show
+
+    check_output(json_file, force=force)
+    figures = measure()
+    show(figures, Console())
+    floors = {f"hop {hop}": figures.floor_cores(hop) for hop in (1, 4)}
+    write_json(json_file, asdict(figures) | {"floor_cores": floors})
 
 
 @bench_app.command()

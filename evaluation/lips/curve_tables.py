@@ -25,6 +25,7 @@ TIME, OPENING = "t", "opening"
 _MAX_BYTES = 64 << 20
 _LOW, _HIGH = 1.0, 99.0  # percentiles
 _MAX_OPENING = 400.0  # FAP units, 12 mm on a face
+_READY_PLAYER_ME = {"I": "ih", "O": "oh", "U": "ou"}  # its names of Oculus' visemes
 _LOWER_LIP = FAP_NUMBER["raise_b_midlip"] - 1
 
 
@@ -117,7 +118,8 @@ def shipped_mouth(folder: Path, tables: Collection[CurveTable]) -> ShippedMouth:
         for name, row in zip(shapes.names, shapes.basis, strict=True)
     }
     for row, name in zip(basis, names, strict=True):
-        row[:] = known.get(name.removeprefix("viseme_"), 0.0)
+        viseme = name.removeprefix("viseme_")
+        row[:] = known.get(_READY_PLAYER_ME.get(viseme, viseme), 0.0)
     if not basis.any():
         raise UserError(
             f"{folder}: no column is a curve of a mouth; name a column {OPENING}, jawOpen or"

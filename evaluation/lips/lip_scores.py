@@ -91,6 +91,7 @@ def score_lips(
     music: Samples,
     conditions: Sequence[str],
     tables: Sequence[Path] = (),
+    every: int = 1,
 ) -> Results:
     """Score faces (see ``load_faces``) on the held-out clips of a folder.
 
@@ -99,7 +100,9 @@ def score_lips(
     """
     model = load_model()
     faces = {} if tables and not names else load_faces(names, delays_ms, model.inventory)
-    clips = clips_to_score(folder, [Path(name) for name in names if name.endswith(".json")])
+    clips = clips_to_score(folder, [Path(name) for name in names if name.endswith(".json")])[
+        ::every
+    ]
     training = training_clips(read_clips(folder, language=None))
     programs = load_programs(tables, clips, training)
     known = {clip.speaker for clip in training}

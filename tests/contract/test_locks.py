@@ -11,7 +11,9 @@ from packaging.utils import canonicalize_name
 
 from tests.system import ROOT
 
-LOCKS = sorted([*ROOT.glob("requirements*.lock"), *ROOT.glob("examples/*/requirements.lock")])
+LOCKS = sorted(
+    [*ROOT.glob("requirements*.lock"), *ROOT.glob("e*/*/requirements.lock")]  # examples, evaluation
+)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 HASH = r"--hash=sha256:[0-9a-f]{64}"
 

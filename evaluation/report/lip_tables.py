@@ -1,0 +1,255 @@
+"""The tables of lips: agreement with tracked lips, closures, look-ahead, motion, and the papers."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from kouxing.evaluation.report.markdown import Results, Table, joined, number, percent
+
+_REAL, _CLEAN, _BABBLE, _MUSIC = "real", "clean", "babble 10 dB", "music 10 dB"
+_GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
+_ALL = "all"
+_OWN = "learnt"
+_COMPARED = {  # measures of the comparison, and whether a higher figure is better
+    "r_opening": ("correlation of the opening", True),
+    "r_width": ("correlation of the width", True),
+    "r_jaw": ("correlation of the jaw", True),
+    "closure_f1": ("F1 of closures", True),
+    "closure_precision": ("precision of closures", True),
+    "closure_recall": ("recall of closures", True),
+    "mtm_ms": ("MTM", False),
+}
+_NAMES = {
+    "headaudio": "HeadAudio 0.1.0",
+    "wlipsync": "wLipSync 1.3.1",
+    "wawa": "wawa-lipsync 0.0.2",
+    "live2d": "live2d-motionsync 0.0.4",
+    "pylipsync": "pylipsync 0.2.1 (uLipSync)",
+    "openfacefx": "OpenFaceFX 0.24.0, energy, offline",
+    "loudness": "loudness",
+}
+
+
+def title_of(face: str) -> str:
+    """Return the title of a face such as ``wawa, fitted, 100 ms``."""
+    program, _, rest = face.partition(", ")
+    shown = _NAMES.get(program, f"**{program}**")
+    return f"{shown}, {rest}"
+
+
+def agreement(results: Results) -> Table:
+    """Return the correlations with tracked lips in speech, best opening first."""
+    faces = _clean_scores(results.get("rivals", {}))
+    columns = ("face, delay", *(f"{name}: opening / width / jaw" for name in _GROUPS.values()))
+    order = sorted(faces, key=lambda face: -(faces[face][_ALL]["r_opening"] or 0.0))
+    return columns, [
+        [
+            title_of(face),
+            *(
+                joined(number(faces[face].get(group, {}).get(f"r_{name}")) for name in _CURVES)
+                for group in _GROUPS
+            ),
+        ]
+        for face in order
+    ]
+
+
+_CURVES = ("opening", "width", "jaw")
+
+
+def better_programs(results: Results) -> list[str]:
+    """Return a sentence for each figure in which another program is better than the own lips."""
+    faces = _clean_scores(results.get("rivals", {}))
+    own = next((face for face in faces if face.startswith(f"{_OWN}, ")), None)
+    sentences = []
+    for group, group_title in {**_GROUPS, _ALL: "all clips"}.items():
+        for measure, (name, is_higher_better) in _COMPARED.items():
+            if own is None or faces[own].get(group, {}).get(measure) is None:
+                continue
+            others = {
+                face: value
+                for face, groups in faces.items()
+                if face.partition(", ")[0] in _NAMES
+                if (value := groups.get(group, {}).get(measure)) is not None
+            }
+            sign = 1 if is_higher_better else -1
+            best = max(others, key=lambda face: sign * others[face], default=None)
+            mine = faces[own][group][measure]
+            if best is not None and sign * others[best] > sign * mine:
+                values = f"{_short(measure, others[best])} and {_short(measure, mine)}"
+                sentences.append(f"{group_title}: {title_of(best)} has a better {name} ({values})")
+    return sentences
+
+
+def _short(measure: str, value: float) -> str:
+    return f"{value:.0f} ms" if measure.endswith("_ms") else number(value)
+
+
+def closures(results: Results) -> Table:
+    """Return recall and precision of closures, also by class of phones."""
+    columns = (
+        "face, delay",
+        "F1",
+        "recall",
+        "precision",
+        "b p m",
+        "a e i",
+        "u o",
+        "pauses",
+        "closed at b p m",
+        "closed in speech",
+    )
+    measures = (
+        "closure_f1",
+        "closure_recall",
+        "closure_precision",
+        *(f"precision_{name}" for name in ("bpm", "aei", "uo", "pause")),
+        "labials_shut",
+        "share_shut",
+    )
+    return columns, [
+        [title, *(percent(scores.get(measure)) for measure in measures)]
+        for title, scores in _all_faces(results)
+    ]
+
+
+def motion(results: Results) -> Table:
+    """Return timing, effort and rest of the faces, and of real lips."""
+    columns = (
+        "face, delay",
+        "lag, ms",
+        "MTM, ms",
+        "SLCC",
+        "effort",
+        "opening at rest",
+        "closed after, ms",
+        "spread",
+        "turns per s",
+    )
+    digits = {
+        "lag_ms": 0,
+        "mtm_ms": 0,
+        "slcc": 2,
+        "effort_correlation": 2,
+        "rest_opening": 0,
+        "closing_time_ms": 0,
+        "phone_spread": 0,
+        "turns_per_s": 1,
+    }
+    return columns, [
+        [title, *(number(scores.get(measure), places) for measure, places in digits.items())]
+        for title, scores in _all_faces(results)
+    ]
+
+
+def disturbed_lips(results: Results) -> list[str]:
+    """Return a sentence for each lip model with its figures with babble and music."""
+    sentences = []
+    for face, scores in results.get("lips", {}).items():
+        conditions = [name for name in (_CLEAN, _BABBLE, _MUSIC) if name in scores]
+        figures = (
+            f"{name} {joined(number(scores[name][_ALL][m]) for m in ('r_opening', 'closure_f1'))}"
+            for name in conditions
+        )
+        if face != _REAL and len(conditions) > 1:
+            sentences.append(f"{face}, correlation of the opening / F1: {', '.join(figures)}")
+    return sentences
+
+
+def lookahead(results: Results) -> Table:
+    """Return the opening's correlation and the closures' F1 by lip model and look-ahead."""
+    curves = lookahead_curves(results)
+    delays = sorted({delay for points in curves.values() for delay in points})
+    rows = []
+    for lips, points in curves.items():
+        for measure, name in (("r_opening", "r"), ("closure_f1", "F1")):
+            values = (number(points.get(delay, {}).get(measure)) for delay in delays)
+            rows.append([f"{lips}, {name}", *values])
+    return ("lip model", *(f"{delay} ms" for delay in delays)), rows
+
+
+def lookahead_curves(results: Results) -> dict[str, dict[int, dict[str, Any]]]:
+    """Return the scores of all clips by lip model and delay, ms."""
+    curves: dict[str, dict[int, dict[str, Any]]] = {}
+    for face, groups in _clean_scores(results.get("lookahead", {})).items():
+        lips, _, delay = face.partition(", ")
+        curves.setdefault(lips, {})[int(float(delay.removesuffix(" ms")))] = groups[_ALL]
+    return curves
+
+
+def schemes(results: Results) -> Table:
+    """Return the four schemes of Li et al. 2011 with the paper's scores."""
+    paper = {1: "4.34 / 4.01", 2: "3.98 / 3.81", 3: "3.42 / 3.50", 4: "3.21 / 3.16"}
+    columns = (
+        "lips",
+        "scheme",
+        "recognizer",
+        "r with scheme 1: opening / width / jaw",
+        "lag, ms",
+        "F1 of closures",
+        "phone delay p50 / p95, ms",
+        "paper: sync / realism",
+    )
+    return columns, [
+        [
+            score["lips"],
+            str(score["scheme"]),
+            score["recognizer"] or "(text)",
+            joined(number(value) for value in like["correlation"].values()),
+            number(like["lag_ms"], 0),
+            number(like["closure_f1"]),
+            joined(number(score[f"phone_delay_{p}_ms"], 0) for p in ("p50", "p95")),
+            paper[score["scheme"]],
+        ]
+        for step in ("schemes", "schemes-paper-rule")
+        for score in results.get(step, {}).get("scores", [])
+        if (like := score["like_scheme_1"])
+        and (step == "schemes" or score["recognizer"].endswith("-paper"))
+    ]
+
+
+def viseme_fit(results: Results) -> Table:
+    """Return the errors of the visemes of Wang & Cai 2003 by viseme and measure."""
+    errors = results.get("visemes", {}).get("errors", [])
+    measures = list(dict.fromkeys(error["measure"] for error in errors))
+    rows = []
+    for viseme in dict.fromkeys(error["viseme"] for error in errors):
+        of_viseme = {error["measure"]: error for error in errors if error["viseme"] == viseme}
+        frames = max(error["num_frames"] for error in of_viseme.values())
+        cells = (
+            joined(number(of_viseme[measure][key], 0) for key in ("learnt", "guessed", "extent"))
+            if measure in of_viseme
+            else "-"
+            for measure in measures
+        )
+        rows.append([viseme, str(frames), *cells])
+    return ("viseme", "frames", *measures), rows
+
+
+def ferguson(results: Results) -> Table:
+    """Return the accuracies of Zhang et al. 2021 by method and speaking rate."""
+    scores: Sequence[Any] = results.get("ferguson", [])
+    columns = ("method", *(f"{s['rate']:g} ({s['syllables_per_s']:.1f} per s)" for s in scores))
+    methods = scores[0]["of_frames"] if scores else ()
+    return columns, [
+        [
+            method,
+            *(
+                joined(percent(score[kind][method]) for kind in ("of_frames", "of_phones"))
+                for score in scores
+            ),
+        ]
+        for method in methods
+    ]
+
+
+def _clean_scores(faces: Results) -> dict[str, dict[str, Any]]:
+    return {face: scores[_CLEAN] for face, scores in faces.items() if face != _REAL}
+
+
+def _all_faces(results: Results) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield title and scores of all clips: real lips, own lip models, then other programs."""
+    faces = results.get("rivals", {})
+    if _REAL in faces:
+        yield "real lips", faces[_REAL][_CLEAN][_ALL]
+    for face, groups in _clean_scores(faces).items():
+        yield title_of(face), groups[_ALL]

@@ -1,0 +1,94 @@
+"""Writes the page of the report, docs/results.md, and its picture from the results of the steps.
+
+``template.md`` has the text, with a line ``[[NAME]]`` for each table.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.evaluation.report import lip_tables, system_tables
+from kouxing.evaluation.report.markdown import Results, Table, bullets, markdown
+from kouxing.evaluation.report.recognition_table import recognition
+from kouxing.evaluation.report.steps import STEPS
+
+PICTURE = "lookahead.png"
+_TEMPLATE = Path(__file__).with_name("template.md")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A table, with the steps whose results it shows."""
+
+    steps: tuple[str, ...]
+    table: Callable[[Results], Table]
+
+
+TABLES = {
+    "recognition": Part(("read", "conversation", "disturbed"), recognition),
+    "agreement": Part(("rivals",), lip_tables.agreement),
+    "closures": Part(("rivals",), lip_tables.closures),
+    "lookahead": Part(("lookahead",), lip_tables.lookahead),
+    "motion": Part(("rivals",), lip_tables.motion),
+    "schemes": Part(("schemes", "schemes-paper-rule"), lip_tables.schemes),
+    "visemes": Part(("visemes",), lip_tables.viseme_fit),
+    "ferguson": Part(("ferguson",), lip_tables.ferguson),
+    "system": Part(("chain", "load", "busy", "browser", "sizes"), system_tables.system),
+    "faults": Part(("faults",), system_tables.faults),
+}
+
+
+def read_results(folder: Path) -> dict[str, Any]:
+    """Read the files of all steps that have been measured."""
+    paths = {name: folder / f"{name}.json" for name in STEPS}
+    return {n: json.loads(path.read_text("utf-8")) for n, path in paths.items() if path.exists()}
+
+
+def write_page(folder: Path, page: Path) -> None:
+    """Write the page and its picture from the results in a folder."""
+    steps = read_results(folder)
+    results = {name: step["result"] for name, step in steps.items()}
+    better = lip_tables.better_programs(results)
+    text = _TEMPLATE.read_text("utf-8").replace(
+        "[[better]]\n", bullets(better or ["In no measure"])
+    )
+    parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _part(match[1], steps, results), text)
+    page.write_text(parts, encoding="utf-8")
+    if "lookahead" in results:
+        save_figure(_lookahead_figure(results), page.with_name(PICTURE))
+
+
+def _part(name: str, steps: Results, results: Results) -> str:
+    part = TABLES[name]
+    measured = [step for step in part.steps if step in steps]
+    if not measured:
+        return f'Not measured yet: `make report STEPS="{" ".join(part.steps)}"`.\n'
+    notes = [_about(steps[step]) for step in measured]
+    if name == "agreement" and "lips" in steps:
+        notes += [*lip_tables.disturbed_lips(results), _about(steps["lips"])]
+    return f"{markdown(part.table(results))}\n{bullets(notes)}"
+
+
+def _about(step: Results) -> str:
+    commands = "`, `".join(step["commands"])
+    measured = f"{step['machine']}, {step['date']}, commit {step['commit']}"
+    return f"`{commands}`: {measured}, {step['seconds']} s, load {step['load']:.1f}"
+
+
+def _lookahead_figure(results: Results) -> Any:
+    figure = new_figure(9.0, 3.6)
+    axes = figure.subplots(1, 2, sharex=True)
+    titles = {"r_opening": "correlation of the opening", "closure_f1": "F1 of closures"}
+    for lips, points in lip_tables.lookahead_curves(results).items():
+        for axis, (measure, title) in zip(axes, titles.items(), strict=True):
+            delays = sorted(points)
+            axis.plot(delays, [points[delay][measure] for delay in delays], "o-", label=lips)
+            axis.set_title(title, fontsize=9)
+            axis.set_xlabel("look-ahead, ms")
+            axis.set_ylim(0.0, 1.0)
+    axes[-1].legend(fontsize=8)
+    return figure

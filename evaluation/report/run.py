@@ -1,0 +1,134 @@
+"""Runs the steps of the report that are out of date, and stores their results.
+
+A result is a JSON file with the command, machine, date, commit and load. It is out of date if the
+code or the models that its step depends on have another hash.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.shared.terminal import print_message
+
+_SOURCES = {".py", ".js", ".mjs", ".ts", ".json", ".toml", ".tsv", ".npz", ".txt"}
+_DROPPED = {"rules", "late_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
+_DROPPED_GROUPS = ("source ", "speaker ")
+_DIGITS = 5
+
+
+def run_steps(
+    names: Iterable[str],
+    folders: Mapping[str, Path | None],
+    results: Path,
+    *,
+    is_quick: bool,
+    is_fresh: bool,
+) -> list[str]:
+    """Run steps and return those that failed.
+
+    ``folders`` are the data that the commands name. A step without its data is left out.
+    """
+    failed = []
+    for name in names:
+        step, path = STEPS[name], results / f"{name}.json"
+        commands = step.commands if step.quick is None or not is_quick else step.quick
+        missing = [
+            key for key, folder in folders.items() if not folder and f"{{{key}}}" in str(commands)
+        ]
+        code = code_hash(step)
+        if not commands or missing:
+            reason = f"give --{missing[0]}" if missing else "it is not part of a quick report"
+            print_message(f"{name}: left out ({reason})")
+        elif not is_fresh and path.exists() and json.loads(path.read_text())["code"] == code:
+            print_message(f"{name}: up to date")
+        else:
+            print_message(f"{name}: kouxing {_without_braces(commands[-1])}")
+            figures = _run(commands, folders)
+            if figures is None:
+                failed.append(name)
+            else:
+                shown = [f"kouxing {_without_braces(command)}" for command in commands]
+                write_result(path, {"commands": shown, **about(), "code": code, **figures})
+    return failed
+
+
+def code_hash(step: Step) -> str:
+    """Return a hash of the sources and models that a step depends on."""
+    digest = hashlib.sha256()
+    for pattern in step.code:
+        for path in sorted(ROOT.glob(pattern)):
+            files = sorted(path.rglob("*")) if path.is_dir() else [path]
+            for file in files:
+                inner = {"node_modules", ".venv"} & {*file.relative_to(ROOT).parts}
+                if file.suffix in _SOURCES and not inner and file.is_file():
+                    digest.update(str(file.relative_to(ROOT)).encode())
+                    digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def about() -> dict[str, Any]:
+    """Return machine, date and commit."""
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
+    models = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"],  # noqa: S607
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return {
+        "machine": f"{models[0] if models else platform.processor()}, {os.cpu_count()} cores",
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "commit": commit.stdout.strip() or "unknown",
+    }
+
+
+def write_result(path: Path, result: Mapping[str, Any]) -> None:
+    """Write a result without figures by speaker and by frame, and with five digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(_reduced(result), indent=1, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _run(commands: Iterable[str], folders: Mapping[str, Path | None]) -> dict[str, Any] | None:
+    *earlier, last = commands
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "result.json"
+        load, start_s = os.getloadavg()[0], time.monotonic()
+        for command in (*earlier, f"{last} --json {path}"):
+            arguments = command.format_map(folders).split()
+            done = subprocess.run(  # noqa: S603
+                [sys.executable, "-m", "kouxing", *arguments], cwd=ROOT, check=False
+            )
+            if done.returncode:
+                return None
+        seconds = round(time.monotonic() - start_s)
+        return {"load": load, "seconds": seconds, "result": json.loads(path.read_text("utf-8"))}
+
+
+def _without_braces(command: str) -> str:
+    return command.replace("{", "").replace("}", "")
+
+
+def _reduced(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {
+            key: _reduced(item)
+            for key, item in value.items()
+            if key not in _DROPPED and not key.startswith(_DROPPED_GROUPS)
+        }
+    if isinstance(value, list | tuple):
+        return [_reduced(item) for item in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value

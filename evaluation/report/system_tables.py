@@ -1,0 +1,153 @@
+"""The tables of the running system: time, load, size and faults, next to their physical floor."""
+
+from collections.abc import Iterator
+
+from kouxing.evaluation.report.markdown import Results, Table, joined, number, percent
+
+_LOOK_AHEAD_MS, _FRAME_MS, _TICK_MS = 60, 20, 1000 / 60
+_FRAME_BYTES, _FRAMES_PER_S = 68 * 4, 50
+
+
+def system(results: Results) -> Table:
+    """Return each figure of the running system with its physical floor."""
+    return ("figure", "value", "floor", "why this floor"), [
+        row for rows in (_chain, _load, _busy, _browser, _sizes) for row in rows(results)
+    ]
+
+
+def _chain(results: Results) -> Iterator[list[str]]:
+    chain = results.get("chain")
+    if not chain:
+        return
+    floor_cores = results.get("sizes", {}).get("floor_cores", {}).get("hop 1")
+    to_frame, from_sound = chain["chunk_to_frame_ms"], chain["sound_to_frame_ms"]
+    yield ["end of a chunk to its frame, p50 / p95, ms", _percentiles(to_frame), "0", "computation"]
+    yield [
+        "sound to its frame, p50 / p95, ms",
+        _percentiles(from_sound),
+        str(_LOOK_AHEAD_MS),
+        "look-ahead of the lips",
+    ]
+    yield [
+        "processor time of all services, s per s of audio",
+        number(sum(chain["cpu_s_per_audio_s"].values())),
+        number(floor_cores),
+        "operations of the networks / rate of the matrix product",
+    ]
+    for name, drawing in chain["page"]["drawings"].items():
+        rate = drawing.get("images_per_s") or drawing.get("rate")
+        if rate:
+            yield [
+                f"page in headless Chromium, {name}, pictures per s",
+                number(rate, 0),
+                "60",
+                "display",
+            ]
+
+
+def _load(results: Results) -> Iterator[list[str]]:
+    load = results.get("load")
+    if not load:
+        return
+    summary = load["summary"]
+    floor_cores = results.get("sizes", {}).get("floor_cores", {}).get("hop 4")
+    floor = load["cores"] / floor_cores if floor_cores else None
+    yield [
+        f"sessions on {load['cores']} cores, all speaking",
+        number(summary["sessions"], 0),
+        number(floor, 0),
+        "cores / floor of the processor time; under load, the block network runs every 160 ms",
+    ]
+    if "recognizer_mb_per_session" in summary:
+        memory = (summary[f"{name}_mb_per_session"] for name in ("recognizer", "synthesizer"))
+        yield [
+            "memory of a session, recognizer / synthesizer, MB",
+            joined(number(value, 1) for value in memory),
+            "1.5",
+            "keys and values of the block network, 2.5 s",
+        ]
+
+
+def _busy(results: Results) -> Iterator[list[str]]:
+    busy = results.get("busy")
+    for run, summary in zip(busy["runs"], busy["summary"], strict=True) if busy else ():
+        yield [
+            f"{run['num_programs']} busy programs: largest lateness, s / frames missing, %",
+            joined([number(summary["worst_s"]), percent(summary["missing"])]),
+            "0",
+            "",
+        ]
+
+
+def _browser(results: Results) -> Iterator[list[str]]:
+    browser = results.get("browser")
+    if not browser:
+        return
+    floor_ms = _LOOK_AHEAD_MS + _FRAME_MS + _TICK_MS
+    yield [
+        "lips in the browser: sound to weights, p50 / p95, ms",
+        _percentiles(browser["delay_ms"]),
+        number(floor_ms, 0),
+        "look-ahead + frame + display tick",
+    ]
+    yield [
+        "lips in the browser: share of a core, %",
+        percent(browser["processor_share"]),
+        "",
+        "",
+    ]
+    models = results.get("sizes", {}).get("model_bytes", {})
+    needed = sum(models.get(name, 0) for name in ("ear", "lips", "traits", "phone_lm")) / 1e6
+    yield [
+        "lips in the browser: download, MB",
+        number(browser["download_bytes"] / 1e6, 1),
+        number(needed, 1),
+        "weights of its models",
+    ]
+
+
+def _sizes(results: Results) -> Iterator[list[str]]:
+    sizes = results.get("sizes")
+    if not sizes:
+        return
+    total = sum(sizes["model_bytes"].values()) / 1e6
+    yield ["all models of the recognizer, MB", number(total, 1), "", ""]
+    yield [
+        "FAP frames to a subscriber, kB/s",
+        number(sizes["frame_bytes"] * _FRAMES_PER_S / 1e3, 1),
+        number(_FRAME_BYTES * _FRAMES_PER_S / 1e3, 1),
+        "68 floats, 50 times a second",
+    ]
+
+
+def _percentiles(values: Results) -> str:
+    return joined(number(values.get(key), 1) for key in ("p50", "p95"))
+
+
+def faults(results: Results) -> Table:
+    """Return what a viewer sees of each fault."""
+    columns = (
+        "fault",
+        "no new frame for, s",
+        "late for, s",
+        "frames lost",
+        "phones lost / doubled / changed",
+        "largest step",
+        "refused sessions",
+    )
+    rows = []
+    for outcome in results.get("faults", []):
+        face = outcome["face"]
+        cells = (
+            [
+                number(face["stood_s"]),
+                number(face["late_s"]),
+                str(face["frames_lost"]),
+                joined(str(face[f"phones_{kind}"]) for kind in ("lost", "doubled", "changed")),
+                number(face["largest_step"], 1),
+            ]
+            if face
+            else [outcome["failure"], "-", "-", "-", "-"]
+        )
+        rows.append([outcome["fault"], *cells, str(outcome["num_refused"])])
+    return columns, rows

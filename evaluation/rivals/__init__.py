@@ -1,0 +1,1 @@
+"""Other real-time lip sync, run on the clips of a folder."""

@@ -1,0 +1,157 @@
+"""Writes the curves of other lip sync for clips: tables for ``kouxing evaluate lips --from-csv``.
+
+HeadAudio, wLipSync and live2d-motionsync run in Node as in a browser's audio thread, at 48 kHz in
+blocks of 128 samples. wawa-lipsync reads an analyser node 60 times a second. pylipsync (uLipSync in
+Python) and OpenFaceFX process whole recordings. All have their default settings. ``make report``
+installs them.
+
+wLipSync needs a profile, which its users make from their own voice. Here it is the mean cepstrum of
+each viseme in the training clips. Loudness is the level of the last 20 ms, from 40 dB below the
+loudest frames of the recording (0) to these (1).
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+from scipy.signal import resample_poly
+
+from kouxing.corpora.lip_clips import (
+    SAMPLE_RATE_HZ,
+    LipClip,
+    label_clip,
+    read_clips,
+    training_clips,
+)
+from kouxing.evaluation.lips.curve_tables import read_table
+from kouxing.evaluation.lips.references import clips_to_score
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.errors import UserError
+
+Array = NDArray[np.float64]
+
+FOLDER = Path(__file__).parent
+NODE_PROGRAMS = ("headaudio", "wlipsync", "wawa", "live2d")
+PYTHON_PROGRAMS = ("pylipsync", "openfacefx")
+LOUDNESS = "loudness"
+PROGRAMS = (*NODE_PROGRAMS, *PYTHON_PROGRAMS, LOUDNESS)
+
+_RATE_HZ = 48_000
+_STEP_S = 0.01
+_LOUDNESS_RANGE_DB = 40.0
+_VOWELS = {"a": "A", "e": "E", "i": "I", "o": "O", "u": "U"}  # names in wLipSync, by viseme
+_NUM_CEPSTRA = 12
+_WINDOW = 1024  # samples at 16 kHz
+_PROFILE = {
+    "targetSampleRate": SAMPLE_RATE_HZ,
+    "sampleCount": _WINDOW,
+    "melFilterBankChannels": 30,
+    "compareMethod": 1,  # Euclidean
+    "mfccNum": _NUM_CEPSTRA,
+    "mfccDataCount": 1,
+    "useStandardization": False,
+    "means": [0.0] * _NUM_CEPSTRA,
+    "stdDevs": [1.0] * _NUM_CEPSTRA,
+}
+
+
+def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
+    """Write ``output/PROGRAM/CLIP.csv`` for the held-out and the training clips of a folder.
+
+    Existing tables stay. Raises UserError if a program is unknown, not installed, or fails.
+    """
+    unknown = {*programs} - {*PROGRAMS}
+    if unknown:
+        raise UserError(f"unknown program: {min(unknown)}; choose from {', '.join(PROGRAMS)}")
+    training = training_clips(read_clips(folder, language=None))
+    clips = [*clips_to_score(folder), *training]
+    for program in track(programs, description="programs", transient=True):
+        tables = output / program
+        tables.mkdir(parents=True, exist_ok=True)
+        missing = [clip for clip in clips if not (tables / f"{clip.name}.csv").exists()]
+        if program == LOUDNESS:
+            for clip in missing:
+                _write_loudness(clip, tables / f"{clip.name}.csv")
+        elif missing:
+            profile = _wlipsync_profile(training) if program == "wlipsync" else None
+            _run(program, missing, tables, profile)
+
+
+def _run(program: str, clips: Sequence[LipClip], tables: Path, profile: Any = None) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        sounds, settings = Path(name) / "sounds", Path(name) / "profile.json"
+        sounds.mkdir()
+        settings.write_text(json.dumps(profile), encoding="utf-8")
+        for clip in clips:
+            sound = resample_poly(clip.samples, _RATE_HZ // SAMPLE_RATE_HZ, 1)
+            sound.astype("<f4").tofile(sounds / f"{clip.name}.f32")
+        arguments = [program, str(sounds), str(tables.resolve())]
+        if program in NODE_PROGRAMS:
+            command = [_node(), "run.js", *arguments, *([str(settings)] if profile else [])]
+        else:
+            command = [str(_installed(".venv/bin/python")), "run.py", *arguments]
+        done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=False)  # noqa: S603
+        if done.returncode:
+            raise UserError(f"{program} failed: {done.stderr[-500:]}")
+
+
+def _node() -> str:
+    _installed("node_modules")
+    beside = Path(sys.executable).parent / "node"
+    node = str(beside) if beside.exists() else shutil.which("node")
+    if node is None:
+        raise UserError("other lip sync needs Node; install it with 'make setup'")
+    return node
+
+
+def _installed(name: str) -> Path:
+    if not (FOLDER / name).exists():
+        raise UserError("other lip sync is not installed; run 'make report'")
+    return FOLDER / name
+
+
+def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:
+    """Return a profile with the mean cepstrum of each viseme, in the middles of its phones."""
+    model = load_model()
+    # wLipSync computes as many coefficients as the profile has phonemes
+    blank = _profile({str(k): np.zeros(_NUM_CEPSTRA) for k in range(_NUM_CEPSTRA)})
+    windows: dict[str, list[Array]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as name:
+        _run("wlipsync", clips, Path(name), blank)
+        for clip in track(clips, description="profile of wLipSync", transient=True):
+            table = read_table(Path(name) / f"{clip.name}.csv")
+            middle_s = table.time_s - _WINDOW / SAMPLE_RATE_HZ / 2.0
+            for phone in label_clip(model, clip):
+                (viseme, share), *_ = model.inventory.visemes[phone.symbol]
+                distance_s = np.abs(middle_s - phone.onset_s - phone.duration_s / 2.0)
+                if share == 1.0:
+                    near = distance_s <= phone.duration_s / 4.0
+                    windows[_VOWELS.get(viseme, viseme)].append(table.values[near, -_NUM_CEPSTRA:])
+    joined = {viseme: np.concatenate(found) for viseme, found in sorted(windows.items())}
+    return _profile({name: found.mean(axis=0) for name, found in joined.items() if len(found)})
+
+
+def _profile(cepstra: dict[str, Array]) -> dict[str, Any]:
+    phonemes = [{"name": name, "values": values.tolist()} for name, values in cepstra.items()]
+    return {**_PROFILE, "mfccs": phonemes}
+
+
+def _write_loudness(clip: LipClip, path: Path) -> None:
+    hop = round(_STEP_S * SAMPLE_RATE_HZ)
+    energy = np.append(0.0, np.cumsum(np.square(clip.samples, dtype=float)))
+    ends = np.arange(0, len(energy), hop)
+    power = (energy[ends] - energy[np.maximum(ends - 2 * hop, 0)]) / (2 * hop)
+    level_db = 10.0 * np.log10(power + 1e-10)
+    share = (level_db - np.percentile(level_db, 95)) / _LOUDNESS_RANGE_DB + 1.0
+    rows = zip(ends / SAMPLE_RATE_HZ, np.clip(share, 0.0, 1.0), strict=True)
+    lines = ["t,opening", *(f"{time_s:.4f},{value:.4f}" for time_s, value in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

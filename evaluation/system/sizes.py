@@ -1,0 +1,95 @@
+"""Sizes of models and messages, and the physical floor of the recognizer's processor time.
+
+The floor is the number of multiplications and additions of the networks in a second of speech,
+divided by the rate of one core. This rate is four times that of a float32 matrix product, because
+the weights have 8 bits. The block network processes its block and its right context in each run,
+the small ear each position once.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from kouxing_client.messages import encode
+from rich.console import Console
+
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.terminal import print_table
+
+_MODELS = Path(__file__).parents[2] / "services" / "recognizer" / "models"
+_SIZE, _MEASURE_S = 512, 0.5
+_POSITIONS_PER_S = 50
+_INT8_SPEED_UP = 4
+_BLOCKS, _EAR = "block network", "small ear"
+_OPERATIONS = 2  # per weight and position
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """Figures of this machine and this version."""
+
+    model_bytes: dict[str, int]
+    frame_bytes: int  # of a message with a face's FAPs
+    gemm_gflops: float  # of one core, float32
+    network_gflop_per_s: dict[str, float]  # per second of speech
+
+    def floor_cores(self, hop: int = 1) -> float:
+        """Return the cores that the networks would need at the highest rate of products.
+
+        The block network runs once in ``hop`` blocks, 4 under load.
+        """
+        gflop = self.network_gflop_per_s[_BLOCKS] / hop + self.network_gflop_per_s[_EAR]
+        return gflop / (_INT8_SPEED_UP * self.gemm_gflops)
+
+
+def measure() -> Sizes:
+    """Measure sizes and the rate of the matrix product."""
+    blocks = load_model("blocks")
+    assert isinstance(blocks, BlockModel)  # noqa: S101 - the file of this name is one
+    sizes = blocks.session.sizes
+    ear_bytes = len(np.load(_MODELS / "ear.npz", allow_pickle=False)["network"])
+    weighted_positions = {  # weights are bytes; positions per second of speech
+        _BLOCKS: len(blocks.network) * sizes.length * _POSITIONS_PER_S / sizes.block,
+        _EAR: ear_bytes * _POSITIONS_PER_S,
+    }
+    return Sizes(
+        model_bytes={path.stem: path.stat().st_size for path in sorted(_MODELS.glob("*.npz"))},
+        frame_bytes=sum(map(len, _frame_message())),
+        gemm_gflops=_gemm_gflops(),
+        network_gflop_per_s={
+            name: _OPERATIONS * number / 1e9 for name, number in weighted_positions.items()
+        },
+    )
+
+
+def _frame_message() -> list[bytes]:
+    fields = {"values": bytes(4 * NUM_FAPS), "mask": bytes(9), "media_time": 16_000_000, "epoch": 1}
+    return encode("fap-frame", "session-1", fields)
+
+
+def _gemm_gflops() -> float:
+    matrix = np.ones((_SIZE, _SIZE), np.float32)
+    (matrix @ matrix).sum()  # warm up
+    start_s, num = time.process_time(), 0
+    while time.process_time() - start_s < _MEASURE_S:
+        _ = matrix @ matrix
+        num += 1
+    return _OPERATIONS * num * _SIZE**3 / (time.process_time() - start_s) / 1e9
+
+
+def show(sizes: Sizes, console: Console) -> None:
+    """Print the figures as a table."""
+    rows = [(f"model {name}", f"{size / 1e6:.2f} MB") for name, size in sizes.model_bytes.items()]
+    rows += [
+        (f"{name}, per second of speech", f"{gflop:.1f} Gflop")
+        for name, gflop in sizes.network_gflop_per_s.items()
+    ]
+    rows += [
+        ("message with a FAP frame", f"{sizes.frame_bytes} bytes"),
+        ("matrix product, one core", f"{sizes.gemm_gflops:.0f} Gflop/s"),
+        ("floor of both networks", f"{sizes.floor_cores():.2f} cores"),
+    ]
+    print_table(console, "", ("figure", "value"), rows)

@@ -1,0 +1,138 @@
+"""The report: which steps run, what their files contain, and the page that they make."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from kouxing.corpora.figures import new_figure
+from kouxing.evaluation.commands import app
+from kouxing.evaluation.report import lip_tables, run
+from kouxing.evaluation.report.markdown import markdown
+from kouxing.evaluation.report.page import TABLES, write_page
+from kouxing.evaluation.report.run import run_steps, write_result
+from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.shared.errors import UserError
+
+SCORES = {"r_opening": 0.5, "closure_f1": 0.6, "mtm_ms": 50.0, "closure_precision": 0.7}
+BETTER = {"r_opening": 0.7, "closure_f1": 0.4, "mtm_ms": 40.0, "closure_precision": 0.7}
+
+
+def faces(**by_title: dict[str, float]) -> dict[str, Any]:
+    return {title: {"clean": {"all": scores}} for title, scores in by_title.items()}
+
+
+def rivals() -> dict[str, Any]:
+    return faces(real={}) | {
+        "learnt, 60 ms": {"clean": {"all": SCORES}},
+        "wawa, fitted, 100 ms": {"clean": {"all": BETTER}},
+        "dynamic-visemes, 160 ms": {"clean": {"all": BETTER | {"r_opening": 0.9}}},
+    }
+
+
+def step_file(result: Any) -> dict[str, Any]:
+    about = {"machine": "m", "date": "2026-01-01", "commit": "c", "load": 0.5, "seconds": 3}
+    return {"commands": ["kouxing x"], **about, "code": "1", "result": result}
+
+
+def test_every_step_names_code_that_exists_and_a_command() -> None:
+    for step in STEPS.values():
+        assert all([*ROOT.glob(pattern)] for pattern in step.code)
+        for command in (*step.commands, *(step.quick or ())):
+            group = {"evaluate": app}.get(command.split()[0])
+            assert group is None or command.split()[1] in {
+                c.name or c.callback.__name__ for c in group.registered_commands if c.callback
+            }
+    assert {name for part in TABLES.values() for name in part.steps} | {"lips"} == {*STEPS}
+
+
+def test_the_page_has_at_most_ten_tables() -> None:
+    assert len(TABLES) <= 10
+
+
+def test_a_step_runs_only_if_its_code_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = tmp_path / "code.py"
+    code.write_text("1")
+    monkeypatch.setattr(f"{run.__name__}.ROOT", tmp_path)
+    monkeypatch.setitem(STEPS, "mine", Step(("bench {data}",), ("code.py",)))
+    commands: list[list[str]] = []
+
+    def measure(command: list[str], **_: object) -> Any:
+        commands.append(command)
+        if "--json" in command:
+            Path(command[-1]).write_text(json.dumps({"r": 0.123456789, "speaker ann": 1}))
+        return type("Done", (), {"returncode": 0, "stdout": "abc"})
+
+    monkeypatch.setattr("subprocess.run", measure)
+    options = {"is_quick": False, "is_fresh": False}
+
+    def run_mine(**changed: Any) -> int:
+        commands.clear()
+        assert run_steps(["mine"], {"data": Path("/d")}, tmp_path, **options | changed) == []
+        return sum(sys.executable in command for command in commands)
+
+    assert run_mine() == 1
+    assert ["kouxing", "bench", "/d"] in [command[2:5] for command in commands]
+    stored = json.loads((tmp_path / "mine.json").read_text())
+    assert stored["result"] == {"r": 0.12346}
+    assert stored["commands"] == ["kouxing bench data"]
+    assert stored["commit"] == "abc"
+    assert run_mine() == 0
+    assert run_mine(is_fresh=True) == 1
+    code.write_text("2")
+    assert run_mine() == 1
+    assert run_steps(["mine"], {"data": None}, tmp_path, **options) == []  # left out without data
+
+
+def test_a_failed_step_is_reported_and_leaves_the_old_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_result(tmp_path / "sizes.json", step_file({"old": 1}))
+    failed = type("Done", (), {"returncode": 1, "stdout": ""})
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: failed)
+    assert run_steps(["sizes"], {}, tmp_path, is_quick=False, is_fresh=False) == ["sizes"]
+    assert json.loads((tmp_path / "sizes.json").read_text())["result"] == {"old": 1}
+
+
+def test_an_unknown_step_is_an_error() -> None:
+    with pytest.raises(UserError, match="no step 'fautls'; choose from read,"):
+        CliRunner().invoke(app, ["report", "fautls"], catch_exceptions=False)
+
+
+def test_the_page_starts_with_what_others_do_better() -> None:
+    assert lip_tables.better_programs({"rivals": rivals()}) == [
+        "all clips: wawa-lipsync 0.0.2, fitted, 100 ms has a better correlation of the opening"
+        " (0.70 and 0.50)",
+        "all clips: wawa-lipsync 0.0.2, fitted, 100 ms has a better MTM (40 ms and 50 ms)",
+    ]
+
+
+def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
+    try:
+        new_figure(1.0, 1.0)
+    except UserError:
+        pytest.skip("matplotlib is not installed")
+    results = {
+        "rivals": rivals(),
+        "lookahead": faces(**{"learnt, 0 ms": SCORES, "learnt, 60 ms": BETTER}),
+    }
+    for name, result in results.items():
+        write_result(tmp_path / "results" / f"{name}.json", step_file(result))
+    page = tmp_path / "results.md"
+    write_page(tmp_path / "results", page)
+    text = page.read_text("utf-8")
+    assert "[[" not in text
+    assert "| **learnt**, 60 ms |" in text
+    assert "| learnt, r | 0.50 | 0.70 |" in text
+    assert "`kouxing x`: m, 2026-01-01, commit c, 3 s, load 0.5" in text
+    assert 'make report STEPS="faults"' in text
+    assert (tmp_path / "lookahead.png").stat().st_size > 1000
+
+
+def test_markdown_table() -> None:
+    assert markdown((("a", "b"), [["1", "2"]])) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
