@@ -29,6 +29,19 @@ def test_catmull_clark_of_a_cube() -> None:
     np.testing.assert_allclose(sorted(np.abs(fine[-1])), [0, 0, 1])
 
 
+def test_strands_are_subdivided_across_the_seams_of_their_texture() -> None:
+    corners = CUBE_QUADS.ravel()  # each face has its own texture and vertices
+    own = np.arange(24).reshape(6, 4)
+    uv = np.tile([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], (6, 1))
+    welds = np.array([np.flatnonzero(corners == corner)[0] for corner in corners])
+    points, quads, fine_uv, fine_welds = subdivision.smooth_strands(CUBE[corners], own, uv, welds)
+    matrix, expected = subdivision.catmull_clark(CUBE_QUADS, 8)
+    np.testing.assert_allclose(points[quads], (matrix @ CUBE)[expected])
+    np.testing.assert_allclose(np.ptp(fine_uv[quads], axis=1), 0.5)  # a quarter of the texture
+    np.testing.assert_array_equal(points[fine_welds], points)
+    assert len(np.unique(fine_welds)) == 8 + 12 + 6
+
+
 OBJ = """v 0 0 0
 v 1 0 0
 v 1 1 0

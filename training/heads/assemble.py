@@ -53,8 +53,9 @@ _PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
 _HAIR_TEXTURES = {"afro01": "afro"}
 # styles with a fringe over the right eye, and its distance from the head's axis at the side, dm
 _FRINGES = {"bob01": 0.73, "bob02": 0.73, "short03": 0.69}
+_COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
 _SWEEP = 0.62  # share of the angle to the right ear by which it is turned
-_BROW_RAISE = 0.018  # of their inner ends, dm
+_BROW_RAISE = 0.006  # of their inner ends, dm
 _HAIR_HEIGHT = 0.45  # above the scalp, dm
 _LASH_COLOR = (0.09, 0.07, 0.065)
 
@@ -212,12 +213,14 @@ class Builder:
         points = hair.fit(vertices)
         if person.hair in _FRINGES:
             points = self._swept_aside(points, vertices, _FRINGES[person.hair])
-        middle = points[hair.triangles].mean(axis=1) - PIVOT
+        quads, uv, welds = hair.quads, hair.uv, hair.welds
+        if len(quads) < _COARSE_HAIR:
+            points, quads, uv, welds = subdivision.smooth_strands(points, quads, uv, welds)
+        triangles = subdivision.triangles_of(quads)
+        middle = points[triangles].mean(axis=1) - PIVOT
         order = np.argsort(np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2])
-        color = textures.tint(person.look.hair)
-        part = parts.Geometry(
-            points, hair.triangles[order], hair.uv, np.tile(color, (len(points), 1)), hair.welds
-        )
+        color = np.tile(textures.tint(person.look.hair), (len(points), 1))
+        part = parts.Geometry(points, triangles[order], uv, color, welds)
         return HeadPiece("hair", part, "hair", 0.6, np.ones(len(points)))
 
     def _swept_aside(self, points: Float, vertices: Float, width: float) -> Float:

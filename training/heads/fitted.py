@@ -32,6 +32,12 @@ class Fitted:
     offsets: Float  # (V, 3), relative to the scale
     scale: Float  # (3, 3): for each axis two vertices of the base mesh, and their distance, dm
 
+    @property
+    def quads(self) -> Index:
+        """Quads (F / 2, 4), for a mesh of quads only, such as hair."""
+        first, second = np.split(self.triangles, 2)
+        return np.column_stack([first, second[:, 2]])
+
     def fit(self, vertices: Float) -> Float:
         """Return the vertices (V, 3) on a shape (19158, 3) of the base mesh, dm."""
         first, second = self.scale[:, 0].astype(int), self.scale[:, 1].astype(int)

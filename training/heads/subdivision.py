@@ -65,6 +65,28 @@ def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, In
     return matrix, fine
 
 
+def smooth_strands(
+    points: Float, quads: Index, uv: Float, welds: Index
+) -> tuple[Float, Index, Float, Index]:
+    """Subdivide a textured mesh (V, 3) once, across the seams of its texture.
+
+    Returns points (W, 3), quads (4 F, 4), texture coordinates (W, 2), and ``welds`` (W,): the first
+    vertex at the same position.
+    """
+    used, joined = np.unique(welds[quads], return_inverse=True)
+    matrix, fine = catmull_clark(joined.reshape(-1, 4), len(used))
+    corners = uv[quads]
+    after = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
+    before = np.roll(after, 1, axis=1)
+    fine_uv = np.stack([corners, after, middle, before], axis=2).reshape(-1, 2)
+    table = np.column_stack([fine.ravel(), np.round(fine_uv, 6)])
+    rows, vertices = np.unique(table, axis=0, return_inverse=True)
+    position = rows[:, 0].astype(int)
+    _, first, same = np.unique(position, return_index=True, return_inverse=True)
+    return (matrix @ points[used])[position], vertices.reshape(-1, 4), rows[:, 1:], first[same]
+
+
 def _incidence(rows: Index, columns: Index, shape: tuple[int, int]) -> sparse.csr_array:
     return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape)
 

@@ -58,7 +58,7 @@ def encode(image: Float) -> bytes:
 def strands(texture: Float, contrast: float) -> Float:
     """Make a hair texture (H, W, 4) gray with the mean ``GRAY``; return (H, W, 2) with alpha."""
     opaque = texture[..., 3]
-    alpha = ndimage.grey_closing(opaque, (5, 5))  # the scalp would shine through gaps
+    alpha = ndimage.grey_closing(opaque, (15, 15))  # the scalp would shine through gaps
     light = texture[..., :3].mean(axis=2)
     usual = np.average(light, weights=opaque)
     gray = np.clip(GRAY * (light / usual) ** contrast, 0, 1)

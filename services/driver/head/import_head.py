@@ -298,7 +298,7 @@ class _Import:
             elif (
                 np.abs(middle[0] - lips[0]) < 0.6 * fapu["MW"]
                 and high[2] < lips[2] + 0.1 * fapu["ES"]
-                and low[2] > lips[2] - 1.6 * fapu["ES"]
+                and low[2] > lips[2] - 1.8 * fapu["ES"]
                 and size[0] < 1.5 * fapu["MW"]
                 and low[1] > chin[1]
                 and high[1] < lips[1] + 1.5 * fapu["MNS"]

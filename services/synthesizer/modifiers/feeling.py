@@ -56,9 +56,8 @@ _PLEASANT = _faps(
 _UNPLEASANT = _faps(
     raise_S_cornerlip=-60.0,
     raise_S_cornerlip_o=-60.0,
-    raise_S_i_eyebrow=25.0,
-    squeeze_S_eyebrow=45.0,
-    raise_S_o_eyebrow=-20.0,
+    squeeze_S_eyebrow=35.0,
+    raise_S_o_eyebrow=-10.0,
 )
 
 
