@@ -6,7 +6,7 @@ Python) and OpenFaceFX process whole recordings. All have their default settings
 installs them.
 
 wLipSync needs a profile, which its users make from their own voice. Here it is the mean cepstrum of
-each viseme in the training clips. Loudness is the level of the last 20 ms, from 40 dB below the
+each viseme in a quarter of the training clips. Loudness is the level of the last 20 ms, from 40 dB below the
 loudest frames of the recording (0) to these (1).
 """
 
@@ -50,6 +50,7 @@ _STEP_S = 0.01
 _LOUDNESS_RANGE_DB = 40.0
 _VOWELS = {"a": "A", "e": "E", "i": "I", "o": "O", "u": "U"}  # names in wLipSync, by viseme
 _NUM_CEPSTRA = 12
+_PROFILE_EVERY = 4  # training clips, because means need few
 _WINDOW = 1024  # samples at 16 kHz
 _PROFILE = {
     "targetSampleRate": SAMPLE_RATE_HZ,
@@ -82,7 +83,7 @@ def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
             for clip in missing:
                 _write_loudness(clip, tables / f"{clip.name}.csv")
         elif missing:
-            profile = _wlipsync_profile(training) if program == "wlipsync" else None
+            profile = _wlipsync_profile(training[::_PROFILE_EVERY]) if program == "wlipsync" else None
             _run(program, missing, tables, profile)
 
 
