@@ -6,8 +6,8 @@ Python) and OpenFaceFX process whole recordings. All have their default settings
 installs them.
 
 wLipSync needs a profile, which its users make from their own voice. Here it is the mean cepstrum of
-each viseme in a quarter of the training clips. Loudness is the level of the last 20 ms, from 40 dB below the
-loudest frames of the recording (0) to these (1).
+each viseme in a quarter of the training clips. Loudness is the level of the last 20 ms, from 40 dB
+below the loudest frames of the recording (0) to these (1).
 """
 
 import json
@@ -83,7 +83,8 @@ def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
             for clip in missing:
                 _write_loudness(clip, tables / f"{clip.name}.csv")
         elif missing:
-            profile = _wlipsync_profile(training[::_PROFILE_EVERY]) if program == "wlipsync" else None
+            is_profiled = program == "wlipsync"
+            profile = _wlipsync_profile(training[::_PROFILE_EVERY]) if is_profiled else None
             _run(program, missing, tables, profile)
 
 
