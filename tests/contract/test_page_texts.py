@@ -4,12 +4,14 @@ import ast
 import re
 from collections.abc import Iterator
 
+from kouxing.shared.wire.session import ErrorCode
 from tests.system import ROOT
 
-PAGE_TEXTS = ROOT / "services" / "gateway" / "page" / "gateway-texts.js"
+PAGE = ROOT / "services" / "gateway" / "page"
+PAGE_TEXTS = PAGE / "gateway-texts.js"
 SOURCES = (
     *("shared/audio_file.py", "shared/media_file.py", "shared/sound_formats.py"),
-    *("shared/channels.py", "services/gateway/sound_upload.py"),
+    *("shared/channels.py", "shared/wav_parts.py", "services/gateway/sound_upload.py"),
     *("services/gateway/uploads.py", "services/gateway/learn_mouth.py"),
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),
@@ -62,3 +64,8 @@ def test_the_page_translates_all_texts_of_the_gateway() -> None:
         key for key in translated if any(part.strip() not in everything for part in key.split("{}"))
     }
     assert not unknown, "these texts no longer exist"
+
+
+def test_the_page_has_a_text_for_each_error_of_control() -> None:
+    texts = (PAGE / "texts.js").read_text("utf-8")
+    assert {*re.findall(r'^  "error\.(.+?)": \{', texts, re.MULTILINE)} == {*ErrorCode}

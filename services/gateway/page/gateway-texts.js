@@ -28,8 +28,8 @@ const CHINESE = {
     "有 {count} 条音轨：{tracks}。现在播放第 {track} 条；其他音轨可用 kouxing speak --track 播放",
   "the file is cut off after {read} s of {whole} s": "文件不完整：只有 {read} 秒，应有 {whole} 秒",
   "the file is cut off after {read} s": "文件不完整：只有 {read} 秒",
-  "joined WAV files; convert each part alone, or join them as 16-bit":
-    "文件由多个 WAV 拼接而成；请分别转换各部分，或以 16 位格式拼接",
+  "the file has several parts of sound; convert each alone": "文件里有几段声音，请分别转换",
+  "the encoding of the sound changes; convert each part alone": "声音的编码中途改变，请分别转换",
   "the file cannot be read after {read} s; export it again": "{read} 秒之后无法读取，请重新导出",
   "cannot be read to its end: {reason}": "无法读到结尾，请重新导出",
   "damaged near {place} s; the damaged part is silent": "{place} 秒附近已损坏，损坏部分无声",
