@@ -3,6 +3,8 @@
 import difflib
 import json
 import subprocess
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,13 @@ RATE_HZ = 16_000
 DELAY_S, FRAME_RATE_HZ, EXPRESSIVENESS, FEELING = 0.06, 50.0, 1.4, 0.5
 HEAD_TURN = slice(47, 50)  # FAPs 48 to 50
 TONGUE = [13, 43, 44, 45, 46]  # FAPs 14, and 44 to 47: jaw thrust and tongue
+FILES = [
+    *(
+        DEMO / f"{name}.wav"
+        for name in ("hello-male", "bilabials-female", "lake-male", "fast-female")
+    ),
+    VOWELS_FILE,
+]
 Frames = NDArray[np.float32]
 
 
@@ -51,9 +60,17 @@ def package_output(models: Path, samples: Frames, **options: Any) -> dict[str, A
     return output
 
 
+def faps_of(output: dict[str, Any]) -> Frames:
+    return np.array([frame["faps"] for frame in output["frames"]], np.float32)
+
+
 def package_faps(models: Path, samples: Frames, **options: Any) -> Frames:
-    frames = package_output(models, samples, **options)["frames"]
-    return np.array([frame["faps"] for frame in frames], np.float32)
+    return faps_of(package_output(models, samples, **options))
+
+
+@cache
+def output_of(models: Path, file: Path) -> dict[str, Any]:
+    return package_output(models, read(file))
 
 
 def server_events(samples: Frames) -> list[SoundEvent]:
@@ -61,7 +78,7 @@ def server_events(samples: Frames) -> list[SoundEvent]:
     return sound_events(load_model("light"), samples, load_lip_predictor(), DELAY_S, config)
 
 
-def server_faps(samples: Frames, *, phones: bool = True) -> Frames:
+def server_faps(events: Sequence[SoundEvent]) -> Frames:
     """Return the server's frames without idle motion and tongue."""
     face = FaceAnimator(
         load_lip_model(),
@@ -70,14 +87,9 @@ def server_faps(samples: Frames, *, phones: bool = True) -> Frames:
         expressiveness=EXPRESSIVENESS,
         feeling=FEELING,
     )
-    events = [e for e in server_events(samples) if phones or not isinstance(e, Phone)]
     faps = np.array([frame for event in events for _, frame in face.process(event)])
     faps[:, TONGUE] = 0.0
     return faps
-
-
-def labels(phones: list[dict[str, Any]]) -> list[str]:
-    return [p["symbol"] for p in phones if p["isFinal"] and p["durationS"] > 0]
 
 
 def read(path: Path) -> Frames:
@@ -100,36 +112,18 @@ def assert_equal(ours: Frames, theirs: Frames) -> None:
     assert np.corrcoef(opening(ours), opening(theirs))[0, 1] > 0.999
 
 
-@pytest.mark.parametrize(
-    "file", [DEMO / "hello-male.wav", DEMO / "bilabials-female.wav", VOWELS_FILE]
-)
-def test_frames_equal_the_servers(models: Path, file: Path) -> None:
-    samples = read(file)
-    assert_equal(package_faps(models, samples), server_faps(samples))
-
-
-def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
-    speech, other = read(DEMO / "lake-male.wav"), read(DEMO / "fast-female.wav")
-    samples = np.concatenate([np.zeros(7001, np.float32), 0.1 * speech, np.zeros(20_000), other])
-    assert_equal(package_faps(models, samples), server_faps(samples.astype(np.float32)))
-
-
-def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
-    samples = read(DEMO / "bilabials-female.wav")
-    assert_equal(package_faps(models, samples, phones=False), server_faps(samples, phones=False))
-
-
-@pytest.mark.parametrize("name", ["hello-female", "hello-male", "lake-male", "fast-female"])
-def test_phones_equal_those_of_the_light_model(models: Path, name: str) -> None:
-    samples = read(DEMO / f"{name}.wav")
-    ours = package_output(models, samples)["phones"]
-    theirs = [event for event in server_events(samples) if isinstance(event, Phone)]
-    final = [phone for phone in theirs if phone.final and phone.duration_s > 0]
-    different = edit_distance(labels(ours), [phone.symbol for phone in final])
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_frames_and_phones_equal_the_servers(models: Path, file: Path) -> None:
+    output = output_of(models, file)
+    events = server_events(read(file))
+    assert_equal(faps_of(output), server_faps(events))
+    ours = [p for p in output["phones"] if p["isFinal"] and p["durationS"] > 0]
+    theirs = [e for e in events if isinstance(e, Phone) and e.final and e.duration_s > 0]
+    different = edit_distance([p["symbol"] for p in ours], [phone.symbol for phone in theirs])
     assert different <= 1  # rounding can decide between two phones
     if different == 0:
-        onsets_s = [p["onsetS"] for p in ours if p["isFinal"] and p["durationS"] > 0]
-        assert onsets_s == pytest.approx([phone.onset_s for phone in final], abs=0.05)
+        onsets_s = [p["onsetS"] for p in ours]
+        assert onsets_s == pytest.approx([phone.onset_s for phone in theirs], abs=0.05)
 
 
 def edit_distance(ours: list[str], theirs: list[str]) -> int:
@@ -137,21 +131,36 @@ def edit_distance(ours: list[str], theirs: list[str]) -> int:
     return max(len(ours), len(theirs)) - sum(block.size for block in matcher.get_matching_blocks())
 
 
+def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
+    speech, other = read(DEMO / "lake-male.wav"), read(DEMO / "fast-female.wav")
+    samples = np.concatenate([np.zeros(7001, np.float32), 0.1 * speech, np.zeros(20_000), other])
+    assert_equal(
+        package_faps(models, samples), server_faps(server_events(samples.astype(np.float32)))
+    )
+
+
+def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
+    samples = read(DEMO / "bilabials-female.wav")
+    without = [event for event in server_events(samples) if not isinstance(event, Phone)]
+    assert_equal(package_faps(models, samples, phones=False), server_faps(without))
+
+
 def test_sound_at_48_khz(models: Path) -> None:
     samples = read(DEMO / "hello-female.wav")
     resampled = soxr.resample(samples, RATE_HZ, 48_000)
     ours = package_faps(models, resampled, sampleRateHz=48_000)
-    assert_equal(ours, server_faps(to_16_khz(resampled, 48_000)))
+    assert_equal(ours, server_faps(server_events(to_16_khz(resampled, 48_000))))
 
 
 def test_any_chunks_give_the_same_frames(models: Path) -> None:
-    samples = read(DEMO / "lake-male.wav")
-    whole = package_faps(models, samples, chunk=len(samples))
-    assert np.array_equal(whole, package_faps(models, samples, chunk=97))
+    file = DEMO / "lake-male.wav"
+    assert np.array_equal(
+        faps_of(output_of(models, file)), package_faps(models, read(file), chunk=97)
+    )
 
 
 def test_weights_equal_the_servers(models: Path) -> None:
-    output = package_output(models, read(DEMO / "bilabials-female.wav"))
+    output = output_of(models, DEMO / "bilabials-female.wav")
     for name, shapes in SHAPE_SETS.items():
         assert output["names"][name] == list(shapes.names)
         for frame in output["frames"]:
