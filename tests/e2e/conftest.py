@@ -1,14 +1,36 @@
-"""A client of the running system, and another session that no test may disturb."""
+"""A client of the running system, commands, and a session that no test may disturb."""
 
+import sys
 from collections.abc import Iterator
 
 import pytest
 from kouxing_client import Client, Session
 
+from kouxing.services.cli.main import main
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import user_key
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System, wait_until
+
+
+class Command:
+    """Runs commands in this process."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, capture: pytest.CaptureFixture[str]) -> None:
+        patch.setenv("COLUMNS", "200")
+        self._patch, self._capture = patch, capture
+
+    def __call__(self, *arguments: object) -> tuple[int | str | None, str, str]:
+        """Return the exit status and what the command prints on stdout and stderr."""
+        self._patch.setattr(sys, "argv", ["kouxing", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *self._capture.readouterr()
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(monkeypatch, capsys)
 
 
 @pytest.fixture

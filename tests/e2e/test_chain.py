@@ -28,6 +28,7 @@ from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
+from tests.e2e.conftest import Command
 from tests.e2e.following import Stream, samples_of_file, stream
 from tests.lips import LIPS
 from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, kouxing, start_python
@@ -273,8 +274,13 @@ def test_phones_and_render_return_them(
 
 
 def test_speak_and_listen_return_them(
-    system: System, recordings: list[Path], expected: dict[str, list[events.Phone]]
+    system: System,
+    command: Command,
+    recordings: list[Path],
+    expected: dict[str, list[events.Phone]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("KOUXING_CONTROL", system.control.partition(" ")[0])
     for number, path in enumerate(recordings):
         name = f"same-{number}"
         listener = start_python(
@@ -284,8 +290,8 @@ def test_speak_and_listen_return_them(
         assert name in listener.stderr.readline()
         pace = ["--fast"] if number else []
         phones = spoken(expected[path.name])
-        said = kouxing("speak", path, "--session", name, *pace, control=system.control)
-        assert f"session {name}: {len(phones)} phones in" in said.stderr
+        _, _, said = command("speak", path, "--session", name, *pace)
+        assert f"session {name}: {len(phones)} phones in" in said
         output, log = listener.communicate(timeout=LIMIT_S)
         assert f"session {name} ended: {len(phones)} phones" in log
         assert output.splitlines() == [line(phone) for phone in phones]

@@ -16,10 +16,10 @@ import pytest
 import soundfile
 from kouxing_client import Client, FapFrame, Refused
 
-from kouxing.services.cli.main import main
 from kouxing.services.kinds import KINDS
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
+from tests.e2e.conftest import Command
 from tests.e2e.following import Stream, samples_of_file
 from tests.receivers import read_osc
 from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
@@ -27,28 +27,10 @@ from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_pyth
 SENTENCE = VOWELS_FILE
 
 
-class Command:
-    """Runs commands in this process."""
-
-    def __init__(
-        self, system: System, patch: pytest.MonkeyPatch, capture: pytest.CaptureFixture[str]
-    ) -> None:
-        patch.setenv("KOUXING_CONTROL", system.control.partition(" ")[0])
-        self._patch, self._capture = patch, capture
-
-    def __call__(self, *arguments: object) -> tuple[int | str | None, str, str]:
-        """Return the exit status and what the command prints on stdout and stderr."""
-        self._patch.setattr(sys, "argv", ["kouxing", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, *self._capture.readouterr()
-
-
 @pytest.fixture
-def command(
-    system: System, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Command:
-    return Command(system, monkeypatch, capsys)
+def command(system: System, command: Command, monkeypatch: pytest.MonkeyPatch) -> Command:
+    monkeypatch.setenv("KOUXING_CONTROL", system.control.partition(" ")[0])
+    return command
 
 
 @pytest.mark.parametrize(("scale", "word"), [(0.0, "it is silent"), (30.0, "clipped")])

@@ -140,7 +140,7 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
         key_folder().mkdir(mode=0o700)
         (tmp_path / "laptop.key").rename(key_folder() / "client.key")
         key = find_key()
-    with Client(system.control, key=key, timeout_s=10.0) as made:
+    with Client(system.control, key=key, timeout_s=5.0) as made:
         yield made
     with contextlib.suppress(UserError):  # revoked already
         revoke_key("laptop")

@@ -15,7 +15,9 @@ from pathlib import Path
 import av
 import pytest
 
+from tests.e2e.conftest import Command
 from tests.system import (
+    CHEAP,
     LIMIT_S,
     ONE_THREAD,
     ROOT,
@@ -59,8 +61,10 @@ def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
         assert sum(1 for _ in film.decode(video=0)) >= 2.2 * 25
 
 
-def test_runs_on_free_ports_until_it_is_interrupted(tmp_path: Path) -> None:
-    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
+def test_runs_on_free_ports_until_it_is_interrupted(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path), **CHEAP}
     options = ["--set", "driver.view=none", "--set", f"driver.out={tmp_path}", "--no-browser"]
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # another program uses it, which has the same effect
@@ -79,9 +83,10 @@ def test_runs_on_free_ports_until_it_is_interrupted(tmp_path: Path) -> None:
         port = re.findall(r"the face is at http://127.0.0.1:(\d+)\n", log)[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert "kouxing" in answer.read().decode()
-        spoken = kouxing("speak", SENTENCE, environment=environment)
-        assert spoken.returncode == 0, spoken.stderr
-        shown = kouxing("status", environment=environment).stdout
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        status, _, said = command("speak", SENTENCE)
+        assert status == 0, said
+        _, shown, _ = command("status")
         assert (len(re.findall("recognizer-", shown)), len(re.findall("driver-", shown))) == (2, 1)
         running.send_signal(signal.SIGINT)
         _, rest = running.communicate(timeout=LIMIT_S)
@@ -110,17 +115,21 @@ def test_reports_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     ],
 )
 def test_reports_a_mistake_before_anything_starts(
-    tmp_path: Path, arguments: list[str], word: str
+    command: Command, arguments: list[str], word: str
 ) -> None:
-    result = kouxing("run", *arguments, environment=own_environment(tmp_path))
-    assert result.returncode == 2
-    assert result.stderr.startswith("kouxing: ")
-    assert word in result.stderr
+    status, _, log = command("run", *arguments)
+    assert (status, log.startswith("kouxing: ")) == (2, True), log
+    assert word in log
 
 
 def interrupt(arguments: list[str], folder: Path, is_due: Callable[[], object]) -> tuple[int, str]:
     """Press Ctrl-C when it is due; return the command's status and what it printed."""
-    environment = {**ONE_THREAD, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(folder)}
+    environment = {
+        **ONE_THREAD,
+        **CHEAP,
+        "PYTHONPATH": str(ROOT),
+        "XDG_RUNTIME_DIR": str(folder),
+    }
     with subprocess.Popen(
         [sys.executable, "-c", COMMAND, *arguments],
         env=os.environ | environment,
