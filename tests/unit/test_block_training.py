@@ -92,6 +92,8 @@ def test_batches_of_a_step_have_one_shape_and_can_be_drawn_again() -> None:
     step = [block_batch(material, 3, number) for number in range(8, 16)]
     assert len({(one.frames.shape, one.block, one.start) for one in step}) == 1
     assert not np.array_equal(step[0].frames, step[1].frames)
+    states = step[0].states.reshape(len(step[0].states), -1)
+    assert (np.diff(states) < 0).mean() < 0.05, "frames are in order, except where a recording ends"
     again = block_batch(material, 3, 8)
     for name in ("frames", "clean", "states", "probs"):
         array = getattr(step[0], name)
