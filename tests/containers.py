@@ -1,8 +1,7 @@
-"""Containers without an engine: a process with what a container would have, and no more.
+"""Containers without an engine: processes with the isolation that a container would have.
 
-It has a network and a file system of its own that can only be read, but for ``/tmp``; the
-environment, secrets and hosts that its description names; and a user without rights, except to
-read this machine's Python.
+Each has a network namespace and a file system that is read-only except for ``/tmp``. It gets the
+environment, secrets and hosts of its description. Its user may only read this machine's Python.
 """
 
 import contextlib
@@ -73,9 +72,9 @@ class Containers:
     Parameters
     ----------
     network
-        Has a host for each of them.
+        Has a host for each container.
     names
-        Names by which they find others, and the hosts that bear them.
+        Host names that resolve inside the containers, and the hosts that they lead to.
     """
 
     def __init__(self, folder: Path, network: Network, names: Mapping[str, str]) -> None:
@@ -97,7 +96,7 @@ class Containers:
     ) -> subprocess.Popen[bytes]:
         """Start ``kouxing`` with arguments in a container on a host; its output is in a log.
 
-        Instead of secrets it may have a folder of keys, ``mounted`` somewhere.
+        ``mounted`` is a folder of keys and its path in the container; it replaces the secrets.
         """
         folder, target = mounted or (self._folder / f"{host}-secrets", "")
         if not mounted:
@@ -121,7 +120,7 @@ class Containers:
             )
 
     def log(self, host: str) -> Path:
-        """Return where the output of a container is."""
+        """Return the log of a container."""
         return self._folder / f"{host}.log"
 
     def is_healthy(self, host: str, check: Sequence[str]) -> bool:

@@ -1,4 +1,4 @@
-"""Programs that stand in documents, so that the tests run what readers copy."""
+"""Programs in documents; tests run the code that readers copy."""
 
 import re
 import textwrap
@@ -6,6 +6,6 @@ from pathlib import Path
 
 
 def code_blocks(document: Path, language: str) -> list[str]:
-    """Return the blocks of code in a language, also those within a list."""
+    """Return the blocks of code in a language, including those in lists."""
     blocks = re.findall(rf"```{language}\n(.*?)```", document.read_text("utf-8"), re.DOTALL)
     return [textwrap.dedent(block) for block in blocks]

@@ -1,4 +1,4 @@
-"""Bytes that are nothing, for a port of any kind: ZeroMQ's, http, WebSockets."""
+"""Invalid bytes for ports of any kind: ZeroMQ, HTTP, WebSockets."""
 
 import contextlib
 import socket
@@ -9,7 +9,7 @@ from kouxing.evaluation.system import attackers
 
 
 def pour(port: int, seconds: float) -> None:
-    """Send what no peer says over many connections, the same every time."""
+    """Send invalid bytes over many connections, the same ones in every run."""
     random = Random(1)  # noqa: S311
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
@@ -23,18 +23,18 @@ def pour(port: int, seconds: float) -> None:
 
 
 def answer_handshake(listener: socket.socket, curve: bool, rest: bytes) -> None:
-    """Answer a ZeroMQ socket as another program or one of other keys would, and leave the port."""
+    """Answer a ZeroMQ socket like another program or one with other keys, then free the port."""
     greeting = attackers.GREETING
     if curve:
         greeting = greeting[:12] + b"CURVE".ljust(20, b"\0") + greeting[32:]
     with listener, listener.accept()[0] as connection, contextlib.suppress(OSError):
         connection.sendall(greeting + rest)
-        while connection.recv(1000):  # until it is given up
+        while connection.recv(1000):  # until the peer gives up
             pass
 
 
 def _nonsense(random: Random) -> bytes:
-    """Return random bytes after a beginning that some peer might say."""
+    """Return random bytes after the first bytes of a valid message."""
     beginnings = [
         b"",
         attackers.GREETING,

@@ -1,4 +1,4 @@
-"""Running services for tests: real processes, real sockets, and ports of their own."""
+"""Running services for tests: real processes, real sockets, reserved ports."""
 
 import contextlib
 import io

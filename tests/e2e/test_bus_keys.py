@@ -177,7 +177,7 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
 
 
 class Recognizer(Service):
-    """A service of which nothing is wanted but who may connect."""
+    """A service that only decides which keys may connect."""
 
     kind = KINDS["recognizer"]
 

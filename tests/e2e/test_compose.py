@@ -1,4 +1,4 @@
-"""docker-compose.yml, carried out without an engine."""
+"""docker-compose.yml, run without an engine."""
 
 import contextlib
 import shutil
@@ -37,20 +37,20 @@ def network() -> Iterator[Network]:
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Folder of the keys, made by the service ``keys``; this process gets them, too."""
+    """The folder of keys that the service ``keys`` creates; this process also uses them."""
     folder = tmp_path_factory.mktemp("keys")
     run_keys_service(folder, *COMPOSE["services"]["keys"]["command"])
     made = folder / "kouxing"
     assert (made / "control.key").stat().st_uid == USER
     own = tmp_path_factory.mktemp("own-keys") / "kouxing"
-    shutil.copytree(made, own)  # owned by who copies
+    shutil.copytree(made, own)  # owned by this user
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(own.parent))
         yield made
 
 
 def run_keys_service(folder: Path, *command: str) -> None:
-    """Run what makes the keys, on a folder that takes the place of its volume."""
+    """Run the service that creates the keys; a folder replaces its volume."""
     shell, option, script, name = COMPOSE["services"]["keys"]["entrypoint"]
     programs = folder.parent / "programs"
     programs.mkdir(exist_ok=True)
@@ -103,7 +103,7 @@ def start(
     return containers.start(host, arguments, environment, secrets)
 
 
-@pytest.mark.timeout(400)  # of a busy machine
+@pytest.mark.timeout(400)  # on a busy machine
 def test_containers_are_healthy_private_and_speak(
     containers: Containers, network: Network, keys: Path
 ) -> None:
@@ -132,7 +132,7 @@ def test_containers_are_healthy_private_and_speak(
 
 
 def check_page(told: Collection[str], gateway: str) -> None:
-    """Check that the page is where compose publishes it, and needs the token that it tells."""
+    """Check that compose publishes the page, and that it requires the token in its address."""
     (published,) = COMPOSE["services"]["gateway"]["ports"]
     host, port, own_port = published.split(":")
     (secret,) = [

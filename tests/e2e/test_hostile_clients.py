@@ -126,7 +126,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
         wait_until(lambda: len(frames) >= 30, step=lambda: frames.extend(output.available(0.1)))
         assert not output.has_ended, "a false end"
         assert max(frame.media_time for frame in frames) <= 16000
-        assert not stranger.wait(0.1), "it is told no sequence number"
+        assert not stranger.wait(0.1), "it gets no sequence number"
     with Bus(user_key()) as bus:
         assert bus.probe(endpoint) is Reach.REFUSED, "a client does not even get in"
 

@@ -1,4 +1,4 @@
-"""Services and a client on machines of their own, each with the key that was copied there."""
+"""Services and a client on separate machines, each with the key that was copied there."""
 
 import socket
 import subprocess
@@ -17,7 +17,7 @@ WORKERS = ("recognizer", "synthesizer")
 
 
 def machine(command: Command, folder: Path, name: str, role: str, file: str) -> Path:
-    """Make a key by the command, and the state folder of another machine that has it alone."""
+    """Create a key by the command, and the state folder of another machine with only this key."""
     status, _, log = command("keys", "add", name, "--role", role, "-o", folder / f"{name}.key")
     assert (status, f"/{file}.key on the other machine" in log) == (0, True), log
     keys = folder / name / "kouxing"

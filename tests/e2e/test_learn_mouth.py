@@ -103,7 +103,7 @@ def longer(recording: bytes) -> bytes:
     return landmark_file(time_s, frames, sound, sample_rate_hz=rate_hz)
 
 
-@pytest.mark.timeout(400)  # of a busy machine
+@pytest.mark.timeout(400)  # on a busy machine
 def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Browser) -> None:
     browser.evaluate(
         "window.realFetch = fetch; window.fetch = (url, options) => realFetch(url,"

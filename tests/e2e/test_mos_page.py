@@ -23,7 +23,7 @@ SENTENCES = ("one", "two")
 
 
 class Served:
-    """``kouxing mos serve`` in a process of its own, which can be killed and come again."""
+    """``kouxing mos serve`` in a process that can be killed and started again."""
 
     def __init__(self, folder: Path, *options: str) -> None:
         self.folder = folder
@@ -42,7 +42,7 @@ class Served:
         assert self.line.startswith("judges open http"), self.line
 
     def kill(self) -> None:
-        """End it as a crash does."""
+        """Kill the process, as in a crash."""
         self._process.kill()
         self._process.communicate()
 
@@ -54,7 +54,7 @@ class Served:
     def ask(
         self, path: str, body: object = None, *, raw: bytes = b"", **headers: str
     ) -> tuple[int, bytes]:
-        """Return the status and what is answered."""
+        """Return the status and the body of the answer."""
         connection = HTTPConnection("127.0.0.1", self.port, timeout=60)
         content = raw or (None if body is None else json.dumps(body).encode())
         connection.request("GET" if content is None else "POST", path, content, headers)

@@ -320,7 +320,7 @@ def test_the_microphone_reaches_the_recognizer(
     name = turn_on_microphone(control, page)
     wait_until(lambda: len(control.samples(name)) > 48000)
     page.wait_for(f"{STATE}.session === '{name}'")
-    assert page.evaluate(f"{STATE}.sound") == "off"  # one's own voice
+    assert page.evaluate(f"{STATE}.sound") == "off"  # the user's own voice is not played
     turn_off_microphone(page)
     wait_until(lambda: control.has_ended(name))
     opening = control.openings[name]

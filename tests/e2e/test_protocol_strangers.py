@@ -28,7 +28,7 @@ KEY_FILE = "~/.local/state/kouxing/client.key"
 
 
 class Stranger:
-    """A program that speaks the protocol with nothing but pyzmq and msgpack."""
+    """A program that implements the protocol with pyzmq and msgpack."""
 
     def __init__(self) -> None:
         self.context = zmq.Context()

@@ -18,7 +18,7 @@ from tests.control_stage import Stage
 
 def ask(stage: Stage, client: Socket, **fields: object) -> StatusReport | Error:
     """Return the answer to a status request."""
-    request = secrets.token_hex(4)  # an answer of before is not given again
+    request = secrets.token_hex(4)  # control repeats the answer to a known request
     client.send(StatusRequest(request=request, **fields))  # type: ignore[arg-type]
     while not isinstance(answer := stage.receive(client)[-1], StatusReport | Error):
         pass

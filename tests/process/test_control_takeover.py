@@ -117,7 +117,7 @@ def test_repeats_session_moved_to_the_client(
         assert isinstance(start, StartSession)
         service.send(SessionStarted(session="mine", request=start.request))
     stage.receive(client)
-    for media_time in (2840, 5000):  # said again, as one does that goes on
+    for media_time in (2840, 5000):  # a continuing recognizer repeats it
         speech = Speech(session="mine", epoch=1, sequence=1, media_time=media_time, active=True)
         recognizer.send(speech)
     recognizer.send(beat("recognizer"))

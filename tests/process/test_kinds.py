@@ -50,7 +50,7 @@ def test_reports_a_port_that_needs_privileges(monkeypatch: pytest.MonkeyPatch) -
 def test_a_taken_default_and_port_0_are_replaced_by_a_free_port() -> None:
     taken = GatewayConfig().port
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # another program has it, which is as good
+        with contextlib.suppress(OSError):  # another program uses it, which has the same effect
             stack.enter_context(socket.create_server(("127.0.0.1", taken)))
         for settings in (read_settings(), read_settings(assignments={"gateway.port": "0"})):
             port = int(available_port_environment(settings)["KOUXING_GATEWAY_PORT"])

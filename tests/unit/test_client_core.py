@@ -86,7 +86,7 @@ class Scene:
         return inbox
 
     def confirm(self) -> None:
-        """Confirm the newest subscription, at as many publishers as it needs."""
+        """Confirm the newest subscription from both publishers."""
         for name in ("a", "b"):
             self.sockets.connections[-1].on_message(Joined(publisher=name))
 
