@@ -23,7 +23,7 @@ from kouxing.shared.phones.events import SoundEvent, Waveform
 def sound_events(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lip_predictor: LipFrameModel | None = None,
+    lip_predictor: LipFrameModel | None,
     face_delay_s: float = 0.0,
     config: RecognizerConfig | None = None,
 ) -> list[SoundEvent]:
@@ -49,10 +49,10 @@ class LiveChain:
         The acoustic model.
     lip_model
         The lip model, for the acoustic model's language.
-    sample_rate_hz, num_channels
-        Format of the audio.
-    recognizer, synthesizer
-        Settings of the two services. ``synthesizer.lips`` is ignored.
+    sample_rate_hz
+        Rate of the audio, one channel.
+    synthesizer
+        Settings of the synthesizer. ``lips`` is ignored.
     lip_predictor
         The network that predicts learnt lips. If None, the recognizer's default.
 
@@ -73,18 +73,14 @@ class LiveChain:
         lip_model: LipModel,
         *,
         sample_rate_hz: int = MEDIA_RATE_HZ,
-        num_channels: int = 1,
-        recognizer: RecognizerConfig | None = None,
         synthesizer: SynthesizerConfig | None = None,
         lip_predictor: LipFrameModel | None = None,
     ) -> None:
-        recognizer = recognizer or RecognizerConfig()
         synthesizer = synthesizer or SynthesizerConfig()
         self.events: list[SoundEvent] = []
-        self._recognizer = Recognizer(model, recognizer.output_rule)
+        self._recognizer = Recognizer(model, RecognizerConfig().output_rule)
         self._stream = self._recognizer.create_stream(
             sample_rate_hz=sample_rate_hz,
-            num_channels=num_channels,
             lip_predictor=lip_predictor or load_lip_predictor(),
             face_delay_s=synthesizer.delay_ms / 1e3,
         )
@@ -98,7 +94,7 @@ class LiveChain:
         )
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:
-        """Process samples, shape (n,) or (n, channels), and return the frames that are due.
+        """Process samples, shape (n,), and return the frames that are due.
 
         Raises ``UserError`` if the samples have another shape or are not finite.
         """

@@ -53,7 +53,7 @@ class Bus:
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
         self._context = zmq.Context()
         self._key = key
-        self._limiter = ConnectionLimiter(extra_connections, self._is_service)
+        self._limiter = ConnectionLimiter(self._is_service, extra_connections)
         self.zap = None if key is None else Zap(self._limiter.disconnect_keys)
         self._answers_handshakes = False
         self._sockets: list[Socket] = []
@@ -84,9 +84,9 @@ class Bus:
         """
         return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_joined)
 
-    def connect_dealer(self, endpoint: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
+    def connect_dealer(self, endpoint: str) -> Socket:
         """Connect to a router. Messages are queued until it is available."""
-        return self._connect(zmq.DEALER, endpoint, queue_length=queue_length)
+        return self._connect(zmq.DEALER, endpoint)
 
     def connect_subscriber(self, *endpoints: str, live: Iterable[str] = ()) -> Socket:
         """Connect to publishers. Call ``subscribe`` to receive messages.
@@ -94,7 +94,7 @@ class Bus:
         For publishers in ``live`` the kernel buffers only a few messages, so that a stalled
         process has little to skip.
         """
-        socket = self._connect(zmq.SUB, *endpoints, queue_length=QUEUE_LENGTH)
+        socket = self._connect(zmq.SUB, *endpoints)
         socket.raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
         for endpoint in live:
             socket.connect(endpoint)
@@ -201,7 +201,7 @@ class Bus:
         self._sockets.append(socket)
         return socket
 
-    def _connect(self, kind: int, *endpoints: str, queue_length: int) -> Socket:
+    def _connect(self, kind: int, *endpoints: str, queue_length: int = QUEUE_LENGTH) -> Socket:
         raw = self._open(kind, queue_length)
         if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))

@@ -35,8 +35,8 @@ class ClockOffset:
     error (Mills, RFC 5905, section 8).
     """
 
-    def __init__(self, num_exchanges: int = 16) -> None:
-        self._exchanges: deque[tuple[int, int]] = deque(maxlen=num_exchanges)
+    def __init__(self) -> None:
+        self._exchanges: deque[tuple[int, int]] = deque(maxlen=16)
 
     def update(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
         """Add one exchange: sent and returned on our clock, received and replied on theirs."""

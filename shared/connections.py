@@ -238,12 +238,10 @@ class LimitedSocket:
 class ConnectionLimiter:
     """Watches the connections to all bound sockets of a process.
 
-    ``extra_connections`` and ``is_service`` are those of ``PeerQuota``.
+    ``is_service`` and ``extra_connections`` are those of ``PeerQuota``.
     """
 
-    def __init__(
-        self, extra_connections: int = 0, is_service: Callable[[str], bool] = lambda key: False
-    ) -> None:
+    def __init__(self, is_service: Callable[[str], bool], extra_connections: int = 0) -> None:
         self._quota = PeerQuota(extra_connections, is_service)
         self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
         self._connections: dict[int, Connection] = {}  # by inode; both threads add

@@ -86,7 +86,7 @@ class ReliableReceiver:
         self,
         socket: Socket,
         session: str,
-        make_acknowledgement: Callable[[], Acknowledge] = Acknowledge,
+        make_acknowledgement: Callable[[], Acknowledge],
     ) -> None:
         self._socket = socket
         self._session = session

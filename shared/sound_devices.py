@@ -45,8 +45,8 @@ def sound_devices() -> list[SoundDevice]:
     return devices
 
 
-def microphone(name: str = "") -> AudioSource:
-    """Read the default microphone, or the one whose name contains ``name``, until interrupted.
+def microphone(name: str) -> AudioSource:
+    """Read the microphone whose name contains ``name`` until interrupted. Empty: the default one.
 
     Raises ``UserError`` if the sound library or the microphone is missing.
     """

@@ -30,7 +30,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.phones.events import Phone, SoundEvent
-from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
+from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
 
 T = TypeVar("T", Phone, TimedSyllable)
@@ -95,7 +95,7 @@ def animate(
     mouth: Path | None,
     expressiveness: float | None,
     track: int | None = None,
-    language: str = DEFAULT_LANGUAGE,
+    language: str,
 ) -> Motion:
     """Animate a face from a sound file.
 

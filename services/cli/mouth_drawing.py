@@ -25,7 +25,7 @@ from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline import WithProgress, recognize
-from kouxing.services.recognizer.transcriber import SherpaTranscriber
+from kouxing.services.recognizer.transcriber import Transcriber
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.ferguson import drawing
@@ -135,7 +135,7 @@ def draw_mouth(
     samples = read_mono_16k(source, track)
     inventory = load_inventory(language)
     if speech_to_text is not None:
-        text = SherpaTranscriber(speech_to_text).transcribe(samples) or None
+        text = Transcriber(speech_to_text).transcribe(samples) or None
         print_message(f"{source}: {text or 'no words were recognized'}")
     transcript = None if text is None else read_text(text, inventory)
     with open_progress() as progress:

@@ -23,6 +23,7 @@ from kouxing.shared.errors import USER_ERROR, UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
+START_LIMIT_S = 120.0
 STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
 
@@ -79,12 +80,12 @@ class Supervisor:
         for name in self._names:
             self._start(name)
 
-    def wait_ready(self, control: str, deadline_s: float = 120.0) -> None:
+    def wait_ready(self, control: str) -> None:
         """Wait until all services have registered with control.
 
-        Raises ``UserError`` if a service cannot start, or the deadline passes.
+        Raises ``UserError`` if a service cannot start, or this takes longer than ``START_LIMIT_S``.
         """
-        end_s = time.monotonic() + deadline_s
+        end_s = time.monotonic() + START_LIMIT_S
         with connect(control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.check()

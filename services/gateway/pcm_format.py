@@ -83,11 +83,12 @@ class PcmFormat:
             )
 
 
-def check_text(text: str, expected: str) -> None:
-    """Raise a UserError with the ``expected`` messages if a text message looks like base64."""
+def check_text(text: str) -> None:
+    """Raise ``UserError`` if a text message looks like base64."""
     if len(text) >= 16 and not text.lstrip().startswith("{") and _is_base64(text):
         raise UserError(
-            f"expected {expected}; this text looks like base64: send the bytes as a binary message"
+            "expected binary messages of samples, or a JSON object; this text looks like base64:"
+            " send the bytes as a binary message"
         )
 
 

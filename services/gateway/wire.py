@@ -113,7 +113,7 @@ def parse_command(message: str) -> MicrophoneCommand:
 
     Raises ``UserError`` if the message is not a JSON object or a field is out of range.
     """
-    check_text(message, "binary messages of samples, or a JSON object")
+    check_text(message)
     fields = parse_object(message)
     num_skipped = fields.get("skip", 0)
     if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:

@@ -85,7 +85,7 @@ class SpeechSegmenter:
     def __init__(
         self,
         front_end: FrontEnd,
-        lip_stream: LipFrameStream | None = None,
+        lip_stream: LipFrameStream | None,
         start_frame: int | None = None,
     ) -> None:
         self._front_end = front_end

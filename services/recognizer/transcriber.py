@@ -1,11 +1,7 @@
-"""Speech to text, for audio without a transcript.
-
-Any speech recognizer can implement ``Transcriber``. This module uses sherpa-onnx with a model that
-the user provides.
-"""
+"""Speech to text, for audio without a transcript, with sherpa-onnx."""
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +10,8 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError, install_command
 
 
-class Transcriber(Protocol):
-    """Any speech recognizer."""
-
-    def transcribe(self, samples: NDArray[np.float32]) -> str:
-        """Return the text of audio, 16 kHz mono, shape (n,); empty without speech."""
-
-
-class SherpaTranscriber:
-    """A Mandarin model in sherpa-onnx.
+class Transcriber:
+    """A Mandarin model that the user provides.
 
     Parameters
     ----------

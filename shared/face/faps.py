@@ -22,7 +22,6 @@ class Fap:
     name: str
     fapu: str  # unit: MNS MW IRISD ES ENS AU; empty for FAP 1 and 2
     direction: str  # direction of positive values; "left" is the subject's left
-    bidirectional: bool
     feature_points: tuple[str, ...]  # points that this FAP moves, such as "2.1"
 
 
@@ -34,7 +33,6 @@ def _read_table() -> tuple[Fap, ...]:
             name=row["name"],
             fapu=row["fapu"],
             direction=row["direction"],
-            bidirectional=row["bidirectional"] != "0",
             feature_points=tuple(point for point in row["feature_points"].split(",") if point),
         )
         for row in csv.DictReader(text.splitlines(), delimiter="\t")

@@ -90,7 +90,7 @@ _ON_LISTENER = {
 class IdleMotion:
     """Motion of eyes and head; the same seed gives the same motion. Times must not decrease."""
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int) -> None:
         self.is_still = False  # the head does not turn
         self.has_eye_contact = False  # the eyes do not leave the viewer
         self._seed = seed

@@ -8,7 +8,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from kouxing.services.recognizer.transcriber import SherpaTranscriber
+from kouxing.services.recognizer.transcriber import Transcriber
 from kouxing.shared.errors import UserError
 
 SOUND = 0.1 * np.random.default_rng(0).standard_normal(16_000).astype(np.float32)
@@ -53,22 +53,22 @@ def paraformer(tmp_path: Path) -> Path:
 
 def test_transcribes_with_the_smallest_file(paraformer: Path) -> None:
     (paraformer / "model.onnx").write_bytes(bytes(100_000))  # cannot be loaded
-    transcriber = SherpaTranscriber(paraformer)
+    transcriber = Transcriber(paraformer)
     assert [transcriber.transcribe(sound) for sound in (SOUND, SOUND[:8000])] == ["你好", "你好"]
 
 
 def test_rejects_a_folder_without_a_model(tmp_path: Path, paraformer: Path) -> None:
     with pytest.raises(UserError, match=r"contains no tokens\.txt"):
-        SherpaTranscriber(tmp_path)
+        Transcriber(tmp_path)
     with pytest.raises(UserError, match="no model of a known kind"):
-        SherpaTranscriber(paraformer.rename(tmp_path / "other"))
+        Transcriber(paraformer.rename(tmp_path / "other"))
     damaged = (tmp_path / "other").rename(paraformer)
     (damaged / "tokens.txt").write_text("你 0\n", encoding="utf-8")
     with pytest.raises(UserError, match=r"paraformer-zh: sherpa-onnx cannot load the model"):
-        SherpaTranscriber(damaged)
+        Transcriber(damaged)
 
 
 def test_reports_which_package_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sherpa_onnx", None)
     with pytest.raises(UserError, match=r"pip install 'kouxing\[speech-to-text\]'"):
-        SherpaTranscriber(tmp_path)
+        Transcriber(tmp_path)

@@ -53,7 +53,7 @@ def render_video(
     renderer: Renderer | SideBySide,
     *,
     frame_rate_hz: float,
-    samples: NDArray[np.float32] | None = None,
+    samples: NDArray[np.float32] | None,
     captions: Captions | None = None,
     on_progress: Callable[[float], None] = lambda _share: None,
 ) -> int:
@@ -89,7 +89,7 @@ def render_picture(
     path: Path,
     renderer: Renderer | SideBySide,
     at_s: float,
-    captions: Captions | None = None,
+    captions: Captions | None,
 ) -> None:
     """Write the picture (PNG) at a time, with captions below it.
 

@@ -23,7 +23,7 @@ import os
 import re
 import secrets
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -105,14 +105,11 @@ def open_writer(
     return PictureSequence(path)
 
 
-def check_name(path: Path, others: Iterable[str] = ()) -> None:
-    """Check that a path is a valid output in an existing folder.
-
-    Raises ``UserError`` if it is not; the text also suggests the suffixes ``others``.
-    """
+def check_name(path: Path) -> None:
+    """Raise ``UserError`` if a path is not a valid output in an existing folder."""
     if path.suffix not in _FORMATS and not is_sequence(path):
         raise UserError(
-            f"{path}: give a name that ends in {', '.join((*VIDEO_SUFFIXES, *others))}, a folder,"
+            f"{path}: give a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder,"
             " or a name with a number such as face%05d.png"
         )
     if not path.parent.is_dir():
