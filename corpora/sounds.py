@@ -40,7 +40,7 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
     sounds = []
     for folder in folders:
         manifest = folder / "manifest.tsv"
-        rows = read_rows(manifest)
+        rows = read_rows(manifest, ("path", "kind", "licence"))
         if not rows:
             raise UserError(f"{manifest} lists no sounds; add some, or give another folder")
         try:
@@ -49,10 +49,6 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
                     sounds += _parts(row["kind"], folder / row["path"])
         except OSError as error:
             raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
-        except KeyError as error:
-            raise UserError(
-                f"{manifest} lacks the column {error}; add path, kind and licence"
-            ) from error
         except ValueError as error:
             raise UserError(f"cannot read a sound in {folder}: {error}") from error
     return sounds

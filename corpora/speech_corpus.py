@@ -20,13 +20,13 @@ podcasts, a talk, a web seminar and a prompt, with eight voices. The publishers 
 are cut into pieces that overlap by 0.48 s, and so are their texts.
 """
 
-import csv
 import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from kouxing.corpora.tables import read_rows
 from kouxing.corpora.universal_phones import has_labels, universal_words
 from kouxing.shared.audio_file import read_duration_s
 from kouxing.shared.errors import UserError
@@ -44,7 +44,6 @@ _CLOSED_LICENSE = re.compile(
 )
 _MIN_PHONE_S = 0.03
 _MAX_LIST_BYTES = 256 << 20
-_MAX_ROWS = 1_000_000
 _AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")
 
@@ -199,20 +198,13 @@ def duration_s(path: Path) -> float:
 
 
 def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:
-    reader = csv.DictReader(_lines(path), delimiter="\t", quoting=csv.QUOTE_NONE)
-    columns = set(reader.fieldnames or ())
-    missing = sorted({"utt_id", "path"} - columns)
-    if not columns & {"pinyin", "text"}:
-        missing.append("pinyin or text")
-    if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; add them")
-    for number, row in enumerate(reader, start=2):
+    rows = read_rows(path, ("utt_id", "path", "pinyin or text"))
+    for number, row in enumerate(rows, start=2):
         place = f"{path.name} row {number} ({row['utt_id']})"
-        cells = {"text": "", **{key: value or "" for key, value in row.items() if key}}
         for name in ("path", "phones_path"):
-            if cells.get(name):
-                cells[name] = str((audio or path.parent) / cells[name])
-        yield place, cells
+            if row.get(name):
+                row[name] = str((audio or path.parent) / row[name])
+        yield place, {"text": "", **row}
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
@@ -258,15 +250,8 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
             )
 
 
-def _lines(path: Path) -> Iterator[str]:
-    for number, line in enumerate(split_lines(path, read_text(path, _MAX_LIST_BYTES))):
-        if number > _MAX_ROWS:
-            raise UserError(f"{path} has more than {_MAX_ROWS} rows; split it")
-        yield line
-
-
 def _pairs(path: Path) -> Iterator[tuple[str, str]]:
-    for line in _lines(path):
+    for line in split_lines(path, read_text(path, _MAX_LIST_BYTES)):
         key, _, value = line.strip().partition(" ")
         if key:
             yield key, value.strip()

@@ -1,17 +1,31 @@
 """Reads tables of corpora: tab-separated files with a header, without quoting."""
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
+from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import read_text, split_lines
 
-_MAX_BYTES = 16 << 20
+_MAX_BYTES = 256 << 20
+_MAX_ROWS = 1_000_000
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
+def read_rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     """Return the rows of a table by column; missing cells are empty.
 
-    Raises ``UserError`` if the file is missing, is not text or is larger than 16 MB.
+    Raises ``UserError`` if the file is missing, is not text, is too large, or lacks one of
+    ``columns``. A column may have several names: ``pinyin or text``.
     """
     lines = split_lines(path, read_text(path, _MAX_BYTES))
-    return list(csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE))
+    table = csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE)
+    known = set(table.fieldnames or ())
+    missing = [column for column in columns if known.isdisjoint(column.split(" or "))]
+    if missing:
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}; add them")
+    rows: list[dict[str, str]] = []
+    for row in table:
+        if len(rows) == _MAX_ROWS:
+            raise UserError(f"{path} has more than {_MAX_ROWS} rows; split it")
+        rows.append({name: cell for name, cell in row.items() if name})  # without surplus cells
+    return rows

@@ -13,11 +13,11 @@ text         text in the language of the column ``language``, an ISO 639-1 code.
 ============ =====================================================================================
 """
 
-import csv
 import re
 from functools import cache
 from pathlib import Path
 
+from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.alphabets import phones_of_arpabet
 from kouxing.shared.phones.inventory import (
@@ -119,13 +119,11 @@ def labeled_phones(path: Path) -> list[tuple[float, str]]:
     """Return the end in seconds of each phone of a table of labels; pauses count as phones.
 
     A stop has up to three labels. Labels of a diphthong have two phones of equal durations.
-    Raises ``OSError`` or ``UserError`` if the table cannot be read.
+    Raises ``UserError`` or ``ValueError`` if the table cannot be read.
     """
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file, delimiter="\t"))
     phones: list[tuple[float, str]] = []
     before = ""
-    for row in rows:
+    for row in read_rows(path, ("symbol", "start_s", "end_s")):
         label, start_s, end_s = row["symbol"], float(row["start_s"]), float(row["end_s"])
         symbol = _MARKS.sub("", label) if len(label) > 1 else label
         if symbol == before and symbol != label:

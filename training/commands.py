@@ -9,7 +9,7 @@ import typer
 
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.terminal import Force, check_output, print_message
+from kouxing.shared.terminal import Force, check_output
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
@@ -282,7 +282,7 @@ def ferguson(
     from kouxing.training.ferguson.recipe import train_ferguson
 
     check_output(output, force=force)
-    train_ferguson(clips, corpus, output, print_message, any_license=any_license)
+    train_ferguson(clips, corpus, output, any_license=any_license)
 
 
 @app.command()

@@ -7,7 +7,6 @@ from pathlib import Path
 from kouxing.corpora.emotions import EmotionRecording
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
-from kouxing.training.search_weights import SearchWeights
 from kouxing.training.training_set import Example
 
 
@@ -21,13 +20,11 @@ def write_card(
     | Sequence[Utterance]
     | Sequence[EmotionRecording],
     errors: RowErrors | None = None,
-    chosen: SearchWeights | None = None,
     notes: str = "",
 ) -> None:
     """Write the card of the model in ``output``, with the suffix ``.md``.
 
-    ``details`` describe the training as part of a sentence. ``chosen`` are the search weights, if
-    they were chosen on development data.
+    ``details`` describe the training as part of a sentence.
     """
     by_license: dict[str, list[Example | LipClip | Utterance | EmotionRecording]] = defaultdict(
         list
@@ -50,12 +47,6 @@ def write_card(
     ]
     if errors:
         lines += ["", f"{len(errors.messages)} rows were skipped."]
-    if chosen:
-        lines += [
-            "",
-            f"Chosen on dev: acoustic scale {chosen.acoustic_scale}, phone penalty "
-            f"{chosen.phone_penalty}; phone error rate there {100 * chosen.error_rate:.1f} %.",
-        ]
     if notes:
         lines += ["", notes]
     output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The training set: recordings with features, phones and weights; and lines of progress.
+"""The training set: recordings with features, phones and weights.
 
 Corpora are unbalanced. One speaker reads words for three hours, thirty others read one sentence
 each, and a synthesizer makes any amount. The weight of a recording is
@@ -6,12 +6,10 @@ each, and a synthesizer makes any amount. The weight of a recording is
     w = clip(sqrt(30 min / minutes of its speaker), 0.3, 3) * (0.3 if synthetic)
 """
 
-import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,16 +183,3 @@ def _samples_of(span: slice, num_frames: int) -> slice:
     """Return the range of samples behind the first ``num_frames`` frames of a span."""
     first = HOP_SAMPLES * span.start
     return slice(first, first + HOP_SAMPLES * (num_frames - 1) + WINDOW_SAMPLES)
-
-
-Report = Callable[[str], None]
-T = TypeVar("T")
-
-
-def with_progress(items: Sequence[T], what: str, report: Report) -> Iterator[T]:
-    """Yield the items, and report after each tenth of them."""
-    step = math.ceil(len(items) / 10)
-    for number, item in enumerate(items, start=1):
-        yield item
-        if number % step == 0 or number == len(items):
-            report(f"{number} of {len(items)} recordings {what}")

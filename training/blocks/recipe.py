@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.progress import track
 
 from kouxing.corpora.feature_cache import as_floats, as_integers
 from kouxing.corpora.parallel import process_in_order
@@ -33,6 +34,7 @@ from kouxing.services.recognizer.acoustic.model_file import (
     topology_from,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, frames_in
+from kouxing.shared.terminal import print_message
 from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, Material
 from kouxing.training.blocks.export import onnx_of
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout
@@ -42,13 +44,7 @@ from kouxing.training.model_card import write_card
 from kouxing.training.networks.batches import Recording, Targets
 from kouxing.training.networks.labels import STATES_PER_PHONE, Mix, label, statistics_of
 from kouxing.training.networks.whisper import init_encoder, load_whisper
-from kouxing.training.training_set import (
-    FRAMES_PER_MINUTE,
-    Example,
-    Report,
-    load_examples,
-    with_progress,
-)
+from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_examples
 
 # Live, in positions. A short block gives early hypotheses. Its positions have less right context
 # than the first ones of a long block, so R is longer than in training.
@@ -113,7 +109,6 @@ def train_blocks(
     seed: int = 0,
     num_steps: int = 1000,
     shipping: bool = True,
-    report: Report = print,
 ) -> None:
     """Train the block model, and write it with its card.
 
@@ -142,11 +137,10 @@ def train_blocks(
             encoder=whole,
             errors=errors,
             seed=seed,
-            report=report,
         )
         weights = [recording.weight for recording in recordings[: len(aligned)]]
         statistics = statistics_of(aligned, weights, before.topology.phone_lm)
-        _Labeled([*recordings, *_sung_copies(recordings, seed, report)], *statistics).save(labels)
+        _Labeled([*recordings, *_sung_copies(recordings, seed)], *statistics).save(labels)
     labeled = _Labeled.load(labels)
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
@@ -158,7 +152,6 @@ def train_blocks(
         seed=seed,
         num_steps=num_steps,
         checkpoint=checkpoint,
-        report=report,
     ).cpu()
     model = BlockModel(
         topology=replace(labeled.topology, phone_penalty=_PHONE_PENALTY),
@@ -168,16 +161,16 @@ def train_blocks(
     )
     model.save(output)
     _write_card(output, start, seed, num_steps, labeled.recordings, examples, errors)
-    errors.report_to(report)
+    errors.report_to(print_message)
     for path in (labels, checkpoint):
         path.unlink()
 
 
-def _sung_copies(recordings: Sequence[Recording], seed: int, report: Report) -> Iterator[Recording]:
+def _sung_copies(recordings: Sequence[Recording], seed: int) -> Iterator[Recording]:
     """Yield copies of some recordings that are sung, or have a held vowel."""
     numbers = np.random.default_rng(seed).permutation(len(recordings))[::_SUNG_SHARE].tolist()
     copies = process_in_order(partial(_sung_copy, recordings, seed), numbers)
-    for copy, _ in zip(copies, with_progress(numbers, "sung", report), strict=True):
+    for copy in track(copies, "sung copies", len(numbers)):
         if copy:
             yield copy
 

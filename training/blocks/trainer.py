@@ -37,9 +37,8 @@ from kouxing.training.blocks.batches import BATCHES_PER_STEP, BlockBatch, Materi
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.network import MAX_DEVIATIONS
-from kouxing.training.networks.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
+from kouxing.training.networks.optimizer import cross_entropy, optimize
 from kouxing.training.networks.teacher import WholeEncoder
-from kouxing.training.training_set import Report
 
 _RATE, _READOUT_RATE = 1.5e-4, 1.5e-3  # of the last layer, of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above
@@ -68,7 +67,6 @@ def train_network(
     seed: int,
     num_steps: int,
     checkpoint: Path,
-    report: Report,
 ) -> BlockNetwork:
     """Train the network in place; return one with the running mean of its weights.
 
@@ -83,8 +81,6 @@ def train_network(
         ]
     network.readout.standardize(torch.cat(features).to(network.readout.mean.device))
     network.to(DEVICE).train()
-    groups = _groups(network)
-    optimizer = Optimizer(network, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=8)
     batches: Iterator[BlockBatch] | None = None
 
     def loss(step: int) -> Tensor:
@@ -103,12 +99,14 @@ def train_network(
             total = total + part
         return total
 
-    return optimizer.train(
+    return optimize(
+        network,
+        _groups(network),
         loss,
-        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
         num_steps=num_steps,
+        warm_up_steps=_WARM_UP_STEPS,
+        falling=_FALLING,
         seed=seed,
-        report=report,
         checkpoint=checkpoint,
     )
 

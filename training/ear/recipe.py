@@ -26,6 +26,7 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.ear import Voice
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import print_message
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.ear.batches import BATCH_S, Batch, Material, batch_of
 from kouxing.training.ear.export import save_ear
@@ -34,8 +35,8 @@ from kouxing.training.ear.network import Ear
 from kouxing.training.ear.targets import Columns, Recording, Samples, TargetStore
 from kouxing.training.ear.teachers import Teachers
 from kouxing.training.model_card import write_card
-from kouxing.training.networks.optimizer import Optimizer, warm_up_and_decay_factor
-from kouxing.training.training_set import Report, read_utterances, weights_of
+from kouxing.training.networks.optimizer import optimize
+from kouxing.training.training_set import read_utterances, weights_of
 
 _RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 200, 0.5
 _OTHER_VOICES = {"laughter": Voice.LAUGHTER, "breath": Voice.NONE}  # by the kind of a sound
@@ -69,7 +70,6 @@ def train_ear(
     whisper: Path,
     seed: int = 0,
     num_steps: int = 7000,
-    report: Report = print,
 ) -> None:
     """Train the small ear, and write it with its model card.
 
@@ -111,13 +111,8 @@ def train_ear(
     folder.mkdir(parents=True, exist_ok=True)
     lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", clips, teachers, seed)
     store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
-    trained = _train_network(
-        Material(store.pieces(), backgrounds, Columns(len(inventory))),
-        num_steps,
-        seed,
-        output,
-        report,
-    )
+    material = Material(store.pieces(), backgrounds, Columns(len(inventory)))
+    trained = _train_network(material, num_steps, seed, output)
     trained.rescale_lips(store.lips_mean, store.lips_deviation)
     save_ear(output, trained)
     write_card(
@@ -129,7 +124,7 @@ def train_ear(
         errors=errors,
         notes=f"It also learned from {len(sources.untranscribed)} folders of speech without text.",
     )
-    errors.report_to(report)
+    errors.report_to(print_message)
 
 
 def _speech_of(
@@ -179,18 +174,9 @@ def _load_lip_teacher(
     return LipTeacher.load(path)
 
 
-def _train_network(
-    material: Material, num_steps: int, seed: int, output: Path, report: Report
-) -> Ear:
+def _train_network(material: Material, num_steps: int, seed: int, output: Path) -> Ear:
     torch.manual_seed(seed)
     ear = Ear(material.columns.num_phones).to(DEVICE)
-    optimizer = Optimizer(
-        ear,
-        [{"params": list(ear.parameters()), "lr": _RATE}],
-        weight_decay=0.01,
-        max_norm=1.0,
-        mean_exponent=8,
-    )
     batches: Iterator[Batch] | None = None
 
     def loss(step: int) -> Tensor:
@@ -201,11 +187,14 @@ def _train_network(
         with mixed_precision():
             return ear.loss(*(torch.from_numpy(part).to(DEVICE).float() for part in next(batches)))
 
-    return optimizer.train(
+    return optimize(
+        ear,
+        [{"params": list(ear.parameters()), "lr": _RATE}],
         loss,
-        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
         num_steps=num_steps,
+        warm_up_steps=_WARM_UP_STEPS,
+        falling=_FALLING,
         seed=seed,
-        report=report,
+        max_norm=1.0,
         checkpoint=output.with_suffix(".checkpoint.pt"),
     ).cpu()

@@ -1,8 +1,8 @@
 """The teachers of the small ear: trained networks that compute its targets from clean recordings.
 
-The block network comes from the shipped model. Its 8-bit ONNX weights are converted to floats, so
-that PyTorch can run whole recordings. The second teacher is Whisper's unchanged encoder. The lip
-teacher (:mod:`kouxing.training.ear.lip_teacher`) uses the outputs of both.
+The block network comes from the shipped model. PyTorch runs it on whole recordings. The second
+teacher is Whisper's unchanged encoder. The lip teacher (:mod:`kouxing.training.ear.lip_teacher`)
+uses the outputs of both.
 
 ======== ==================================================================== =================
 symbol   meaning                                                              shape
@@ -21,26 +21,23 @@ research and affective computing" (the effort is its alpha ratio).
 """
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import numpy_helper
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.blocks.exported import encoder_of, readout_of
+from kouxing.training.blocks.network import layout
 from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.networks.network import ReadoutShape, Shape
+from kouxing.training.networks.network import Shape
 from kouxing.training.networks.teacher import NUM_LAYERS, WholeEncoder
 from kouxing.training.networks.whisper import load_whisper
 
@@ -69,14 +66,10 @@ class Teachers:
     """The teachers, ready to run."""
 
     def __init__(self, blocks: BlockModel, whisper: Path) -> None:
-        self._blocks = BlockEncoder(_block_shape(blocks))
-        load_exported(self._blocks, blocks.network)
-        self._readout = _readout_of(blocks)
+        self._blocks, self._readout = encoder_of(blocks), readout_of(blocks)
         self._encoder = WholeEncoder(Shape(num_states=0, layers=NUM_LAYERS), _ENCODER_LAYERS)
         load_whisper(self._encoder, whisper)
-        self._networks = (self._blocks, self._readout, self._encoder)
-        for network in self._networks:
-            network.eval()
+        self._networks = (self._blocks, self._readout, self._encoder.eval())
         self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
         self._first_state = blocks.topology.first_state
         self.digest = hashlib.sha256(blocks.network.tobytes()).hexdigest()
@@ -120,71 +113,3 @@ def pitch_of(samples: NDArray[np.int16], num_positions: int) -> Floats:
     with np.errstate(divide="ignore"):
         logarithm = np.log2(np.array(pitch, np.float32))
     return np.where(np.isfinite(logarithm), logarithm, np.float32(np.nan))
-
-
-def _tensors_of(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    graph = onnx.load_from_string(file.tobytes()).graph
-    return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
-
-
-def load_exported(
-    module: nn.Module,
-    file: NDArray[np.uint8],
-    prefix: str = "",
-    others: Mapping[str, NDArray[Any]] | None = None,
-) -> None:
-    """Load the weights of an exported network (:mod:`kouxing.training.networks.onnx_graph`).
-
-    ``others`` are weights that the file stores in another form, by their module names.
-    """
-    tensors = _tensors_of(file)
-    state = {}
-    for name, tensor in module.state_dict().items():
-        stem = f"{prefix}{name}".removesuffix(".weight")
-        if others and name in others:
-            weight = others[name]
-        elif name.endswith(".weight") and f"{stem}.integers" in tensors:
-            weight = (tensors[f"{stem}.integers"] * tensors[f"{stem}.scales"]).T
-            if tensor.ndim == 3:  # a convolution, place by place
-                weight = weight.reshape(len(weight), tensor.shape[2], -1).transpose(0, 2, 1)
-        else:
-            weight = tensors[f"{prefix}{name}"]
-        state[name] = torch.from_numpy(np.array(weight, np.float32))
-    module.load_state_dict(state)
-
-
-def _inner_of(file: NDArray[np.uint8]) -> int:
-    return len(_tensors_of(file)["layers.0.inner.bias"])
-
-
-def _block_shape(model: BlockModel) -> Shape:
-    sizes = model.session.sizes
-    return Shape(
-        num_states=int(model.topology.first_state[-1]),
-        width=sizes.width,
-        heads=sizes.heads,
-        layers=sizes.layers,
-        inner=_inner_of(model.network),
-    )
-
-
-def _readout_of(model: BlockModel) -> BlockReadout:
-    """Load the block network's readout, whose recurrent layer is exported in ONNX's layout."""
-    tensors = _tensors_of(model.network)
-    inner = len(tensors["readout.inner.bias"])
-    shape = ReadoutShape(inner=inner, gru=model.session.sizes.state, dropout=0.0, noise=0.0)
-    readout = BlockReadout(len(tensors["readout.mean"]), int(model.topology.first_state[-1]), shape)
-    input_biases, recurrent_biases = np.split(tensors["readout.biases"], 2, axis=1)
-    recurrent = {
-        "weight_ih": tensors["readout.input_weights.halves"],
-        "weight_hh": tensors["readout.recurrent_weights.halves"],
-        "bias_ih": input_biases,
-        "bias_hh": recurrent_biases,
-    }
-    others = {"deviation": 1 / tensors["readout.inverse"]}
-    for name, directions in recurrent.items():
-        for direction, suffix in zip(directions, ("", "_reverse"), strict=True):
-            update, reset, new = np.split(direction, 3)
-            others[f"gru.{name}_l0{suffix}"] = np.concatenate([reset, update, new])
-    load_exported(readout, model.network, "readout.", others)
-    return readout

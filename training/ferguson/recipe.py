@@ -40,7 +40,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
-from kouxing.training.training_set import Report
+from kouxing.shared.terminal import print_message
 
 Array = NDArray[np.float64]
 
@@ -233,7 +233,7 @@ _MAX_OF_SPEAKER = 60  # recordings
 
 
 def train_ferguson(
-    clips: Path, corpora: Sequence[Path], output: Path, report: Report, *, any_license: bool = False
+    clips: Path, corpora: Sequence[Path], output: Path, *, any_license: bool = False
 ) -> None:
     """Learn the table from the training clips and recordings.
 
@@ -250,13 +250,13 @@ def train_ferguson(
     errors = RowErrors()
     rows = training_rows(corpora, inventory, errors, any_license=any_license)
     table = phone_table(openings, aligned_speech(model, rows, errors), inventory)
-    errors.report_to(report)
+    errors.report_to(print_message)
     of_fap = dict(zip(MOUTH_FAPS, travel_of(used), strict=True))
     for name, point in lip_points().items():
         if point.fap is not None:
             travel = of_fap[point.fap]
             result = f"travel {travel:.1f} FAP units" if travel else "not measured; keep its value"
-            report(f"lip_points.tsv: point {name}, FAP {point.fap}: {result}")
+            print_message(f"lip_points.tsv: point {name}, FAP {point.fap}: {result}")
     licenses = sorted({clip.license for clip in used} | {row.license for row in rows})
     about = [
         "Made by `kouxing train ferguson`; least squares, no seed.",

@@ -12,6 +12,7 @@ from kouxing.services.recognizer.acoustic.gmm import GmmModel
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, LogMel, cepstra_of_all
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import print_message
 from kouxing.training.gmm.estimation import (
     Copy,
     FrameSet,
@@ -22,11 +23,11 @@ from kouxing.training.gmm.estimation import (
     split,
     topology_of,
 )
+from kouxing.training.gmm.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
-from kouxing.training.search_weights import SearchWeights, choose_search_weights
-from kouxing.training.training_set import Example, Report, load_examples
+from kouxing.training.training_set import Example, load_examples
 
 _STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # of the differences, frames
@@ -50,7 +51,6 @@ def train_gmm(
     phone_lm: Path | None = None,
     num_mixtures: int = 32,
     shipping: bool = True,
-    report: Report = print,
 ) -> None:
     """Train the Gaussian mixture recognizer, and write the model with its card.
 
@@ -64,7 +64,7 @@ def train_gmm(
     lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)
     rng = np.random.default_rng(seed)
     copies = [copy for example in examples for copy in _copies(example, rng)]
-    report(f"{len(examples)} recordings, {len(copies)} copies with augmentation")
+    print_message(f"{len(examples)} recordings, {len(copies)} copies with augmentation")
     first_state = np.arange(len(inventory) + 1) * _STATES_PER_PHONE
     prior_mean = _mean_cepstra(examples)
 
@@ -73,10 +73,10 @@ def train_gmm(
     )
     hmm = first_estimate(flat_start, first_state)
     for _ in range(_FLAT_START_ITERATIONS):
-        report(f"flat start: log likelihood {flat_start.realign(hmm):.3f} per frame")
+        print_message(f"flat start: log likelihood {flat_start.realign(hmm):.3f} per frame")
         hmm = estimate(flat_start, hmm)
     frames = FrameSet.build(copies, inventory, first_state, prior_mean, _HALF_WIDTH)
-    hmm, rotation = _train_mixtures(frames, hmm, num_mixtures, report)
+    hmm, rotation = _train_mixtures(frames, hmm, num_mixtures)
     model = GmmModel(
         topology=topology_of(hmm, lm, frames),
         mixtures=hmm.mixtures,
@@ -85,7 +85,7 @@ def train_gmm(
         half_width=_HALF_WIDTH,
     )
 
-    chosen = choose_search_weights(model, corpora, shipping=shipping, report=report)
+    chosen = choose_search_weights(model, corpora, shipping=shipping)
     (chosen or _UNTUNED).applied_to(model).save(output)
     write_card(
         output,
@@ -94,17 +94,17 @@ def train_gmm(
         details=f"seed {seed}",
         recordings=examples,
         errors=errors,
-        chosen=chosen,
+        notes=f"Chosen on dev: {chosen}" if chosen else "",
     )
-    errors.report_to(report)
+    errors.report_to(print_message)
 
 
 def _train_mixtures(
-    frames: FrameSet, hmm: Hmm, num_mixtures: int, report: Report
+    frames: FrameSet, hmm: Hmm, num_mixtures: int
 ) -> tuple[Hmm, NDArray[np.float32]]:
     """Double the mixtures step by step; return the model and the rotation of the features."""
     rotation = np.eye(NUM_FEATURES, dtype=np.float32)
-    report(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
+    print_message(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
     hmm = estimate(frames, hmm, 3)
     size = 1
     while size < num_mixtures:
@@ -113,7 +113,7 @@ def _train_mixtures(
         if size == min(_DECORRELATED_AT, num_mixtures):
             hmm, rotation = decorrelate(frames, hmm)
             hmm = estimate(frames, hmm, 3)
-            report(f"{size} mixtures: log likelihood {frames.realign(hmm):.3f} per frame")
+            print_message(f"{size} mixtures: log likelihood {frames.realign(hmm):.3f} per frame")
             hmm = estimate(frames, hmm, 3)
     return hmm, rotation
 

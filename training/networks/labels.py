@@ -11,10 +11,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 
+from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticModel,
+    Topology,
+    score_segment,
+)
 from kouxing.services.recognizer.acoustic.network import NetworkModel
 from kouxing.services.recognizer.search.decoder import Segment
 from kouxing.services.recognizer.search.forced_path import (
@@ -27,14 +33,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.networks.batches import Recording, Targets
 from kouxing.training.networks.teacher import WholeEncoder, train_teacher
-from kouxing.training.search_weights import all_scores
-from kouxing.training.training_set import (
-    FRAMES_PER_MINUTE,
-    Example,
-    Report,
-    load_untranscribed,
-    with_progress,
-)
+from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
 
 STATES_PER_PHONE = 3
 _MIN_STAY, _MAX_STAY = 0.05, 0.98
@@ -70,7 +69,6 @@ def label(
     encoder: WholeEncoder,
     errors: RowErrors,
     seed: int,
-    report: Report,
 ) -> tuple[list[AlignedExample], list[Recording]]:
     """Align and label recordings; those with text come first, in random order.
 
@@ -80,7 +78,7 @@ def label(
     rng = np.random.default_rng(seed)
     folders = [load_untranscribed([folder], errors) for folder in untranscribed]
     in_random_order = [examples[place] for place in rng.permutation(len(examples))]
-    aligned = _align_all(aligner, in_random_order, report)
+    aligned = _align_all(aligner, in_random_order)
     recordings = _recordings(aligned, mix)
     num_of_kind = dict.fromkeys(mix.kinds, 0)
     teacher_set = []
@@ -88,10 +86,10 @@ def label(
         num_of_kind[one.example.kind] += 1
         if num_of_kind[one.example.kind] <= _TEACHER_SET:
             teacher_set.append(recording)
-    teacher = train_teacher(encoder, teacher_set, seed=seed, report=report)
+    teacher = train_teacher(encoder, teacher_set, seed=seed)
     sounds = [sound for pieces in folders for sound in pieces]
     all_sounds = [*(recording.samples for recording in recordings), *sounds]
-    labels = teacher.label(all_sounds, report)
+    labels = teacher.label(all_sounds)
     labeled = [
         replace(recording, targets=recording.targets.averaged_with(targets))
         for recording, targets in zip(recordings, labels, strict=False)
@@ -124,9 +122,7 @@ def _recordings(aligned: Sequence[AlignedExample], mix: Mix) -> list[Recording]:
     return recordings
 
 
-def _align_all(
-    aligner: AcousticModel, examples: Sequence[Example], report: Report
-) -> list[AlignedExample]:
+def _align_all(aligner: AcousticModel, examples: Sequence[Example]) -> list[AlignedExample]:
     """Align each recording with its text; drop recordings that do not fit.
 
     Raises UserError if no recording fits its text.
@@ -147,14 +143,15 @@ def _align_all(
         graph = utterance_graph(
             example.phones, example.syllables, topology.first_state, silence=silence
         )
-        (rows,) = all_scores(aligner, [example])
+        front_end = aligner.create_front_end()
+        rows = score_segment(aligner, front_end.accept_waveform(as_floats(example.samples)))
         path, _ = viterbi_path(rows, graph.states, graph, topology.log_stay, topology.log_leave)
         on_path = graph.states[path]
         states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
         return (states, segments_of_path(path, graph)) if len(path) else None
 
     alignments = process_in_order(align, range(len(examples)))
-    tracked = with_progress(examples, "aligned", report)
+    tracked = track(examples, "aligned recordings")
     aligned = [
         AlignedExample(example, *alignment)
         for alignment, example in zip(alignments, tracked, strict=True)

@@ -4,124 +4,81 @@ Sources: Loshchilov and Hutter 2019, "Decoupled weight decay regularization" (Ad
 Zhang 2013, "Stochastic gradient descent for non-smooth optimization: convergence results and
 optimal averaging schemes" (the mean, in which late weights count more).
 
-    m(0) = v(0),  m(n) = m(n - 1) + (e + 1) / (n + e + 2) * (v(n) - m(n - 1))
+    m(0) = v(0),  m(n) = m(n - 1) + 9 / (n + 10) * (v(n) - m(n - 1))
 
-v are the weights after a step, m their mean, and e is its exponent.
+v are the weights after a step, and m is their mean. The learning rates rise during the first steps,
+stay constant, and fall to 0 at the end.
 """
 
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeAlias, TypeVar, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from kouxing.training.training_set import Report
+from kouxing.shared.terminal import print_message
 
 SAVE_EVERY = 25  # steps
 MIN_SAVE_S = 30.0  # between two saves
+_MEAN_EXPONENT = 8
 
 N = TypeVar("N", bound=nn.Module)
 _Tensors: TypeAlias = tuple[Tensor, ...] | list[Tensor]
 
 
-class Optimizer(Generic[N]):
-    """Trains a network in place.
+def optimize(
+    network: N,
+    groups: Sequence[dict[str, Any]],
+    loss_of: Callable[[int], Tensor],
+    *,
+    num_steps: int,
+    warm_up_steps: int,
+    falling: float,
+    seed: int,
+    weight_decay: float = 0.01,
+    max_norm: float = 2.0,
+    checkpoint: Path | None = None,
+) -> N:
+    """Train a network in place; return one with the running mean of the weights.
 
-    ``groups`` are parameter groups with their learning rates, as for ``torch.optim``.
-    ``mean_exponent`` is the e of the running mean.
+    ``groups`` are parameter groups with their learning rates, as for ``torch.optim``. ``loss_of``
+    computes the loss of a step. It may itself add gradients of parts of the loss. ``falling`` is
+    the fraction of the steps, at the end, over which the rates fall. Each step has its own random
+    state. The state is saved in ``checkpoint``, and training resumes from this file if it exists.
     """
-
-    def __init__(
-        self,
-        network: N,
-        groups: Sequence[dict[str, Any]],
-        *,
-        weight_decay: float,
-        max_norm: float,
-        mean_exponent: int,
-    ) -> None:
-        self._network = network
-        self._averaged = AveragedModel(network, multi_avg_fn=_weight_average(mean_exponent))
-        self._averaged.eval()
-        self._adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
-        self._rates = [group["lr"] for group in self._adam.param_groups]
-        self._max_norm = max_norm
-
-    def train(
-        self,
-        loss_of: Callable[[int], Tensor],
-        rate_factor_of: Callable[[int], float],
-        *,
-        num_steps: int,
-        seed: int,
-        report: Report,
-        checkpoint: Path | None = None,
-    ) -> N:
-        """Train, and return the network with the running mean of the weights.
-
-        ``loss_of`` computes the loss of a step. It may itself add gradients of parts of the loss.
-        ``rate_factor_of`` computes the factor of the learning rates. Each step has its own random
-        state. The state is saved in ``checkpoint``, and training resumes from this file if it
-        exists.
-        """
-        first_step = self._load(checkpoint) if checkpoint and checkpoint.exists() else 0
-        if first_step:
-            report(f"resuming after step {first_step}")
-        losses = []
-        next_save_s = time.monotonic() + MIN_SAVE_S
-        for step in range(first_step, num_steps):
-            torch.manual_seed(seed + step)
-            self._adam.zero_grad()
-            loss = loss_of(step)
-            self._step(loss, rate_factor_of(step))
-            losses.append(loss.detach())
-            if (step + 1) % SAVE_EVERY == 0 or step + 1 == num_steps:
-                report(f"step {step + 1}: loss {torch.stack(losses).mean():.3f}")
-                losses = []
-                if checkpoint and (time.monotonic() >= next_save_s or step + 1 == num_steps):
-                    self._save(checkpoint, step + 1)
-                    next_save_s = time.monotonic() + MIN_SAVE_S
-        return cast(N, self._averaged.module).eval()
-
-    def _step(self, loss: Tensor, rate_factor: float) -> None:
-        for group, rate in zip(self._adam.param_groups, self._rates, strict=True):
-            group["lr"] = rate_factor * rate
+    averaged = AveragedModel(network, multi_avg_fn=_average)
+    averaged.eval()
+    adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
+    rates = [group["lr"] for group in adam.param_groups]
+    parts = {"network": network, "averaged": averaged, "optimizer": adam}
+    first_step = _load(checkpoint, parts) if checkpoint and checkpoint.exists() else 0
+    if first_step:
+        print_message(f"resuming after step {first_step}")
+    losses = []
+    next_save_s = time.monotonic() + MIN_SAVE_S
+    for step in range(first_step, num_steps):
+        torch.manual_seed(seed + step)
+        adam.zero_grad()
+        loss = loss_of(step)
+        rise = min(1.0, (step + 1) / warm_up_steps)
+        factor = rise * min(1.0, (num_steps - step) / (falling * num_steps))
+        for group, rate in zip(adam.param_groups, rates, strict=True):
+            group["lr"] = factor * rate
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self._network.parameters(), self._max_norm)
-        self._adam.step()
-        self._averaged.update_parameters(self._network)
-
-    def _save(self, checkpoint: Path, num_steps: int) -> None:
-        state = {name: part.state_dict() for name, part in self._parts().items()}
-        unfinished = checkpoint.with_suffix(".part")
-        torch.save(state | {"num_steps": num_steps}, unfinished)
-        unfinished.replace(checkpoint)
-
-    def _load(self, checkpoint: Path) -> int:
-        """Restore the state; return the number of steps taken."""
-        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        for name, part in self._parts().items():
-            part.load_state_dict(state[name])
-        return int(state["num_steps"])
-
-    def _parts(self) -> dict[str, Any]:
-        return {"network": self._network, "averaged": self._averaged, "optimizer": self._adam}
-
-
-def warm_up_factor(step: int, num_steps: int) -> float:
-    """Learning-rate factor: a linear rise during the first steps."""
-    return min(1.0, (step + 1) / num_steps)
-
-
-def warm_up_and_decay_factor(
-    step: int, num_steps: int, warm_up_steps: int, falling: float
-) -> float:
-    """Learning-rate factor: a linear rise, and a fall to 0 in the last fraction of the steps."""
-    rise = warm_up_factor(step, warm_up_steps)
-    return rise * min(1.0, (num_steps - step) / (falling * num_steps))
+        nn.utils.clip_grad_norm_(network.parameters(), max_norm)
+        adam.step()
+        averaged.update_parameters(network)
+        losses.append(loss.detach())
+        if (step + 1) % SAVE_EVERY == 0 or step + 1 == num_steps:
+            print_message(f"step {step + 1}: loss {torch.stack(losses).mean():.3f}")
+            losses = []
+            if checkpoint and (time.monotonic() >= next_save_s or step + 1 == num_steps):
+                _save(checkpoint, parts, step + 1)
+                next_save_s = time.monotonic() + MIN_SAVE_S
+    return cast(N, averaged.module).eval()
 
 
 def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tensor:
@@ -132,9 +89,22 @@ def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tens
     return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
 
 
-def _weight_average(exponent: int) -> Callable[[_Tensors, _Tensors, Tensor | int], None]:
-    def update(means: _Tensors, weights: _Tensors, num_before: Tensor | int) -> None:
-        factor: Any = (exponent + 1) / (num_before + exponent + 2)  # a tensor stays on its device
-        torch._foreach_lerp_(means, weights, [factor] * len(means))
+def _save(checkpoint: Path, parts: dict[str, Any], num_steps: int) -> None:
+    state = {name: part.state_dict() for name, part in parts.items()}
+    unfinished = checkpoint.with_suffix(".part")
+    torch.save(state | {"num_steps": num_steps}, unfinished)
+    unfinished.replace(checkpoint)
 
-    return update
+
+def _load(checkpoint: Path, parts: dict[str, Any]) -> int:
+    """Restore the state; return the number of steps taken."""
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    for name, part in parts.items():
+        part.load_state_dict(state[name])
+    return int(state["num_steps"])
+
+
+def _average(means: _Tensors, weights: _Tensors, num_before: Tensor | int) -> None:
+    # a tensor stays on its device
+    factor: Any = (_MEAN_EXPONENT + 1) / (num_before + _MEAN_EXPONENT + 2)
+    torch._foreach_lerp_(means, weights, [factor] * len(means))

@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.progress import track
 from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_floats
@@ -47,8 +48,7 @@ from kouxing.training.networks.batches import (
     sampling_probs,
 )
 from kouxing.training.networks.network import Encoder, Readout, ReadoutShape, Shape
-from kouxing.training.networks.optimizer import Optimizer, cross_entropy, warm_up_and_decay_factor
-from kouxing.training.training_set import Report, with_progress
+from kouxing.training.networks.optimizer import cross_entropy, optimize
 
 NUM_LAYERS = 6  # of Whisper base's encoder
 _NUM_STEPS = 600  # batches of up to 70 s of sound
@@ -67,7 +67,7 @@ _NUM_STANDARDIZED = 250  # recordings that mean and deviation are computed from
 
 _NUM_CROPS = 14  # in a batch
 _CROP_POSITIONS = 250
-_WARM_UP_STEPS = 30
+_RATE, _WARM_UP_STEPS = 2e-3, 30
 _FALLING = 0.5  # fraction of the steps, at the end, over which the rate falls to 0
 
 
@@ -118,7 +118,7 @@ class Teacher:
     readout: Readout
 
     @torch.no_grad()
-    def label(self, sounds: Sequence[NDArray[np.int16]], report: Report) -> list[Targets]:
+    def label(self, sounds: Sequence[NDArray[np.int16]]) -> list[Targets]:
         """Find the likeliest states of the frames of recordings, (n,) at 16 kHz, 25 ms or longer.
 
         Recordings of similar lengths are computed together.
@@ -126,7 +126,7 @@ class Teacher:
         labels: dict[int, Targets] = {}
         order = sorted(range(len(sounds)), key=lambda number: len(sounds[number]))
         batch: list[int] = []
-        for number in with_progress(order, "labeled by the teacher", report):
+        for number in track(order, "labeled recordings"):
             batch.append(number)
             if number == order[-1] or len(batch) * len(sounds[number]) > _BATCH_SAMPLES:
                 targets = self._targets_of([sounds[place] for place in batch])
@@ -153,16 +153,14 @@ class Teacher:
                 yield Targets(row[kept].astype(np.uint16), probs[kept].astype(np.float16))
 
 
-def train_teacher(
-    encoder: WholeEncoder, recordings: Sequence[Recording], *, seed: int, report: Report
-) -> Teacher:
+def train_teacher(encoder: WholeEncoder, recordings: Sequence[Recording], *, seed: int) -> Teacher:
     """Train a readout on recordings whose targets are the states of an alignment.
 
     Their features stay in memory, 150 KB a second with Whisper base.
     """
     rng = np.random.default_rng(seed)
     sampling = sampling_probs(recordings)
-    tracked = with_progress(recordings, "encoded for the teacher", report)
+    tracked = track(recordings, "encoded for the teacher")
     features = [encoder.features(recording.samples) for recording in tracked]
 
     def draw() -> Sample:
@@ -176,20 +174,21 @@ def train_teacher(
     readout = Readout(features[0].shape[1], encoder.shape.num_states, READOUT).to(DEVICE)
     drawn = rng.choice(len(sampling), size=_NUM_STANDARDIZED, p=sampling)
     readout.standardize(torch.cat([torch.from_numpy(features[one]).float() for one in drawn]))
-    groups = [{"params": list(readout.parameters()), "lr": 2e-3}]
-    optimizer = Optimizer(readout, groups, weight_decay=0.02, max_norm=2.0, mean_exponent=8)
 
     def loss(_step: int) -> Tensor:
         batch = padded_batch([draw() for _ in range(_NUM_CROPS)])
         inputs, states, probs = (tensor.to(DEVICE) for tensor in batch)
         return cross_entropy(readout(inputs)[:, : states.shape[1]], states, probs)
 
-    trained = optimizer.train(
+    trained = optimize(
+        readout,
+        [{"params": list(readout.parameters()), "lr": _RATE}],
         loss,
-        lambda step: warm_up_and_decay_factor(step, _NUM_STEPS, _WARM_UP_STEPS, _FALLING),
         num_steps=_NUM_STEPS,
+        warm_up_steps=_WARM_UP_STEPS,
+        falling=_FALLING,
         seed=seed,
-        report=lambda line: report(f"teacher, {line}"),
+        weight_decay=0.02,
     )
     return Teacher(encoder.eval(), trained)
 

@@ -37,8 +37,9 @@ from kouxing.services.recognizer.acoustic.model_file import (
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import read_text
-from kouxing.training.training_set import MAX_WORD_PHONES, Example, Report
+from kouxing.training.training_set import MAX_WORD_PHONES, Example
 
 Stream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
 
@@ -206,7 +207,6 @@ def train_phone_lm(
     drawn: Stream | None = None,
     order: int = 6,
     max_ngrams: int = 1_000_000,
-    report: Report = print,
 ) -> None:
     """Estimate a phone language model, and write it to a file.
 
@@ -230,13 +230,13 @@ def train_phone_lm(
         streams += [corpus_stream] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus_stream)))
     if not num_text + len(corpus_stream):
         raise UserError("no text to count; give --text, --ngrams or a corpus with sentences")
-    report(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
+    print_message(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
     phone_lm = estimate_phone_lm(streams, inventory, order=order, max_ngrams=max_ngrams)
     write_archive(output, phone_lm_arrays(phone_lm))
     levels = phone_lm.levels
     sizes = ", ".join(f"{end - first}" for first, end in pairwise(levels[1:]))
-    errors.report_to(report)
-    report(f"n-grams of 1 to {len(levels) - 2} phones kept: {sizes}")
+    errors.report_to(print_message)
+    print_message(f"n-grams of 1 to {len(levels) - 2} phones kept: {sizes}")
 
 
 def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> PhoneLanguageModel:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.progress import track
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
@@ -31,7 +32,6 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.universal.segments import features
 from kouxing.training.networks.labels import STATES_PER_PHONE
-from kouxing.training.training_set import Report, with_progress
 from kouxing.training.universal.features import Features
 
 _NUM_COMPONENTS, _INNER = 192, 384
@@ -56,9 +56,7 @@ class Aligner:
         """Number of universal phones, silence included."""
         return len(self.inventory)
 
-    def align(
-        self, stored: Sequence[Features], seed: int, report: Report
-    ) -> dict[str, NDArray[np.int64]]:
+    def align(self, stored: Sequence[Features], seed: int) -> dict[str, NDArray[np.int64]]:
         """Return the states of the frames of recordings, (2 positions,) each, by name.
 
         A recording with too few positions for its phones is left out.
@@ -77,8 +75,7 @@ class Aligner:
                 self.num_phones,
             )
             similar = self._similar(labels) if number == 0 else None
-            tracked = with_progress(components, f"aligned, round {number + 1}", report)
-            for place, rows in enumerate(tracked):
+            for place, rows in enumerate(track(components, f"alignment, round {number + 1}")):
                 if by_hand[place]:
                     continue
                 with torch.no_grad():

@@ -8,9 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import onnx
-import torch
 from numpy.typing import NDArray
-from onnx import numpy_helper
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.network import (
@@ -20,8 +18,9 @@ from kouxing.services.recognizer.acoustic.network import (
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
 from kouxing.training.blocks.export import BlockGraph, cache_names
+from kouxing.training.blocks.exported import encoder_of
 from kouxing.training.blocks.network import BlockEncoder
-from kouxing.training.networks.network import PADDING_FRAMES, Shape
+from kouxing.training.networks.network import PADDING_FRAMES
 from kouxing.training.networks.onnx_graph import halves
 
 BLOCK_LENGTH, RIGHT_CONTEXT, PAST = 10, 14, 120  # positions
@@ -33,7 +32,7 @@ class FeatureEncoder:
     """Computes hidden layers of recordings, in blocks with their right contexts."""
 
     def __init__(self, model: BlockModel, layers: Sequence[int]) -> None:
-        encoder = _encoder_of(model)
+        encoder = encoder_of(model)
         self._shape = encoder.shape
         self._session = open_session(_FeatureGraph(encoder, layers).file_of_features())
         unused = np.zeros((LENGTH, self._shape.width), np.float32)
@@ -103,31 +102,3 @@ class _FeatureGraph(BlockGraph):
         self.new_caches()
         outputs = [halves("features", "sessions", self.length, self._width), self.new]
         return self.file("features", self.inputs(), outputs)
-
-
-def _encoder_of(model: BlockModel) -> BlockEncoder:
-    """Rebuild the encoder of a trained model."""
-    network = onnx.load_from_string(model.network.tobytes())
-    arrays = {one.name: numpy_helper.to_array(one) for one in network.graph.initializer}
-    sizes = model.session.sizes
-    shape = Shape(
-        num_states=model.topology.num_states,
-        width=sizes.width,
-        heads=sizes.heads,
-        layers=sizes.layers,
-        inner=len(arrays["layers.0.inner.bias"]),
-    )
-    encoder = BlockEncoder(shape)
-    state = encoder.state_dict()
-    for name, tensor in state.items():
-        integers = name.removesuffix(".weight") + ".integers"
-        if integers not in arrays:
-            state[name] = torch.from_numpy(arrays[name].copy())
-            continue
-        scales = arrays[integers.replace("integers", "scales")]
-        weight = torch.from_numpy((arrays[integers].astype(np.float32) * scales).T.copy())
-        if tensor.ndim == 3:  # a convolution, place by place
-            weight = weight.view(len(weight), tensor.shape[2], -1).transpose(1, 2)
-        state[name] = weight
-    encoder.load_state_dict(state)
-    return encoder.eval()

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks.network import MAX_DEVIATIONS
-from kouxing.training.training_set import Report, with_progress
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, MAX_FRAMES, FeatureEncoder
 
 LAYERS = (-2, -1)  # of the block network, the last ones
@@ -76,7 +76,7 @@ class FeatureStore:
         with np.load(path, allow_pickle=False) as file:
             self.mean, self.deviation = file["mean"], file["deviation"]
 
-    def read(self, recordings: Sequence[Utterance], report: Report) -> Iterator[Features]:
+    def read(self, recordings: Sequence[Utterance]) -> Iterator[Features]:
         """Yield the features of recordings, computed if they are missing."""
         wanted = {recording.utterance_id for recording in recordings}
         known: set[str] = set()
@@ -87,7 +87,7 @@ class FeatureStore:
                     yield features
         missing = [one for one in recordings if one.utterance_id not in known]
         missing.sort(key=lambda recording: recording.seconds)
-        for start in with_progress(range(0, len(missing), _SHARD), "encoded, in parts", report):
+        for start in track(range(0, len(missing), _SHARD), "features"):
             shard = missing[start : start + _SHARD]
             digest = hashlib.sha256(" ".join(one.utterance_id for one in shard).encode())
             index = self._folder / f"{digest.hexdigest()[:8]}.json"

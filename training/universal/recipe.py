@@ -18,6 +18,7 @@ from kouxing.services.recognizer.acoustic.universal import save_universal
 from kouxing.services.recognizer.search.decoder import Segment
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
+from kouxing.shared.terminal import print_message
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.labels import (
     STATES_PER_PHONE,
@@ -25,7 +26,7 @@ from kouxing.training.networks.labels import (
     statistics_of,
 )
 from kouxing.training.phone_lm.recipe import estimate_phone_lm, stream_of
-from kouxing.training.training_set import Example, Report
+from kouxing.training.training_set import Example
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
 from kouxing.training.universal.export import extension_of
@@ -47,7 +48,6 @@ def train_universal(
     clips: Path | None = None,
     seed: int = 0,
     num_steps: int = 1000,
-    report: Report = print,
 ) -> None:
     """Train the universal readout of the shipped block model, and write it with its card.
 
@@ -67,13 +67,13 @@ def train_universal(
     )
     store = FeatureStore(folder, FeatureEncoder(model, LAYERS))
     store.standardize(data.recordings)
-    stored = list(store.read(data.recordings, report))
+    stored = list(store.read(data.recordings))
     by_name = {one.utterance_id: one for one in data.recordings}
     weight_of = {
         one.utterance_id: weight for one, weight in zip(data.recordings, data.weights, strict=True)
     }
     aligner = Aligner(by_name, inventory)
-    states = _saved(output.with_suffix(".states.npz"), partial(aligner.align, stored, seed, report))
+    states = _saved(output.with_suffix(".states.npz"), partial(aligner.align, stored, seed))
     aligned = [one for one in stored if one.name in states]
     readout = train_readout(
         new_readout(STATES_PER_PHONE * len(inventory)),
@@ -83,7 +83,6 @@ def train_universal(
         seed=seed,
         num_steps=num_steps,
         checkpoint=checkpoint,
-        report=report,
     )
     topology, log_prior = _statistics(by_name, states, weight_of, inventory)
     readout.mean[:] = torch.from_numpy(store.mean)
@@ -98,7 +97,7 @@ def train_universal(
     )
     save_universal(output, universal, extension)
     _write_card(output, data, seed, num_steps, errors)
-    errors.report_to(report)
+    errors.report_to(print_message)
     for path in (states_file, checkpoint):
         path.unlink()
     shutil.rmtree(folder)

@@ -16,8 +16,7 @@ from torch.nn.functional import nll_loss
 
 from kouxing.training.blocks.network import BlockReadout, Layout, layout
 from kouxing.training.networks.network import ReadoutShape
-from kouxing.training.networks.optimizer import Optimizer, warm_up_and_decay_factor
-from kouxing.training.training_set import Report
+from kouxing.training.networks.optimizer import optimize
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, RIGHT_CONTEXT
 from kouxing.training.universal.features import STEP, WIDTH, Features
 
@@ -47,7 +46,6 @@ def train_readout(
     seed: int,
     num_steps: int,
     checkpoint: Path,
-    report: Report,
 ) -> BlockReadout:
     """Train a readout; return one with the running mean of its weights.
 
@@ -56,8 +54,6 @@ def train_readout(
     """
     probs = np.cumsum(weights) / np.sum(weights)
     laid = layout(_CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
-    groups = [{"params": list(readout.parameters()), "lr": _RATE}]
-    optimizer = Optimizer(readout, groups, weight_decay=0.01, max_norm=2.0, mean_exponent=8)
     readout.train()
 
     def loss(step: int) -> Tensor:
@@ -78,12 +74,14 @@ def train_readout(
         result: Tensor = losses[0] + _RIGHT_WEIGHT * losses[1]
         return result
 
-    return optimizer.train(
+    return optimize(
+        readout,
+        [{"params": list(readout.parameters()), "lr": _RATE}],
         loss,
-        lambda step: warm_up_and_decay_factor(step, num_steps, _WARM_UP_STEPS, _FALLING),
         num_steps=num_steps,
+        warm_up_steps=_WARM_UP_STEPS,
+        falling=_FALLING,
         seed=seed,
-        report=report,
         checkpoint=checkpoint,
     )
 

@@ -1,0 +1,73 @@
+"""Reads the networks of a block model back into PyTorch, with their 8-bit weights as floats."""
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from torch import nn
+
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.training.blocks.network import BlockEncoder, BlockReadout
+from kouxing.training.networks.network import ReadoutShape, Shape
+
+M = TypeVar("M", bound=nn.Module)
+_Tensors = Mapping[str, NDArray[Any]]
+
+
+def encoder_of(model: BlockModel) -> BlockEncoder:
+    """Rebuild the encoder."""
+    tensors, sizes = _tensors_of(model), model.session.sizes
+    shape = Shape(
+        num_states=model.topology.num_states,
+        width=sizes.width,
+        heads=sizes.heads,
+        layers=sizes.layers,
+        inner=len(tensors["layers.0.inner.bias"]),
+    )
+    return _load(BlockEncoder(shape), tensors)
+
+
+def readout_of(model: BlockModel) -> BlockReadout:
+    """Rebuild the readout, whose recurrent layer is exported in ONNX's layout."""
+    tensors = _tensors_of(model)
+    inner = len(tensors["readout.inner.bias"])
+    shape = ReadoutShape(inner=inner, gru=model.session.sizes.state, dropout=0.0, noise=0.0)
+    readout = BlockReadout(len(tensors["readout.mean"]), model.topology.num_states, shape)
+    input_biases, recurrent_biases = np.split(tensors["readout.biases"], 2, axis=1)
+    recurrent = {
+        "weight_ih": tensors["readout.input_weights.halves"],
+        "weight_hh": tensors["readout.recurrent_weights.halves"],
+        "bias_ih": input_biases,
+        "bias_hh": recurrent_biases,
+    }
+    others = {"readout.deviation": 1 / tensors["readout.inverse"]}
+    for name, directions in recurrent.items():
+        for direction, suffix in zip(directions, ("", "_reverse"), strict=True):
+            update, reset, new = np.split(direction, 3)
+            others[f"readout.gru.{name}_l0{suffix}"] = np.concatenate([reset, update, new])
+    return _load(readout, {**tensors, **others}, "readout.")
+
+
+def _tensors_of(model: BlockModel) -> _Tensors:
+    graph = onnx.load_from_string(model.network.tobytes()).graph
+    return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+
+
+def _load(module: M, tensors: _Tensors, prefix: str = "") -> M:
+    """Load the weights of a module (:mod:`kouxing.training.networks.onnx_graph`)."""
+    state = {}
+    for name, tensor in module.state_dict().items():
+        stem = f"{prefix}{name}".removesuffix(".weight")
+        if f"{stem}.integers" in tensors and name.endswith(".weight"):
+            weight = (tensors[f"{stem}.integers"] * tensors[f"{stem}.scales"]).T
+            if tensor.ndim == 3:  # a convolution, place by place
+                weight = weight.reshape(len(weight), tensor.shape[2], -1).transpose(0, 2, 1)
+        else:
+            weight = tensors[f"{prefix}{name}"]
+        state[name] = torch.from_numpy(np.array(weight, np.float32))
+    module.load_state_dict(state)
+    return module.eval()
