@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kouxing.services.recognizer.acoustic import universal
+from kouxing.services.recognizer.acoustic import load
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.universal import save_universal
@@ -104,13 +104,13 @@ def test_a_file_belongs_to_one_block_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "universal.npz"
-    monkeypatch.setattr(universal, "_block_network", lambda: blocks().network)
+    monkeypatch.setattr(load, "_block_network", lambda: blocks().network)
     extension = extension_of(readout(), blocks(), LAYERS)
     save_universal(path, extended(), extension)
     model = load_model(path)
     assert isinstance(model, BlockModel)
     np.testing.assert_array_equal(scores_of(model, FRAMES), scores_of(extended(), FRAMES))
-    monkeypatch.setattr(universal, "_block_network", lambda: blocks().network[:-1])
+    monkeypatch.setattr(load, "_block_network", lambda: blocks().network[:-1])
     with pytest.raises(UserError, match="another version of the block model"):
         load_model(path)
 
@@ -144,3 +144,10 @@ def test_the_shipped_model_keeps_the_state_after_the_kept_positions() -> None:
     block = stream.block()
     first, second = (model.session.run([replace(block, num_kept=num)])[1] for num in (2, 4))
     assert not np.array_equal(first, second)
+
+
+def test_the_block_network_is_read_once() -> None:
+    shipped = load_model()
+    assert load_model("blocks") is shipped
+    assert isinstance(shipped, BlockModel)
+    assert load._block_network() is shipped.network

@@ -2,6 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from weakref import WeakValueDictionary
+
+import numpy as np
+from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic import blocks, gmm, light, universal
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -14,8 +18,9 @@ DEFAULT_MODEL = "blocks"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_model_from,
     blocks.FORMAT: blocks.block_model_from,
-    universal.FORMAT: universal.universal_model_from,
+    universal.FORMAT: lambda archive: universal.universal_model_from(archive, _block_network()),
 }
+_loaded: WeakValueDictionary[str, AcousticModel] = WeakValueDictionary()  # shipped models in use
 
 
 def model_path(name: str) -> Path:
@@ -30,11 +35,13 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
     Raises ``UserError`` if the file is missing, broken or of another format, or its language is not
     installed.
     """
+    if known := _loaded.get(str(name)):
+        return known
     path = model_path(str(name))
     archive = read_archive(path)
     try:
         form = str(archive.array("format", ()))
-        return light.light_model_from(archive) if name == "light" else _READERS[form](archive)
+        model = light.light_model_from(archive) if name == "light" else _READERS[form](archive)
     except KeyError:
         raise UserError(
             f"acoustic model {path} has the format {form!r}, but this version reads "
@@ -44,3 +51,12 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
         raise UserError(f"acoustic model {path}: {error}; train the model again") from error
     except UserError as error:
         raise UserError(f"acoustic model {path}: {error}") from error
+    if name in SHIPPED:
+        _loaded[str(name)] = model
+    return model
+
+
+def _block_network() -> NDArray[np.uint8]:
+    blocks_model = load_model("blocks")
+    assert isinstance(blocks_model, blocks.BlockModel)  # noqa: S101 - the shipped file
+    return blocks_model.network

@@ -11,19 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, model_of
-from kouxing.services.recognizer.acoustic.model_file import (
-    Archive,
-    read_archive,
-    write_model,
-)
+from kouxing.services.recognizer.acoustic.model_file import Archive, write_model
 
 FORMAT = "universal 1"
-_BLOCKS = Path(__file__).parents[1] / "models" / "blocks.npz"
 
 
-def universal_model_from(archive: Archive) -> BlockModel:
-    """Build the model after checking every size; ``ValueError`` if something does not fit."""
-    network = _block_network()
+def universal_model_from(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
+    """Build the model on the block network; ``ValueError`` if something does not fit."""
     if str(archive.array("block_network", ())) != _hash_of(network):
         raise ValueError("it belongs to another version of the block model")
     extension = archive.array("extension", None).astype(np.uint8)
@@ -31,20 +25,16 @@ def universal_model_from(archive: Archive) -> BlockModel:
 
 
 def save_universal(path: Path, model: BlockModel, extension: NDArray[np.uint8]) -> None:
-    """Write a model whose network is that of the shipped block model with an extension."""
+    """Write a model whose network is that of the shipped block model, followed by an extension."""
     write_model(
         path,
         FORMAT,
         model.topology,
-        block_network=_hash_of(_block_network()),
+        block_network=_hash_of(model.network[: -len(extension)]),
         extension=extension,
         log_prior=model.log_prior,
         acoustic_scale=model.acoustic_scale,
     )
-
-
-def _block_network() -> NDArray[np.uint8]:
-    return read_archive(_BLOCKS).array("network", None).astype(np.uint8)
 
 
 def _hash_of(network: NDArray[np.uint8]) -> str:
