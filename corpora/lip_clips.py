@@ -150,6 +150,13 @@ def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> li
     ]
 
 
+def no_clip_error(folder: Path) -> UserError:
+    """Make the error that a model cannot be trained on any clip of a folder."""
+    return UserError(
+        f"no clip in {folder} may be used; give clips with a free license, or --any-license"
+    )
+
+
 def read_clip(path: Path) -> LipClip:
     """Read the clip that a file belongs to; UserError if it cannot be read."""
     if path.suffix not in (".json", ".flac", ".csv"):

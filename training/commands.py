@@ -227,16 +227,19 @@ def ear(
     Repeat the command to resume an interrupted run.
     """
     with _neural_training(output, force=force):
-        from kouxing.training.ear.recipe import Sources, train_ear
+        from kouxing.training.ear.recipe import train_ear
 
-    sources = Sources(
-        corpora=corpus,
-        untranscribed=untranscribed or [],
+    train_ear(
+        corpus,
+        output,
+        whisper=whisper,
         clips=clips,
+        untranscribed=untranscribed or [],
         sounds=sounds,
+        seed=seed,
+        num_steps=steps,
         shipping=not any_license,
     )
-    train_ear(sources, output, whisper=whisper, seed=seed, num_steps=steps)
 
 
 @app.command()

@@ -7,6 +7,7 @@ from pathlib import Path
 from kouxing.corpora.emotions import EmotionRecording
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
+from kouxing.shared.terminal import write_text
 from kouxing.training.training_set import Example
 
 
@@ -49,4 +50,4 @@ def write_card(
         lines += ["", f"{len(errors.messages)} rows were skipped."]
     if notes:
         lines += ["", notes]
-    output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(output.with_suffix(".md"), "\n".join(lines) + "\n")

@@ -1,6 +1,5 @@
 """Training of the small ear: its teachers, its batches, its network, the recipe."""
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from kouxing.training.ear import batches, lip_teacher, targets, teachers
 from kouxing.training.ear.batches import Material, batch_of, inputs_of
 from kouxing.training.ear.export import onnx_of
 from kouxing.training.ear.network import NUM_FEATURES, NUM_LIPS, Ear
-from kouxing.training.ear.recipe import Sources, load_teachers, train_ear
+from kouxing.training.ear.recipe import load_teachers, train_ear
 from kouxing.training.ear.singing import sing
 from kouxing.training.ear.targets import PITCH, VOICE, Columns, Piece
 from kouxing.training.ear.teachers import POSITION_SAMPLES
@@ -173,26 +172,20 @@ def test_trains_resumes_and_writes_a_model(
     clips.mkdir()
     write_clip(clips, name_for("train"), "anna", "CC0")
     write_clip(clips, name_for("choice"), "berta", "MIT")
-    sources = Sources(
-        corpora=[corpus],
-        untranscribed=[corpus],
-        sounds=[write_sounds(tmp_path / "sounds")],
-        clips=clips,
-    )
     output = tmp_path / "ear.npz"
-    train = partial(train_ear, whisper=whisper)
-    train(sources, output, num_steps=2)
-    train(sources, output, num_steps=3)
+    sounds = [write_sounds(tmp_path / "sounds")]
+    train = partial(train_ear, [corpus], output, whisper=whisper, clips=clips, sounds=sounds)
+    train(untranscribed=[corpus], num_steps=2)
+    train(untranscribed=[corpus], num_steps=3)
     assert "resuming after step 2" in capsys.readouterr().err
     assert load_ear(output).num_features == NUM_FEATURES
     assert "3 steps of" in output.with_suffix(".md").read_text()
     with pytest.raises(UserError, match="targets of other recordings or models; delete it"):
-        train(replace(sources, untranscribed=[]), output, num_steps=3)
+        train(num_steps=3)
 
 
 @pytest.mark.parametrize(("name", "problem"), [("a", "no music or noise"), ("d", "no usable rec")])
 def test_needs_speech_and_sounds(tmp_path: Path, whisper: Path, name: str, problem: str) -> None:
     corpus = write_corpus(tmp_path / "corpus", {name: HELLO})
-    sources = Sources(corpora=[corpus], clips=tmp_path)
     with pytest.raises(UserError, match=problem):
-        train_ear(sources, tmp_path / "ear.npz", whisper=whisper)
+        train_ear([corpus], tmp_path / "ear.npz", whisper=whisper, clips=tmp_path)

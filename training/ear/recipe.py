@@ -8,7 +8,6 @@ contains the lip teacher and the targets, and ``.checkpoint.pt`` the training st
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +16,13 @@ import torch
 from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
-from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips, training_clips
+from kouxing.corpora.lip_clips import (
+    LipClip,
+    label_clip,
+    no_clip_error,
+    read_clips,
+    training_clips,
+)
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out
@@ -43,17 +48,6 @@ _OTHER_VOICES = {"laughter": Voice.LAUGHTER, "breath": Voice.NONE}  # by the kin
 _OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sources:
-    """Folders of recordings."""
-
-    corpora: Sequence[Path]
-    untranscribed: Sequence[Path] = ()
-    sounds: Sequence[Path] = ()
-    clips: Path  # with tracked lips
-    shipping: bool = True  # use only data whose license allows distributing the model
-
-
 def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
     """Load the teachers and their phone inventory."""
     torch.set_num_threads(1)  # reproducible sums on every machine
@@ -64,30 +58,35 @@ def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
 
 
 def train_ear(
-    sources: Sources,
+    corpora: Sequence[Path],
     output: Path,
     *,
     whisper: Path,
+    clips: Path,
+    untranscribed: Sequence[Path] = (),
+    sounds: Sequence[Path] = (),
     seed: int = 0,
     num_steps: int = 7000,
+    shipping: bool = True,
 ) -> None:
     """Train the small ear, and write it with its model card.
 
-    Raises UserError if there is nothing to train on, or a file cannot be read.
+    The arguments are the options of ``kouxing train ear``. Raises UserError if there is nothing to
+    train on, or a file cannot be read.
     """
     teachers, inventory = load_teachers(whisper)
     errors = RowErrors()
     utterances = [
         utterance
-        for corpus in sources.corpora
+        for corpus in corpora
         for utterance in read_utterances(
-            corpus, errors, inventory, split="train", shipping=sources.shipping
+            corpus, errors, inventory, split="train", shipping=shipping
         )
     ]
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
-    sounds = read_sounds(sources.sounds, shipping=sources.shipping)
-    backgrounds = training_backgrounds(sounds)
+    all_sounds = read_sounds(sounds, shipping=shipping)
+    backgrounds = training_backgrounds(all_sounds)
     if not backgrounds:
         raise UserError("no music or noise to mix with the speech; give a folder with --sounds")
     others = [
@@ -97,19 +96,19 @@ def train_ear(
             _OTHER_VOICE_WEIGHT,
             _OTHER_VOICES[sound.kind],
         )
-        for sound in sounds
+        for sound in all_sounds
         if sound.kind in _OTHER_VOICES and not sound.is_held_out
     ]
-    clips = training_clips(
-        read_clips(sources.clips, any_license=not sources.shipping, language=None),
-        any_license=not sources.shipping,
+    filmed = training_clips(
+        read_clips(clips, any_license=not shipping, language=None), any_license=not shipping
     )
-    if not any(clip.is_in_sync for clip in clips):
-        raise UserError(f"no clip in {sources.clips} may be used; give clips with a free license")
-    recordings = [*_speech_of(sources, utterances, clips), *others]
+    if not any(clip.is_in_sync for clip in filmed):
+        raise no_clip_error(clips)
+    paths = [clips / f"{clip.name}.flac" for clip in filmed]
+    recordings = [*_speech_of(utterances, untranscribed, paths), *others]
     folder = output.with_suffix(".targets")
     folder.mkdir(parents=True, exist_ok=True)
-    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", clips, teachers, seed)
+    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", filmed, teachers, seed)
     store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
     material = Material(store.pieces(), backgrounds, Columns(len(inventory)))
     trained = _train_network(material, num_steps, seed, output)
@@ -122,21 +121,20 @@ def train_ear(
         f"{seed}, {num_steps} steps of {BATCH_S:.0f} s of sound",
         recordings=utterances,
         errors=errors,
-        notes=f"It also learned from {len(sources.untranscribed)} folders of speech without text.",
+        notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
     )
     errors.report_to(print_message)
 
 
 def _speech_of(
-    sources: Sources, utterances: Sequence[Utterance], clips: Sequence[LipClip]
+    utterances: Sequence[Utterance], untranscribed: Sequence[Path], filmed: Sequence[Path]
 ) -> list[Recording]:
     """List all speech. Sources are weighted by the square root of their size; the sum is 1."""
     weights = zip(utterances, weights_of(utterances), strict=True)
     of_sources = [[(one.path, weight * one.seconds) for one, weight in weights]]
-    for folder in sources.untranscribed:
+    for folder in untranscribed:
         of_sources.append([(path, 1.0) for path in audio_files(folder) if not is_held_out(path)])
-    paths = [sources.clips / f"{clip.name}.flac" for clip in clips]
-    of_sources.append([(path, 1.0) for path in paths])
+    of_sources.append([(path, 1.0) for path in filmed])
     shares = np.sqrt([sum(path.stat().st_size for path, _ in source) for source in of_sources])
     recordings = []
     for source, share in zip(of_sources, shares / shares.sum(), strict=True):

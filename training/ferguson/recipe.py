@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, read_clips
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -40,7 +40,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
-from kouxing.shared.terminal import print_message
+from kouxing.shared.terminal import print_message, write_text
 
 Array = NDArray[np.float64]
 
@@ -243,9 +243,7 @@ def train_ferguson(
     inventory = model.inventory
     used = [clip for clip in read_clips(clips, any_license=any_license) if clip.part == "train"]
     if not used:
-        raise UserError(
-            f"no clip in {clips} may be used; give clips with a free license, or --any-license"
-        )
+        raise no_clip_error(clips)
     openings = fit_openings(used, [label_clip(model, clip) for clip in used], inventory)
     errors = RowErrors()
     rows = training_rows(corpora, inventory, errors, any_license=any_license)
@@ -264,10 +262,7 @@ def train_ferguson(
         f"the rest from {len(rows)} recordings.",
         f"Under: {'; '.join(licenses)}",
     ]
-    try:
-        output.write_text(format_table(table, inventory, about), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {output}: {error.strerror}") from None
+    write_text(output, format_table(table, inventory, about))
 
 
 def training_rows(

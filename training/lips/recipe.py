@@ -18,7 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips, training_clips
+from kouxing.corpora.lip_clips import (
+    LipClip,
+    label_clip,
+    no_clip_error,
+    read_clips,
+    training_clips,
+)
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.ear import LIP_DELAYS_S
@@ -92,9 +98,7 @@ def train_lips(
     clips = read_clips(folder, any_license=any_license, language=None)
     used = training_clips(clips, any_license=any_license)
     if not used:
-        raise UserError(
-            f"no clip in {folder} may be used; give clips with a free license, or --any-license"
-        )
+        raise no_clip_error(folder)
     plain = track(speech_of(used), description="clips", total=len(used))
     trained_on = [stretch for stretches in plain for stretch in stretches]
     if not trained_on:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, read_clips
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
@@ -26,10 +26,10 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     VISEMES,
 )
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import write_text
 from kouxing.training.visemes.fit import Array, estimate, frames_of
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
@@ -105,9 +105,7 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
     clips = read_clips(folder, any_license=any_license)
     used = [clip for clip in clips if clip.part == "train"]
     if not used:
-        raise UserError(
-            f"no clip in {folder} may be used; give clips with a free license, or --any-license"
-        )
+        raise no_clip_error(folder)
     model = load_model()
     inventory = model.inventory
     labels = [label_clip(model, clip) for clip in used]
@@ -122,27 +120,23 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
         offset_right_s=parameters.offset_right_s - _LEAD_S,
     )
     licenses = "; ".join(sorted({clip.license for clip in used}))
-    try:
-        save_parameters(
-            parameters,
-            output,
-            f"{_SOURCE}; the rest learned from clips under: {licenses}",
-            learnt_from=[clip.name for clip in used],
-            chosen_with=[clip.name for clip in clips if clip.part == "choice"],
-        )
-    except OSError as error:
-        raise UserError(f"cannot write {output}: {error.strerror}") from None
+    text = format_parameters(
+        parameters,
+        f"{_SOURCE}; the rest learned from clips under: {licenses}",
+        learnt_from=[clip.name for clip in used],
+        chosen_with=[clip.name for clip in clips if clip.part == "choice"],
+    )
+    write_text(output, text)
 
 
-def save_parameters(
+def format_parameters(
     parameters: VisemeParameters,
-    path: Path,
     source: str,
     *,
-    learnt_from: Sequence[str] = (),
-    chosen_with: Sequence[str] = (),
-) -> None:
-    """Write parameters as JSON, one line per viseme and array.
+    learnt_from: Sequence[str],
+    chosen_with: Sequence[str],
+) -> str:
+    """Return parameters as JSON, one line per viseme and array.
 
     ``source`` describes their origin. ``learnt_from`` and ``chosen_with`` are names of clips that a
     fair evaluation must exclude.
@@ -173,7 +167,4 @@ def save_parameters(
             ("faps", list(MOUTH_FAPS)),
         )
     )
-    path.write_text(
-        f'{{\n{head} "silence": {{\n{silence}\n }},\n "visemes": {{\n{visemes}\n }}\n}}\n',
-        encoding="utf-8",
-    )
+    return f'{{\n{head} "silence": {{\n{silence}\n }},\n "visemes": {{\n{visemes}\n }}\n}}\n'
