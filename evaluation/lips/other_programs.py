@@ -59,7 +59,7 @@ def _mouths_of(
     title = f"{folder.name}, {1e3 * delay_s:.0f} ms"
     mouths: dict[str, MouthOf] = {title: lambda clip: as_shipped(clip, delay_s)}
     if fitting:
-        linear = fit_map(fitting, tables, _DELAYS_S)
+        linear = fit_map(fitting, tables, _DELAYS_S[::2])
         title = f"{folder.name}, fitted, {1e3 * linear.delay_s:.0f} ms"
         mouths[title] = lambda clip: made_mouth(linear.faps(tables[clip.name], _frames_s(clip)))
     return mouths

@@ -8,6 +8,7 @@ from kouxing.evaluation.report.markdown import Results, Table, joined, number, p
 _REAL, _CLEAN, _BABBLE, _MUSIC = "real", "clean", "babble 10 dB", "music 10 dB"
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
 _ALL = "all"
+_COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", _ALL: "all clips"}
 _OWN = "learnt"
 _COMPARED = {  # measures of the comparison, and whether a higher figure is better
     "r_opening": ("correlation of the opening", True),
@@ -16,8 +17,21 @@ _COMPARED = {  # measures of the comparison, and whether a higher figure is bett
     "closure_f1": ("F1 of closures", True),
     "closure_precision": ("precision of closures", True),
     "closure_recall": ("recall of closures", True),
+    "precision_bpm": ("precision of closures at b p m", True),
+    "precision_aei": ("precision of closures at a e i", True),
+    "precision_uo": ("precision of closures at u o", True),
+    "precision_pause": ("precision of closures in pauses", True),
     "mtm_ms": ("MTM", False),
 }
+_LIKE_REAL = {  # measures of which real lips have the best figure
+    "slcc": "SLCC",
+    "effort_correlation": "effort",
+    "rest_opening": "opening at rest",
+    "closing_time_ms": "time until the lips are closed",
+    "phone_spread": "spread",
+    "turns_per_s": "number of turns per second",
+}
+_MEASURE_NAMES = {name: title for name, (title, _) in _COMPARED.items()} | _LIKE_REAL
 _NAMES = {
     "headaudio": "HeadAudio 0.1.0",
     "wlipsync": "wLipSync 1.3.1",
@@ -58,30 +72,45 @@ _CURVES = ("opening", "width", "jaw")
 
 def better_programs(results: Results) -> list[str]:
     """Return a sentence for each figure in which another program is better than the own lips."""
-    faces = _clean_scores(results.get("rivals", {}))
-    own = next((face for face in faces if face.startswith(f"{_OWN}, ")), None)
+    faces = results.get("rivals", {})
+    scores = _clean_scores(faces)
+    own = next((face for face in scores if face.startswith(f"{_OWN}, ")), None)
+    if own is None:
+        return []
+    others = [face for face in scores if face.partition(", ")[0] in _NAMES]
     sentences = []
-    for group, group_title in {**_GROUPS, _ALL: "all clips"}.items():
-        for measure, (name, is_higher_better) in _COMPARED.items():
-            if own is None or faces[own].get(group, {}).get(measure) is None:
+    for group, group_title in _COMPARED_GROUPS.items():
+        real = faces[_REAL][_CLEAN].get(group, {})
+        for measure, name in _MEASURE_NAMES.items():
+            if measure in _LIKE_REAL and group != _ALL:
                 continue
-            others = {
-                face: value
-                for face, groups in faces.items()
-                if face.partition(", ")[0] in _NAMES
-                if (value := groups.get(group, {}).get(measure)) is not None
+            values = {face: scores[face].get(group, {}).get(measure) for face in (own, *others)}
+            losses = {
+                face: _loss(measure, value, real.get(measure))
+                for face, value in values.items()
+                if value is not None and (measure in _COMPARED or real.get(measure) is not None)
             }
-            sign = 1 if is_higher_better else -1
-            best = max(others, key=lambda face: sign * others[face], default=None)
-            mine = faces[own][group][measure]
-            if best is not None and sign * others[best] > sign * mine:
-                values = f"{_short(measure, others[best])} and {_short(measure, mine)}"
-                sentences.append(f"{group_title}: {title_of(best)} has a better {name} ({values})")
+            best = min(losses, key=lambda face: losses[face], default=own)
+            if own in losses and losses[best] < losses[own]:
+                shown = [_short(measure, values[face]) for face in (best, own)]
+                if measure in _LIKE_REAL:
+                    shown.append(f"real lips {_short(measure, real[measure])}")
+                sentence = f"{group_title}, {name}: {title_of(best)} ({shown[0]})"
+                sentences.append(f"{sentence}; {own} ({', '.join(shown[1:])})")
     return sentences
 
 
-def _short(measure: str, value: float) -> str:
-    return f"{value:.0f} ms" if measure.endswith("_ms") else number(value)
+def _loss(measure: str, value: float, real: float | None) -> float:
+    """Return how bad a figure is: lower is better."""
+    if measure in _LIKE_REAL:
+        return abs(value - (real or 0.0))
+    return -value if _COMPARED[measure][1] else value
+
+
+def _short(measure: str, value: float | None) -> str:
+    if measure.endswith("_ms"):
+        return f"{number(value, 0)} ms"
+    return number(value, 0 if measure in ("rest_opening", "phone_spread") else 2)
 
 
 def closures(results: Results) -> Table:

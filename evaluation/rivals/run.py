@@ -27,7 +27,7 @@ def pylipsync_rows(samples: Samples) -> Iterator[Row]:
     for segment in PhonemeAnalyzer().extract_phoneme_segments(
         samples, RATE_HZ, fps=FRAMES_PER_S, return_seconds=True
     ):
-        weights = {f"viseme_{visemes[p.name]}": p.target for p in segment.phonemes}
+        weights = {visemes[p.name]: p.target for p in segment.phonemes}
         yield (segment.start + segment.end) / 2.0 + half_window_s, weights
 
 
@@ -48,7 +48,7 @@ def openfacefx_rows(samples: Samples) -> Iterator[Row]:
         channels[row["channel"]].append((float(row["time"]), float(row["value"])))
     curves = {name: np.array(channels.get(name, [(0.0, 0.0)])).T for name in _OPENFACEFX_CURVES}
     for time_s in np.arange(0.0, len(samples) / RATE_HZ, 1.0 / FRAMES_PER_S):
-        weights = {f"viseme_{name}": float(np.interp(time_s, *c)) for name, c in curves.items()}
+        weights = {name: float(np.interp(time_s, *c)) for name, c in curves.items()}
         yield float(time_s), weights
 
 

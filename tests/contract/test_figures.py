@@ -1,0 +1,59 @@
+"""Both READMEs have the six figures of the report, and the report's page has its results."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kouxing.evaluation.report.page import TABLES, read_results
+from tests.system import ROOT
+
+RESULTS = read_results(ROOT / "docs" / "results")
+
+
+def phone_errors(result: Any) -> str:
+    return f"{100 * result['blocks']['speech']['clean']['final']['phone_error_rate']:.1f} %"
+
+
+FIGURES: list[tuple[str, Callable[[Any], str]]] = [  # step and value of each row
+    ("chain", lambda r: "{p50:.1f} ms (p50), {p95:.1f} ms (p95)".format(**r["chunk_to_frame_ms"])),
+    ("chain", lambda r: f"{sum(r['cpu_s_per_audio_s'].values()):.2f} s"),
+    ("read", phone_errors),
+    ("conversation", phone_errors),
+    ("rivals", lambda r: f"{r['learnt, 60 ms']['clean']['zh']['r_opening']:.2f}"),
+    ("chain", lambda r: f"{r['page']['drawings']['microphone']['pictures_per_s']:.0f}"),
+]
+
+
+def figures_of(readme: str) -> list[str]:
+    """Return the values of the table before the section on limits."""
+    text = (ROOT / readme).read_text("utf-8")
+    rows = re.findall(
+        r"^\|[^|]*\|([^|]*)\| `kouxing (?:bench|evaluate)[^|]*\|$", text, re.MULTILINE
+    )
+    return [value.strip() for value in rows]
+
+
+@pytest.mark.parametrize("readme", ["README.md", "README.zh.md"])
+def test_the_readme_has_six_figures_of_the_report(readme: str) -> None:
+    shown = figures_of(readme)
+    assert len(shown) == len(FIGURES)
+    assert "rivals" in RESULTS
+    for value, (step, figure) in zip(shown, FIGURES, strict=True):
+        if step in RESULTS:  # the other steps have not been measured since their file was removed
+            assert value.startswith(figure(RESULTS[step]["result"])), step
+
+
+def test_the_page_was_written_from_these_results() -> None:
+    text = (ROOT / "docs" / "results.md").read_text("utf-8")
+    for step in RESULTS.values():
+        assert f"{step['date']}, commit {step['commit']}" in text
+        assert step["commands"][-1] in text
+    assert text.count("\n| --- |") <= len(TABLES) <= 10
+
+
+def test_results_are_small() -> None:
+    for path in Path(ROOT / "docs" / "results").glob("*.json"):
+        assert path.stat().st_size < 200_000, path.name
