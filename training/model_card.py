@@ -3,12 +3,26 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
-from kouxing.corpora.emotions import EmotionRecording
-from kouxing.corpora.lip_clips import LipClip
-from kouxing.corpora.speech_corpus import RowErrors, Utterance
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.shared.terminal import write_text
-from kouxing.training.training_set import Example
+
+
+class LicensedRecording(Protocol):
+    """What the card reports about a recording."""
+
+    @property
+    def license(self) -> str:
+        """License; empty if unknown."""
+
+    @property
+    def speaker(self) -> str:
+        """Name of the speaker."""
+
+    @property
+    def minutes(self) -> float:
+        """Duration."""
 
 
 def write_card(
@@ -16,10 +30,7 @@ def write_card(
     *,
     title: str,
     details: str,
-    recordings: Sequence[Example]
-    | Sequence[LipClip]
-    | Sequence[Utterance]
-    | Sequence[EmotionRecording],
+    recordings: Sequence[LicensedRecording],
     errors: RowErrors | None = None,
     notes: str = "",
 ) -> None:
@@ -27,9 +38,7 @@ def write_card(
 
     ``details`` describe the training as part of a sentence.
     """
-    by_license: dict[str, list[Example | LipClip | Utterance | EmotionRecording]] = defaultdict(
-        list
-    )
+    by_license: dict[str, list[LicensedRecording]] = defaultdict(list)
     for recording in recordings:
         by_license[recording.license or "none given"].append(recording)
     rows = [
