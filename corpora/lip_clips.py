@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import may_ship
@@ -251,6 +252,12 @@ def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
         return align_text(model, clip.samples, SAMPLE_RATE_HZ, clip.transcript)
     except UserError:
         return None
+
+
+def label_clips(model: AcousticModel, clips: Iterable[LipClip]) -> dict[str, list[Phone]]:
+    """Find the phones of the clips in the model's language, by the names of the clips."""
+    known = [clip for clip in clips if clip.language == model.inventory.code]
+    return {clip.name: label_clip(model, clip) for clip in track(known, "phones of clips")}
 
 
 def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:

@@ -139,7 +139,9 @@ def train_blocks(
             seed=seed,
         )
         weights = [recording.weight for recording in recordings[: len(aligned)]]
-        statistics = statistics_of(aligned, weights, before.topology.phone_lm)
+        statistics = statistics_of(
+            [one.alignment for one in aligned], weights, before.topology.phone_lm
+        )
         _Labeled([*recordings, *_sung_copies(recordings, seed)], *statistics).save(labels)
     labeled = _Labeled.load(labels)
     encoder = BlockEncoder(whole.shape)

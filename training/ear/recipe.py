@@ -18,7 +18,7 @@ from torch import Tensor
 from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.corpora.lip_clips import (
     LipClip,
-    label_clip,
+    label_clips,
     no_clip_error,
     read_clips,
     training_clips,
@@ -160,12 +160,7 @@ def _load_lip_teacher(
         features = list(
             process_in_order(partial(teacher_features, teachers), [clip.samples for clip in clips])
         )
-        model = load_model(model_path("blocks"))
-        phones = {
-            clip.name: label_clip(model, clip)
-            for clip in clips
-            if clip.language == model.inventory.code
-        }
+        phones = label_clips(load_model(), clips)
         unfinished = path.with_suffix(".part")
         train_lip_teacher(clips, features, phones, seed).save(unfinished)
         unfinished.replace(path)

@@ -20,7 +20,7 @@ from rich.progress import track
 
 from kouxing.corpora.lip_clips import (
     LipClip,
-    label_clip,
+    label_clips,
     no_clip_error,
     read_clips,
     training_clips,
@@ -136,11 +136,7 @@ def _targets(
     model: AcousticModel, speech: Sequence[Speech], closed_at: dict[str, float]
 ) -> list[Floats]:
     """Compute the targets of every stretch, FAP units, (positions, delays, 17)."""
-    code = model.inventory.code
-    clips = {one.clip.name: one.clip for one in speech if one.clip.language == code}
-    phones = {
-        name: label_clip(model, clip) for name, clip in track(clips.items(), description="phones")
-    }
+    phones = label_clips(model, {one.clip.name: one.clip for one in speech}.values())
     return [
         targets_at(
             stretch.clip,

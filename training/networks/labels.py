@@ -51,13 +51,21 @@ class Mix:
     untranscribed: float  # share of recordings without text
 
 
-@dataclass(frozen=True, slots=True)
-class AlignedExample:
-    """A recording with the state of each frame."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alignment:
+    """The state of each frame of a recording."""
 
-    example: Example
     states: NDArray[np.int64]  # (frames,) STATES_PER_PHONE for each phone
     phones: list[Segment]
+    weight: float  # of the phones in statistics of durations
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedExample:
+    """A recording with its alignment."""
+
+    example: Example
+    alignment: Alignment
 
 
 def label(
@@ -112,12 +120,13 @@ def _recordings(aligned: Sequence[AlignedExample], mix: Mix) -> list[Recording]:
     """Weight aligned recordings: kinds of speech have fixed shares, rare speakers count more."""
     frames = dict.fromkeys(mix.kinds, 0.0)
     for one in aligned:
-        frames[one.example.kind] += one.example.weight * len(one.states)
+        frames[one.example.kind] += one.example.weight * len(one.alignment.states)
     recordings = []
     for one in aligned:
         kind = one.example.kind
-        weight = mix.kinds[kind] * one.example.weight * len(one.states) / frames[kind]
-        targets = Targets.hard(one.states)
+        states = one.alignment.states
+        weight = mix.kinds[kind] * one.example.weight * len(states) / frames[kind]
+        targets = Targets.hard(states)
         recordings.append(Recording(samples=one.example.samples, targets=targets, weight=weight))
     return recordings
 
@@ -138,7 +147,7 @@ def _align_all(aligner: AcousticModel, examples: Sequence[Example]) -> list[Alig
     if isinstance(aligner, NetworkModel):
         aligner = replace(aligner, acoustic_scale=1.0)
 
-    def align(number: int) -> tuple[NDArray[np.int64], list[Segment]] | None:
+    def align(number: int) -> Alignment | None:
         example = examples[number]
         graph = utterance_graph(
             example.phones, example.syllables, topology.first_state, silence=silence
@@ -148,22 +157,22 @@ def _align_all(aligner: AcousticModel, examples: Sequence[Example]) -> list[Alig
         path, _ = viterbi_path(rows, graph.states, graph, topology.log_stay, topology.log_leave)
         on_path = graph.states[path]
         states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
-        return (states, segments_of_path(path, graph)) if len(path) else None
+        if not len(path):
+            return None
+        phones = segments_of_path(path, graph)
+        return Alignment(states=states, phones=phones, weight=example.weight)
 
     alignments = process_in_order(align, range(len(examples)))
     tracked = track(examples, "aligned recordings")
-    aligned = [
-        AlignedExample(example, *alignment)
-        for alignment, example in zip(alignments, tracked, strict=True)
-        if alignment
-    ]
+    pairs = zip(tracked, alignments, strict=True)
+    aligned = [AlignedExample(example, alignment) for example, alignment in pairs if alignment]
     if not aligned:
         raise UserError("no recording fits its text; check the texts and the aligner")
     return aligned
 
 
 def statistics_of(
-    aligned: Sequence[AlignedExample], weights: Sequence[float], phone_lm: PhoneLanguageModel
+    aligned: Sequence[Alignment], weights: Sequence[float], phone_lm: PhoneLanguageModel
 ) -> tuple[Topology, NDArray[np.float32]]:
     """Count transitions and durations, and the states' log priors, (states,).
 
@@ -179,7 +188,7 @@ def statistics_of(
         occupied += in_states
         ends = np.append(np.flatnonzero(np.diff(one.states)), len(one.states) - 1)
         np.add.at(left, one.states[ends], 1.0)
-        durations.add(one.phones, one.example.weight)
+        durations.add(one.phones, one.weight)
     stay = np.clip(1 - left / occupied, _MIN_STAY, _MAX_STAY)
     mean_s, spread_s = durations.mean_and_spread_s()
     topology = Topology(

@@ -20,13 +20,8 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.model_card import write_card
-from kouxing.training.networks.labels import (
-    STATES_PER_PHONE,
-    AlignedExample,
-    statistics_of,
-)
+from kouxing.training.networks.labels import STATES_PER_PHONE, Alignment, statistics_of
 from kouxing.training.phone_lm.recipe import estimate_phone_lm, stream_of
-from kouxing.training.training_set import Example
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
 from kouxing.training.universal.export import extension_of
@@ -36,7 +31,6 @@ from kouxing.training.universal.trainer import CROPS_S, new_readout, train_reado
 
 _ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE = 0.7, 6.0, 1.0  # chosen on held-out recordings
 _LM_ORDER, _LM_NGRAMS = 3, 20_000
-_NO_LOG_MEL = np.empty((0, 0), np.float16)
 
 
 def train_universal(
@@ -127,24 +121,13 @@ def _statistics(
 ) -> tuple[Topology, NDArray[np.float32]]:
     """Count transitions, durations and n-grams of phones; return the states' log priors too."""
     aligned = [
-        AlignedExample(_example(recordings[name], weight_of[name]), path, _phones_of(path))
+        Alignment(states=path, phones=_phones_of(path), weight=weight_of[name])
         for name, path in states.items()
     ]
-    stream = stream_of([one.example.phones for one in aligned], inventory)
+    stream = stream_of([recordings[name].phones for name in states], inventory)
     phone_lm = estimate_phone_lm([stream], inventory, order=_LM_ORDER, max_ngrams=_LM_NGRAMS)
     weights = [weight_of[name] for name in states]
     return statistics_of(aligned, list(np.array(weights) / sum(weights)), phone_lm)
-
-
-def _example(recording: Utterance, weight: float) -> Example:
-    return Example(
-        log_mel=_NO_LOG_MEL,
-        phones=recording.phones,
-        syllables=recording.syllables,
-        weight=weight,
-        license=recording.license,
-        speaker=recording.speaker,
-    )
 
 
 def _phones_of(states: NDArray[np.int64]) -> list[Segment]:
