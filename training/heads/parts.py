@@ -96,15 +96,9 @@ class HeadPiece:
     def keep(self, kept: NDArray[np.bool_]) -> None:
         """Remove the other triangles (F,) of a piece without coarse ones, and unused vertices."""
         part = self.part
-        used, triangles = np.unique(part.triangles[kept], return_inverse=True)
-        welds = _welds(part)[used]
-        _, first, same = np.unique(welds, return_index=True, return_inverse=True)
+        used, triangles, welds = subdivision.used_vertices(part.triangles[kept], _welds(part))
         self.part = Geometry(
-            part.vertices[used],
-            triangles.reshape(-1, 3),
-            part.uv[used],
-            part.colors[used],
-            first[same],
+            part.vertices[used], triangles, part.uv[used], part.colors[used], welds
         )
         self.head_weight = self.head_weight[used]
         self.fields = {fap: shift[used] for fap, shift in self.fields.items()}

@@ -96,6 +96,16 @@ def triangles_of(quads: Index) -> Index:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
+def used_vertices(triangles: Index, welds: Index) -> tuple[Index, Index, Index]:
+    """Return the vertices (W,) that triangles (F, 3) use, and triangles and welds (W,) of these.
+
+    ``welds`` (V,) has the first vertex at the same position.
+    """
+    used, corners = np.unique(triangles, return_inverse=True)
+    _, first, same = np.unique(welds[used], return_index=True, return_inverse=True)
+    return used, corners.reshape(-1, 3), first[same]
+
+
 def vertex_normals(vertices: Float, triangles: Index) -> Float:
     """Return the unit normals (V, 3): area-weighted means over the adjacent triangles."""
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))

