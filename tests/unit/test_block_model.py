@@ -34,7 +34,7 @@ SCALE = np.float32(0.5)
 @cache
 def networks(num_states: int = 180) -> tuple[BlockEncoder, BlockReadout]:
     torch.manual_seed(0)
-    encoder = BlockEncoder(SMALL(num_states=num_states)).eval()
+    encoder = BlockEncoder(SMALL()).eval()
     with torch.no_grad():  # trained weights are larger than initial ones
         encoder.first.weight *= 6
         encoder.second.weight *= 6

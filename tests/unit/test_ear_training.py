@@ -14,7 +14,7 @@ from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.services.recognizer.onnx_session import open_network
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.training.ear import batches, lip_teacher, targets, teachers
+from kouxing.training.ear import batches, lip_teacher, targets
 from kouxing.training.ear.batches import Material, batch_of, inputs_of
 from kouxing.training.ear.export import onnx_of
 from kouxing.training.ear.network import NUM_FEATURES, NUM_LIPS, Ear
@@ -23,6 +23,7 @@ from kouxing.training.ear.singing import sing
 from kouxing.training.ear.targets import PITCH, VOICE, Columns, Piece
 from kouxing.training.ear.teachers import POSITION_SAMPLES
 from kouxing.training.networks import optimizer
+from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import Shape
 from tests.system import DEMO
 from tests.unit.test_lips_training import name_for, write_clip
@@ -38,7 +39,7 @@ COLUMNS = Columns(NUM_PHONES)
 
 @pytest.fixture
 def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(teachers, "Shape", partial(Shape, width=64, heads=2, inner=48))
+    monkeypatch.setattr(whisper_weights, "Shape", partial(Shape, width=64, heads=2, inner=48))
     return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6, width=64))
 
 

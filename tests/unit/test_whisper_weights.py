@@ -19,7 +19,7 @@ from tests.whisper_folder import encoder_arrays, write_whisper
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 SMALL = partial(Shape, width=32, heads=2, layers=2, inner=48)
-SHAPE = SMALL(num_states=6)
+SHAPE = SMALL()
 
 
 # --- Whisper's weights

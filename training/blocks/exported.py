@@ -22,7 +22,6 @@ def encoder_of(model: BlockModel) -> BlockEncoder:
     """Rebuild the encoder."""
     tensors, sizes = _tensors_of(model), model.session.sizes
     shape = Shape(
-        num_states=model.topology.num_states,
         width=sizes.width,
         heads=sizes.heads,
         layers=sizes.layers,

@@ -121,7 +121,7 @@ def train_blocks(
     torch.set_float32_matmul_precision("high")  # faster on a GPU
     torch.manual_seed(seed)
     num_states = STATES_PER_PHONE * len(before.inventory)
-    whole = init_encoder(whisper, num_states)
+    whole = init_encoder(whisper)
     errors = RowErrors()
     backgrounds = training_backgrounds(read_sounds(sounds, shipping=shipping))
     examples = load_examples(

@@ -37,9 +37,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.blocks.exported import encoder_of, readout_of
 from kouxing.training.blocks.network import layout
 from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.networks.network import Shape
-from kouxing.training.networks.teacher import NUM_LAYERS, WholeEncoder
-from kouxing.training.networks.whisper import load_whisper
+from kouxing.training.networks.whisper import init_encoder
 
 Floats = NDArray[np.float32]
 
@@ -67,9 +65,8 @@ class Teachers:
 
     def __init__(self, blocks: BlockModel, whisper: Path) -> None:
         self._blocks, self._readout = encoder_of(blocks), readout_of(blocks)
-        self._encoder = WholeEncoder(Shape(num_states=0, layers=NUM_LAYERS), _ENCODER_LAYERS)
-        load_whisper(self._encoder, whisper)
-        self._networks = (self._blocks, self._readout, self._encoder.eval())
+        self._encoder = init_encoder(whisper, _ENCODER_LAYERS)
+        self._networks = (self._blocks, self._readout, self._encoder)
         self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
         self._first_state = blocks.topology.first_state
         self.digest = hashlib.sha256(blocks.network.tobytes()).hexdigest()

@@ -90,11 +90,12 @@ def label(
     recordings = _recordings(aligned, mix)
     num_of_kind = dict.fromkeys(mix.kinds, 0)
     teacher_set = []
+    num_states = STATES_PER_PHONE * len(aligner.inventory)
     for one, recording in zip(aligned, recordings, strict=True):
         num_of_kind[one.example.kind] += 1
         if num_of_kind[one.example.kind] <= _TEACHER_SET:
             teacher_set.append(recording)
-    teacher = train_teacher(encoder, teacher_set, seed=seed)
+    teacher = train_teacher(encoder, teacher_set, num_states, seed=seed)
     sounds = [sound for pieces in folders for sound in pieces]
     all_sounds = [*(recording.samples for recording in recordings), *sounds]
     labels = teacher.label(all_sounds)

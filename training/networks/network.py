@@ -40,7 +40,6 @@ PADDING_FRAMES = 2  # of zeros, before a segment's first
 class Shape:
     """Sizes of a network; the defaults are those of Whisper base."""
 
-    num_states: int
     width: int = 512
     heads: int = 8
     layers: int = 4

@@ -153,7 +153,9 @@ class Teacher:
                 yield Targets(row[kept].astype(np.uint16), probs[kept].astype(np.float16))
 
 
-def train_teacher(encoder: WholeEncoder, recordings: Sequence[Recording], *, seed: int) -> Teacher:
+def train_teacher(
+    encoder: WholeEncoder, recordings: Sequence[Recording], num_states: int, *, seed: int
+) -> Teacher:
     """Train a readout on recordings whose targets are the states of an alignment.
 
     Their features stay in memory, 150 KB a second with Whisper base.
@@ -171,7 +173,7 @@ def train_teacher(encoder: WholeEncoder, recordings: Sequence[Recording], *, see
         targets = recordings[number].targets.of(slice(2 * start, 2 * end))
         return features[number][start:end], targets
 
-    readout = Readout(features[0].shape[1], encoder.shape.num_states, READOUT).to(DEVICE)
+    readout = Readout(features[0].shape[1], num_states, READOUT).to(DEVICE)
     drawn = rng.choice(len(sampling), size=_NUM_STANDARDIZED, p=sampling)
     readout.standardize(torch.cat([torch.from_numpy(features[one]).float() for one in drawn]))
 

@@ -27,6 +27,7 @@ file is not trusted, so every size in it is checked.
 import math
 import mmap
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import open_file
 from kouxing.training.device import DEVICE
 from kouxing.training.networks.network import Encoder, Shape
-from kouxing.training.networks.teacher import NUM_LAYERS, WholeEncoder
+from kouxing.training.networks.teacher import KEPT_LAYERS, NUM_LAYERS, WholeEncoder
 
 _FILE_NAME = "model.bin"
 _MIN_VERSION = 4
@@ -161,8 +162,8 @@ def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
     return name, array
 
 
-def init_encoder(whisper: Path, num_states: int) -> WholeEncoder:
+def init_encoder(whisper: Path, kept_layers: Sequence[int] = KEPT_LAYERS) -> WholeEncoder:
     """Make the teacher's encoder, with Whisper's weights."""
-    encoder = WholeEncoder(Shape(num_states=num_states, layers=NUM_LAYERS))
+    encoder = WholeEncoder(Shape(layers=NUM_LAYERS), kept_layers)
     load_whisper(encoder, whisper)
     return encoder.eval().to(DEVICE)
