@@ -4,7 +4,6 @@ Messages have sequence numbers, and the receiver acknowledges them cumulatively.
 unacknowledged messages, because ZeroMQ drops messages in flight when a peer disconnects.
 """
 
-import dataclasses
 import math
 from collections import deque
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from itertools import islice
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import combine
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5
@@ -40,9 +39,7 @@ class ReliableSender:
 
         Results wait for the ``progress`` after them, because only that makes a frame.
         """
-        numbered = dataclasses.replace(
-            message, session=self._session, epoch=self.epoch, sequence=self._next
-        )
+        numbered = replace(message, session=self._session, epoch=self.epoch, sequence=self._next)
         self._next += 1
         if not self.unacknowledged:
             self._progress_s = now_s
@@ -135,7 +132,7 @@ class ReliableReceiver:
         if self._peer is NO_PEER:
             return
         self._acknowledged = self._last
-        answer = dataclasses.replace(
+        answer = replace(
             self._make_acknowledgement(),
             session=self._session,
             epoch=self._epoch,

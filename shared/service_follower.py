@@ -88,8 +88,8 @@ class _ServiceTransport:
         on_message: Callable[[Any], None],
     ) -> Socket:
         socket = self._service.bus.connect_subscriber(*sorted(addresses), live=live_addresses)
-        handlers = dict.fromkeys((*classes, Joined), lambda message, _: on_message(message))
-        self._service.register(socket, handlers)
+        kinds: list[type[Message]] = [*classes, Joined]
+        self._service.register(socket, dict.fromkeys(kinds, lambda message, _: on_message(message)))
         self._on_message[socket] = on_message
         socket.subscribe_session(classes, session)
         return socket

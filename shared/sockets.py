@@ -27,6 +27,7 @@ ERROR_COST = 4.0  # of the sender's budget, for each message that is answered wi
 ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report has 15 MB
 MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
+MAX_FOLLOWED = 4096  # subscriptions; with more, messages are also encoded for nobody
 MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
 T = TypeVar("T", int, str)
 
@@ -65,6 +66,8 @@ class Socket:
         self._has_rest = False  # parts of it that nobody wants
         self._rest_from: Connection | None = None  # whose they are
         self._name = secrets.token_hex(8)
+        self._followed: set[bytes] = set()  # subscriptions, now or before
+        self._prefixes: tuple[bytes, ...] = ()  # those that are not a whole topic
 
     @property
     def endpoint(self) -> str:
@@ -81,6 +84,8 @@ class Socket:
 
         An answer to the message that is being handled reduces its sender's budget.
         """
+        if self._publishes and not self._is_followed(topic(type(message), message.session)):
+            return True
         parts = encode(message)
         if self._connection is not None and to == self._sender:
             cost = ERROR_COST if isinstance(message, Error) else 0.0
@@ -95,6 +100,19 @@ class Socket:
             self._limited.num_sent += 1
         return True
 
+    def _is_followed(self, label: bytes) -> bool:
+        """Return whether a topic may have a subscriber. Encoding for nobody takes time."""
+        return label in self._followed or label.startswith(self._prefixes)
+
+    def _follow(self, wanted: bytes) -> None:
+        """Record that a subscription, a topic or a prefix of topics, is in effect."""
+        if len(self._followed) == MAX_FOLLOWED:
+            self._prefixes = (b"",)
+        elif wanted not in self._followed:
+            self._followed.add(wanted)
+            if wanted.count(b"/") < 2:  # not a whole topic
+                self._prefixes += (wanted,)
+
     def subscribe(self, kind: type[Message], session: str | None) -> None:
         """Subscribe to a kind of message, of one session or of all (None)."""
         prefix = f"{kind.kind}/".encode() if session is None else topic(kind, session)
@@ -106,7 +124,8 @@ class Socket:
         Every publisher answers with one ``joined`` message when all of them are in effect:
         subscriptions keep their order, and the one to ``joined`` is the last.
         """
-        for kind in (*kinds, Joined):
+        wanted: list[type[Message]] = [*kinds, Joined]
+        for kind in wanted:
             self.subscribe(kind, session)
 
     def receive(self) -> Iterator[Received]:
@@ -248,6 +267,7 @@ class Socket:
             self.raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
         elif verb == b"\x01" and may:
             self.raw.setsockopt(zmq.SUBSCRIBE, wanted)
+            self._follow(wanted)
             self._confirm_subscription(wanted)
 
     def _confirm_subscription(self, wanted: bytes) -> None:

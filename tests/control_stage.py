@@ -1,7 +1,6 @@
 """Control with two services that start every session at once."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import zmq
 from kouxing_client.keys import Key
@@ -15,7 +14,7 @@ from kouxing.shared.keys import load_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import Error, OpenSession
 from tests.system import wait_until
 

@@ -4,7 +4,6 @@ Each step is sent to the services and the client of the session, and is publishe
 """
 
 import time
-from dataclasses import replace
 
 from kouxing.services.control.move_repeats import MoveRepeats
 from kouxing.services.control.registry import Registry
@@ -15,7 +14,7 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Event, EventName
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode
 
 START_TIMEOUT_S = 5.0

@@ -6,7 +6,7 @@ A worker provides endpoints and needs others. An observer takes part in every se
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import itemgetter
 
 from kouxing.services.control.load import WorkerLoad
@@ -17,6 +17,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 from kouxing.shared.wire.control import Heartbeat
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
 MAX_SERVICES = 2000
@@ -232,13 +233,12 @@ class Registry:
 
     def facts(self, instances: Iterable[str]) -> SessionFacts:
         """Return what services together state about their sessions."""
-        stated = [asdict(self._services[instance].heartbeat.facts) for instance in instances]
-        return SessionFacts(
-            **{
-                name: next((facts[name] for facts in stated if facts[name] is not None), None)
-                for name in asdict(SessionFacts())
-            }
-        )
+        facts = SessionFacts()
+        for instance in instances:
+            stated = self._services[instance].heartbeat.facts
+            unknown = [name for name in facts.__struct_fields__ if getattr(facts, name) is None]
+            facts = replace(facts, **{name: getattr(stated, name) for name in unknown})
+        return facts
 
     # --- loads and silence ---------------------------------------------------------------------
 

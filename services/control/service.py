@@ -9,7 +9,6 @@ After a restart, control learns the sessions from the services that serve them.
 import secrets
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
@@ -32,7 +31,7 @@ from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
 from kouxing.shared.wire.control import Event, EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,

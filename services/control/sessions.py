@@ -5,7 +5,6 @@ import secrets
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import count
 from operator import attrgetter
 
@@ -18,6 +17,7 @@ from kouxing.shared.keys import MAX_KEY_SHARE, Peer
 from kouxing.shared.phones.inventory import find_language
 from kouxing.shared.wire.control import Heartbeat, StartSession
 from kouxing.shared.wire.face import CurrentFace, FaceSettings
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import ErrorCode, OpenSession
 
 

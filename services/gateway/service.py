@@ -12,7 +12,7 @@ import math
 import secrets
 import time
 from collections.abc import Coroutine
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from aiohttp import web
 
@@ -44,7 +44,7 @@ from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import phone_of
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Acoustic, Phone, Speech
 

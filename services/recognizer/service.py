@@ -6,7 +6,6 @@ Sends: phone, lip-positions, speech, progress (synthesizer, acknowledged), the s
 but with the audio itself (subscribers), speech (control), acknowledge, error (clients).
 """
 
-import dataclasses
 import math
 import time
 from collections.abc import Iterable, Sequence
@@ -33,16 +32,16 @@ from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
-from kouxing.shared.phones.events import Progress, SpeechChange, Waveform
+from kouxing.shared.phones.events import Progress, Waveform
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
-from kouxing.shared.wire.speech import Acknowledge
+from kouxing.shared.wire.speech import Acknowledge, Speech
 
 MAX_QUEUED_S = 60.0  # of live audio; further audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, and in total
@@ -117,10 +116,7 @@ class RecognizerService(Service):
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
         self._read_late_audio()
         self._live.decode([*self._sessions.values()])
-        is_live_waiting = self._has_live_audio or (
-            not self._is_live_blocked and self._audio.wait(0.0)
-        )
-        if not self._is_unpaced_blocked and not is_live_waiting:
+        if self._unpaced and not self._is_unpaced_blocked and not self._is_live_waiting:
             self._decode_unpaced()
 
     def wait(self, timeout_s: float) -> list[Socket]:
@@ -143,7 +139,7 @@ class RecognizerService(Service):
         """Return the sessions, as they are now, for a restarted control."""
         now_s = time.monotonic()
         for session in self._sessions.values():
-            yield dataclasses.replace(session.start, face=session.face.at(now_s))
+            yield replace(session.start, face=session.face.at(now_s))
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
         self._starting.set_face(message.session, message.face)
@@ -297,6 +293,10 @@ class RecognizerService(Service):
         return any(session.audio and not session.is_scoring for session in sessions)
 
     @property
+    def _is_live_waiting(self) -> bool:
+        return self._has_live_audio or (not self._is_live_blocked and self._audio.wait(0.0))
+
+    @property
     def _live_audio_s(self) -> float:
         """Duration of the live audio that is not decoded yet."""
         return sum(session.audio.duration_s for session in self._sessions.values())
@@ -388,11 +388,10 @@ class RecognizerService(Service):
         results = session.new_results(self._recognizer)
         if (acoustic := session.acoustic_message(results)) is not None:
             session.replay.send(acoustic, now_s)
-        for result in results:
-            if (published := session.published_message(result)) is not None:
-                session.replay.send(published, now_s)
-                if isinstance(result, SpeechChange):
-                    self.send_to_control(published)
+        for published in session.published_messages(results):
+            session.replay.send(published, now_s)
+            if isinstance(published, Speech):
+                self.send_to_control(published)
         for result in results:
             if not isinstance(result, Waveform):
                 session.link.send(message_of(result), now_s)

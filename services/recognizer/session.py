@@ -2,30 +2,30 @@
 
 import math
 import secrets
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 from kouxing.services.recognizer.audio_order import AudioOrder
-from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
+from kouxing.services.recognizer.front_end.pcm import BadAudio, samples_of
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_audio import LiveAudio
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
+from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
-from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
+from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, Overload
-from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange, Waveform
+from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
 from kouxing.shared.replay import Replay
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AudioChunk, Sound
+from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import (
     Acknowledge,
@@ -109,6 +109,7 @@ class RecognizerSession:
         self.acknowledged_s = 0.0
         self.is_laughing = False  # the speaker
         self._published_acoustic = AcousticModelName.FULL
+        self._sound = SoundPackets((start.facts.delay_ms or 0.0) / 1e3)
         self.sequence_out = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
@@ -230,16 +231,13 @@ class RecognizerSession:
         results = recognizer.get_result(self.stream)
         return results if self.resumption is None else self.resumption.new_results(results)
 
-    def published_message(self, result: StreamOutput) -> Message | None:
-        """Return the message of a result for subscribers; None if they do not get it."""
-        message: Message
-        if isinstance(result, Waveform):
-            message = Sound(media_time=to_samples(result.time_s), pcm=pcm16_of(result.samples))
-        elif isinstance(result, Phone | LipPositions | SpeechChange):
-            message = message_of(result)
-        else:
-            return None
-        return self._numbered(message)
+    def published_messages(self, results: Iterable[StreamOutput]) -> Iterator[Message]:
+        """Yield the messages of results for subscribers."""
+        for result in results:
+            if isinstance(result, Phone | LipPositions | SpeechChange):
+                yield self._numbered(message_of(result))
+            else:
+                yield from map(self._numbered, self._sound.add(result))
 
     def acoustic_message(self, results: Sequence[StreamOutput]) -> Acoustic | None:
         """Return the message about the acoustic model in use, if these results make it due."""

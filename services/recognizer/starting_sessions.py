@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.message import replace
 
 
 class StartingSessions:

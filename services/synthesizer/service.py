@@ -14,7 +14,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
@@ -50,7 +49,7 @@ from kouxing.shared.wire.events import (
     separate,
 )
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import (
     AudioState,

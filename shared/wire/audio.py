@@ -1,6 +1,5 @@
 """A session's audio: from the client to the recognizer, and from there to all subscribers."""
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from msgspec import Meta
@@ -8,8 +7,7 @@ from msgspec import Meta
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message, Name
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AudioChunk(Message):
+class AudioChunk(Message, frozen=True, kw_only=True):
     """PCM in the session's encoding; media_time is that of its first sample."""
 
     token: Name
@@ -18,8 +16,7 @@ class AudioChunk(Message):
     acknowledge: bool = False  # the client reads acknowledge messages and resends lost messages
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sound(Message):
+class Sound(Message, frozen=True, kw_only=True):
     """The session's audio as the recognizer reads it: 16 kHz mono."""
 
     published_at: ClassVar[str | None] = "phones"

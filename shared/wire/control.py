@@ -1,10 +1,9 @@
 """Messages between control and the services, and the events that control publishes."""
 
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import Meta, Struct, field
 
 from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
 from kouxing.shared.wire.face import FaceSettings
@@ -50,8 +49,7 @@ class EventName(StrEnum):
     SPEECH_STOP = "speech-stop"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionInput:
+class SessionInput(Struct, frozen=True, kw_only=True):
     """How far a service has processed the input of one session."""
 
     idle_s: Seconds = 0.0  # since its last input
@@ -61,8 +59,7 @@ class SessionInput:
     skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Heartbeat(Message):
+class Heartbeat(Message, frozen=True, kw_only=True):
     """A service's loop is running; the first heartbeat registers the service with control."""
 
     service: Name
@@ -86,16 +83,14 @@ class Heartbeat(Message):
     )  # that it takes part in
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AllowedKey:
+class AllowedKey(Struct, frozen=True, kw_only=True):
     """The name of a key and what its owner may do."""
 
     name: Name
     roles: Annotated[list[Name], Meta(max_length=MAX_ROLES)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeartbeatReply(Message):
+class HeartbeatReply(Message, frozen=True, kw_only=True):
     """Control's answer to a heartbeat; the four timestamps give the offset of the clocks."""
 
     sent_ns: int  # as in the heartbeat
@@ -107,8 +102,7 @@ class HeartbeatReply(Message):
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartSession(Message):
+class StartSession(Message, frozen=True, kw_only=True):
     """Control tells a service to serve a session; again with a greater epoch after a move.
 
     Phones whose middle is before ``media_time`` are already known.
@@ -131,8 +125,7 @@ class StartSession(Message):
     client_request: Name | None = None  # of its open-session
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionStarted(Message):
+class SessionStarted(Message, frozen=True, kw_only=True):
     """A service serves a session.
 
     The session's phones are final up to ``media_time``; 0 if the service has no phones.
@@ -142,8 +135,7 @@ class SessionStarted(Message):
     start: StartSession | None = None  # for a restarted control, which does not have the session
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Event(Message):
+class Event(Message, frozen=True, kw_only=True):
     """Something happened. A service sends it to control, which numbers and publishes it."""
 
     name: Name  # an EventName, or one of a later build

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from msgspec import Meta
+from msgspec import Meta, Struct, field
 
 from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
@@ -14,7 +14,14 @@ from kouxing.shared.face.expressions import (
     MIN_EXPRESSIVENESS,
 )
 from kouxing.shared.face.shape_names import MAX_SHAPES
-from kouxing.shared.wire.message import FapMask, FapValues, Message, Name, SessionName
+from kouxing.shared.wire.message import (
+    FapMask,
+    FapValues,
+    Message,
+    Name,
+    SessionName,
+    replace,
+)
 
 Strength = Annotated[float, Meta(ge=0, le=1)]
 ExpressionMap = Annotated[dict[Name, Strength], Meta(max_length=32)]
@@ -22,8 +29,7 @@ ShapeSets = Annotated[list[Name], Meta(max_length=16)]
 ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FaceSettings:
+class FaceSettings(Struct, frozen=True, kw_only=True):
     """How a session's face moves. A setting without a value does not change."""
 
     lip_model: Name | None = None
@@ -46,8 +52,8 @@ class FaceSettings:
         expressed = self if change.expressions is None else change
         changed = {
             name: value
-            for field in fields(change)
-            if (value := getattr(change, name := field.name)) is not None
+            for name in change.__struct_fields__
+            if (value := getattr(change, name)) is not None
         }
         return replace(
             self,
@@ -85,16 +91,14 @@ class CurrentFace:
         return self.settings.after(now_s - self.set_at_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetFace(Message):
+class SetFace(Message, frozen=True, kw_only=True):
     """Changes a session's face. Sent by a client to control, and by control to the services."""
 
     face: FaceSettings
     request: Name | None = None  # None: no answer is needed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FapFrame(Message):
+class FapFrame(Message, frozen=True, kw_only=True):
     """The face that belongs to the audio at media_time."""
 
     published_at: ClassVar[str | None] = "faps"
@@ -105,8 +109,7 @@ class FapFrame(Message):
     shapes: Annotated[dict[Name, ShapeWeights], Meta(max_length=16)] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EndOfFaps(Message):
+class EndOfFaps(Message, frozen=True, kw_only=True):
     """The session has no more FAP frames."""
 
     published_at: ClassVar[str | None] = "faps"

@@ -9,10 +9,10 @@ other change needs a new version.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from msgspec import Meta
+from msgspec import Meta, Struct
+from msgspec.structs import replace as replace  # noqa: PLC0414 - messages cannot be changed
 
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.names import NAME_OR_EMPTY
@@ -42,8 +42,7 @@ LipValues = Annotated[bytes, Meta(min_length=4 * len(MOUTH_FAPS), max_length=4 *
 MESSAGES: dict[str, type[Message]] = {}  # every class by its kind, once its module is imported
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
+class Message(Struct, frozen=True, kw_only=True):
     """The fields that every message has."""
 
     kind: ClassVar[str]  # the class name in kebab-case

@@ -1,10 +1,9 @@
 """Messages between a client and control, and the confirmation of subscriptions."""
 
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import Meta, Struct, field
 
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
@@ -52,8 +51,7 @@ class ErrorCode(StrEnum):
     UNKNOWN_SESSION = "unknown-session"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionFacts:
+class SessionFacts(Struct, frozen=True, kw_only=True):
     """Facts about a session's results; each of its workers states some facts."""
 
     language: Name | None = None  # of the phones
@@ -62,8 +60,7 @@ class SessionFacts:
     lip_model: Name | None = None  # of a face without a chosen one
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lateness:
+class Lateness(Struct, frozen=True, kw_only=True):
     """Lateness of the frames that left a live session's synthesizer in the last 10 s."""
 
     p50_ms: Milliseconds
@@ -71,8 +68,7 @@ class Lateness:
     worst_ms: Milliseconds
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OpenSession(Message):
+class OpenSession(Message, frozen=True, kw_only=True):
     """A client asks for a session; if the session name is empty, control chooses one."""
 
     request: Name  # repeated in the answer
@@ -86,8 +82,7 @@ class OpenSession(Message):
     face: FaceSettings = field(default_factory=FaceSettings)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionOpened(Message):
+class SessionOpened(Message, frozen=True, kw_only=True):
     """The session exists; connect to these endpoints."""
 
     request: Name
@@ -99,8 +94,7 @@ class SessionOpened(Message):
     facts: SessionFacts
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionMoved(Message):
+class SessionMoved(Message, frozen=True, kw_only=True):
     """Other workers serve the session from now on; ``epoch`` is the new one.
 
     Sent to the client, and published for all followers of the session.
@@ -112,8 +106,7 @@ class SessionMoved(Message):
     next_sequence: Count | None = None  # first audio message to resend; None: the recognizer stays
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CloseSession(Message):
+class CloseSession(Message, frozen=True, kw_only=True):
     """The session is over; the services forget it.
 
     Sent by a client to control, and by control to the services.
@@ -123,8 +116,7 @@ class CloseSession(Message):
     token: Name | None = None  # a client must give it
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlushSession(Message):
+class FlushSession(Message, frozen=True, kw_only=True):
     """Interrupts: audio not yet shown is dropped and the face returns to rest.
 
     Sent by a client to control, and by control to the services.
@@ -134,16 +126,14 @@ class FlushSession(Message):
     token: Name
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusRequest(Message):
+class StatusRequest(Message, frozen=True, kw_only=True):
     """Asks for the state of the whole system, or of one session and its services."""
 
     request: Name
     after: Count = 0  # ``next`` of the page before
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServiceState:
+class ServiceState(Struct, frozen=True, kw_only=True):
     """One service, from its newest heartbeat."""
 
     service: Name  # recognizer, driver, ...
@@ -157,8 +147,7 @@ class ServiceState:
     build: Text = ""  # version of kouxing
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionState:
+class SessionState(Struct, frozen=True, kw_only=True):
     """One session."""
 
     session: SessionName
@@ -172,8 +161,7 @@ class SessionState:
     skipped_s: Seconds = 0.0  # total duration of the audio skipped on a busy machine
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusReport(Message):
+class StatusReport(Message, frozen=True, kw_only=True):
     """The answer to a status request."""
 
     request: Name
@@ -183,15 +171,13 @@ class StatusReport(Message):
     resting_face: FaceSettings | None = None  # settings of the face at rest that are in effect
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Done(Message):
+class Done(Message, frozen=True, kw_only=True):
     """Control has carried out a request."""
 
     request: Name
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Error(Message):
+class Error(Message, frozen=True, kw_only=True):
     """A request or message was refused.
 
     The kind and these fields exist in every version of the protocol. A message of another version
@@ -204,8 +190,7 @@ class Error(Message):
     retry_after_s: Annotated[Seconds, Meta(le=3600)] | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Joined(Message):
+class Joined(Message, frozen=True, kw_only=True):
     """A publisher's answer to a subscription to ``joined/<session>/``.
 
     The subscriber's earlier subscriptions are in effect.

@@ -1,10 +1,9 @@
 """The recognizer's results, and the synthesizer's acknowledgement."""
 
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
-from msgspec import Meta
+from msgspec import Meta, Struct, field
 
 from kouxing.shared.wire.message import (
     Count,
@@ -40,8 +39,7 @@ class AcousticModelName(StrEnum):
     LIGHT = "light"  # fewer right phones, in less time
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Speech(Message):
+class Speech(Message, frozen=True, kw_only=True):
     """Voice activity started (active) or ended at media_time."""
 
     published_at: ClassVar[str | None] = "phones"
@@ -49,8 +47,7 @@ class Speech(Message):
     active: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Acoustic(Message):
+class Acoustic(Message, frozen=True, kw_only=True):
     """The acoustic model that finds the phones from now on. Repeated when speech starts."""
 
     published_at: ClassVar[str | None] = "phones"
@@ -58,8 +55,7 @@ class Acoustic(Message):
     model: Name = AcousticModelName.FULL
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Phone(Message):
+class Phone(Message, frozen=True, kw_only=True):
     """A recognized phone; media_time is its onset. A message with the same index revises it."""
 
     published_at: ClassVar[str | None] = "phones"
@@ -71,8 +67,7 @@ class Phone(Message):
     final: bool  # false: the duration is an estimate
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LipPositions(Message):
+class LipPositions(Message, frozen=True, kw_only=True):
     """The mouth at media_time, from a lip model that works on the audio itself."""
 
     published_at: ClassVar[str | None] = "phones"
@@ -83,8 +78,7 @@ class LipPositions(Message):
     lip_to_teeth: Probability  # that the lower lip touches the teeth
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NewestFrame:
+class NewestFrame(Struct, frozen=True, kw_only=True):
     """The newest FAP frame that a synthesizer has published."""
 
     sequence: Count
@@ -92,8 +86,7 @@ class NewestFrame:
     values: FapValues  # 68 float32, little-endian, in FAP units
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress(Message):
+class Progress(Message, frozen=True, kw_only=True):
     """The audio is processed up to media_time."""
 
     state: Name = AudioState.RUNNING
@@ -108,8 +101,7 @@ class Progress(Message):
     newest_frame: NewestFrame | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Results(Message):
+class Results(Message, frozen=True, kw_only=True):
     """Messages that the recognizer sends together; ``sequence`` is their order."""
 
     phones: Annotated[list[Phone], _TOGETHER] = field(default_factory=list)
@@ -118,8 +110,7 @@ class Results(Message):
     progress: Annotated[list[Progress], _TOGETHER] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Acknowledge(Message):
+class Acknowledge(Message, frozen=True, kw_only=True):
     """Every message of the session up to ``sequence`` has arrived.
 
     Sent by the recognizer to the client, and by the synthesizer to the recognizer.

@@ -1,6 +1,5 @@
 """The documents in proto/, the schema and the code agree."""
 
-import dataclasses
 import json
 import re
 from pathlib import Path
@@ -39,7 +38,7 @@ PROTOCOL, MESSAGES_DOCUMENT, VALUES = (
     (ROOT / "proto" / name).read_text(encoding="utf-8")
     for name in ("PROTOCOL.md", "MESSAGES.md", "VALUES.md")
 )
-COMMON = {field.name for field in dataclasses.fields(Message)}
+COMMON = {*Message.__struct_fields__}
 STRUCTURES: dict[str, type[Any]] = {
     **MESSAGES,
     "service-state": ServiceState,
@@ -76,7 +75,7 @@ def type_text(kind: msgspec.inspect.Type) -> str:
             return f"map of str to {type_text(kind.value_type)}"
         case msgspec.inspect.ListType():
             return f"list of {type_text(kind.item_type)}"
-        case msgspec.inspect.DataclassType():
+        case msgspec.inspect.StructType():
             return f"`{WIRE_NAME[kind.cls]}`"
         case msgspec.inspect.UnionType():
             return f"{type_text(some_type(kind))} or null"
@@ -146,7 +145,7 @@ def default_text(field: msgspec.inspect.Field) -> str:
 def expected_rows(cls: type[Any]) -> list[list[str]]:
     """Return field, type, range and default as the document must have them."""
     info = msgspec.inspect.type_info(cls)
-    assert isinstance(info, msgspec.inspect.DataclassType)
+    assert isinstance(info, msgspec.inspect.StructType)
     return [
         [f"`{field.name}`", type_text(field.type), range_text(field.type), default_text(field)]
         for field in info.fields
@@ -170,7 +169,7 @@ def test_the_schema_the_samples_and_the_document_have_the_same_messages() -> Non
     described = re.findall(r"^### `([a-z-]+)`$", MESSAGES_DOCUMENT, re.MULTILINE)
     assert sorted(described) == sorted(STRUCTURES)
     for cls in (SessionOpened, SessionMoved):
-        assert set(CLIENT_NEEDS) <= {field.name for field in dataclasses.fields(cls)}
+        assert set(CLIENT_NEEDS) <= {*cls.__struct_fields__}
 
 
 @pytest.mark.parametrize("name", STRUCTURES)

@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,7 +19,7 @@ from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionInput
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
 from tests.e2e.following import Stream, samples_of_file
@@ -63,7 +62,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
     before = instances(client)
     with Bus(load_key(name, ())) as bus:
         stranger = bus.connect_dealer(system.control)
-        stranger.send(replace(HEARTBEAT, **forged))  # type: ignore[arg-type]
+        stranger.send(replace(HEARTBEAT, **forged))
         assert next(answers(stranger, Error)).code == "not-allowed"
     assert instances(client) == before
     session = client.open_session(paced=False)

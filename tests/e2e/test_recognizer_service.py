@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -20,7 +19,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, replace
 from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START

@@ -1,7 +1,6 @@
 """Control repeats an answer, with its token, only to the client that sent the request."""
 
 import contextlib
-import dataclasses
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -15,6 +14,7 @@ from kouxing.shared.keys import add_key, read_key, revoke_key, user_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
 from kouxing.shared.wire.face import FaceSettings, SetFace
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
 from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage
@@ -145,11 +145,11 @@ def test_a_client_that_missed_the_answer_opens_the_session_again(
 def test_a_session_with_audio_is_not_opened_again(stage: Stage, link: ControlProxy) -> None:
     client, _ = disconnect_before_the_answer(stage, link)
     record = stage.control._sessions.find("mine")
-    recognizer = dataclasses.replace(
+    recognizer = replace(
         stage.control._registry["recognizer"].heartbeat, sessions={"mine": SessionInput(sequence=1)}
     )
     endpoints = dict.fromkeys(recognizer.endpoints, "tcp://127.0.0.1:1")
-    stage.services[0].send(dataclasses.replace(recognizer, endpoints=endpoints))
+    stage.services[0].send(replace(recognizer, endpoints=endpoints))
     stage.step_until(lambda: record.next_sequence == 2)
     assert getattr(stage.open(client, "mine"), "code", "") == "session-exists"
 

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, cast
 
 import pytest
@@ -13,6 +12,7 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port

@@ -4,7 +4,6 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
 from functools import cache
 from typing import Any, cast
 
@@ -26,7 +25,7 @@ from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message, replace
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
 from tests.control_stage import LOCAL, PROVIDED, beat
 from tests.samples import SAMPLES
@@ -72,7 +71,7 @@ def values_like(value: object) -> st.SearchStrategy[Any]:
 def messages(draw: st.DrawFn) -> Message:
     """Draw a message of any kind, of which up to three fields have invalid values."""
     sample = draw(st.sampled_from([*SAMPLES.values()]))
-    names = [field.name for field in fields(sample)]
+    names = sample.__struct_fields__
     changed = draw(st.lists(st.sampled_from(names), max_size=3, unique=True))
     values = {name: draw(values_like(getattr(sample, name))) for name in changed}
     return replace(sample, **values)

@@ -1,11 +1,10 @@
 """The order in which the recognizer accepts audio messages."""
 
-from dataclasses import replace
-
 import pytest
 
 from kouxing.services.recognizer.audio_order import MAX_HELD_BYTES, WAIT_S, AudioOrder
 from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.message import replace
 
 
 def chunk(sequence: int, num_bytes: int = 2) -> AudioChunk:

@@ -1,7 +1,6 @@
 """Messages are encoded and decoded; everything else is rejected with a reason."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import OpenSession
 from tests.samples import SAMPLES
 

@@ -1,6 +1,5 @@
 """A session of the recognizer service: the audio that it accepts, and its messages."""
 
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +22,7 @@ from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import AcousticModelName, Progress
 from tests.e2e.following import samples_of_file
@@ -168,7 +168,7 @@ def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
     frames = [result for result in results if isinstance(result, LipPositions)]
     assert len(frames) > 5
     assert {frame.faps[0] for frame in frames} == {77.0}
-    messages = [message for result in results if (message := session.published_message(result))]
+    messages = list(session.published_messages(results))
     assert [message.sequence for message in messages] == [*range(1, len(messages) + 1)]
 
 

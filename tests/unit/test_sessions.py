@@ -1,8 +1,8 @@
 """The rules by which control opens, moves, restores and ends sessions; no sockets, no clocks."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,6 +15,7 @@ from kouxing.services.control.sessions import Sessions
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import OpenSession, SessionFacts
 
 CLIENT = Peer(b"client", "its key")
@@ -153,7 +154,7 @@ def test_places_a_worker_of_an_unknown_kind_that_another_worker_needs(system: Sy
     with pytest.raises(Refusal, match="provides 'gaze'"):
         system.open()
     eyes = {"service": "eyes", "instance": "eyes-1", "endpoints": {"gaze": "tcp://eyes:1"}}
-    system.add(replace(worker("synthesizer", "eyes-1"), **eyes, needs=[]))  # type: ignore[arg-type]
+    system.add(replace(worker("synthesizer", "eyes-1"), **eyes, needs=[]))
     record = system.open()
     assert record.workers["gaze"] == "eyes-1"
     assert "eyes-1" in record.waiting_for
@@ -289,11 +290,11 @@ def test_waits_longer_for_heartbeats_after_a_service_was_late(system: System) ->
 def test_ignores_what_arrives_from_a_connection_that_has_ended(system: System) -> None:
     heartbeat, peer = worker("recognizer", "recognizer-1"), Peer(b"recognizer-1", connection=7)
     system.registry.add(heartbeat, peer, 0.0)
-    system.registry.add(heartbeat, replace(peer, connection=0), 0.0)
+    system.registry.add(heartbeat, dataclasses.replace(peer, connection=0), 0.0)
     assert system.registry.instance_on(7) == "recognizer-1"
     system.lose("recognizer-1")
-    assert system.registry.is_stale("recognizer-1", replace(peer, connection=0))
-    assert not system.registry.is_stale("recognizer-1", replace(peer, connection=8))
+    assert system.registry.is_stale("recognizer-1", dataclasses.replace(peer, connection=0))
+    assert not system.registry.is_stale("recognizer-1", dataclasses.replace(peer, connection=8))
 
 
 def test_distinguishes_a_restarted_worker_from_the_crashed_one(system: System) -> None:

@@ -1,0 +1,40 @@
+"""Joins the sound of a session to longer messages, because every message costs the same."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from kouxing.services.recognizer.front_end.pcm import pcm16_of
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
+from kouxing.shared.phones.events import EndOfSound, SoundEvent, Waveform
+from kouxing.shared.wire.audio import Sound
+
+PACKET_S = 0.04  # of sound that subscribers get at a time; less if the face follows sooner
+
+
+class SoundPackets:
+    """Sound waits for more, but no longer than its face, which is ``face_delay_s`` later."""
+
+    def __init__(self, face_delay_s: float) -> None:
+        self._num_joined = round(min(PACKET_S, face_delay_s) * MEDIA_RATE_HZ)  # samples
+        self._start = 0  # media time, samples
+        self._samples = np.empty(0, np.float32)
+
+    def add(self, event: SoundEvent | Waveform) -> Iterator[Sound]:
+        """Add sound, or another event; yield the messages that are complete."""
+        if isinstance(event, EndOfSound):
+            yield from self._take()
+        elif isinstance(event, Waveform):
+            start = to_samples(event.time_s)
+            if start != self._start + len(self._samples):  # after a gap
+                yield from self._take()
+                self._start = start
+            self._samples = np.concatenate([self._samples, event.samples])
+            if len(self._samples) >= self._num_joined:
+                yield from self._take()
+
+    def _take(self) -> Iterator[Sound]:
+        if len(self._samples):
+            yield Sound(media_time=self._start, pcm=pcm16_of(self._samples))
+            self._start += len(self._samples)
+            self._samples = self._samples[:0]
