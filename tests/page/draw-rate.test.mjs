@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { DrawRate } from "../../services/gateway/page/draw-rate.js";
+import { DrawRate, ImageQueue } from "../../services/gateway/page/draw-rate.js";
 
 const TICK_MS = 1000 / 60;
 
@@ -41,8 +41,44 @@ test("the delay of an image includes half of the time for which it is visible", 
   for (let nowMs = 0; nowMs < 5000; nowMs += 40) drawRate.recordVisible(nowMs, nowMs + 30);
   assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
   drawRate.recordVisible(5000, 5400); // a slow image
-  drawRate.recordVisible(5500, 60000); // the page is hidden
   assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
+  for (let nowMs = 6000; nowMs < 12000; nowMs += 1900) drawRate.recordVisible(nowMs, nowMs + 1900);
+  assert.ok(drawRate.visibleDelayMs > 1900, `${drawRate.visibleDelayMs}`);
+});
+
+test("images of a page that was hidden in the meantime do not count", (t) => {
+  const page = new EventTarget();
+  const ticks = [];
+  let nowMs = 0;
+  const doubles = {
+    document: page,
+    performance: { now: () => nowMs },
+    setTimeout: (callback) => callback(),
+    requestAnimationFrame: (callback) => ticks.push(callback),
+  };
+  const before = Object.fromEntries(Object.keys(doubles).map((name) => [name, globalThis[name]]));
+  Object.assign(globalThis, doubles);
+  t.after(() => Object.assign(globalThis, before));
+  const gl = { fenceSync: () => ({}), flush() {}, clientWaitSync: () => 0, deleteSync() {} };
+  const drawRate = new DrawRate(1, 1, false);
+  const queue = new ImageQueue({ ...gl, TIMEOUT_EXPIRED: 1 }, drawRate);
+  const draw = (seenAfterMs, isHidden) => {
+    queue.draw(nowMs, () => {});
+    if (isHidden) page.dispatchEvent(new Event("visibilitychange"));
+    nowMs += seenAfterMs;
+    ticks.pop()(nowMs);
+  };
+  for (let i = 0; i < 20; i++) draw(40, false);
+  draw(60000, true);
+  assert.ok(drawRate.visibleDelayMs < 100, `${drawRate.visibleDelayMs}`);
+  draw(1900, false);
+  assert.ok(drawRate.visibleDelayMs >= 1900, `${drawRate.visibleDelayMs}`);
+});
+
+test("images that take very long get fewer pixels within seconds", () => {
+  const drawRate = new DrawRate(2, 2, false);
+  draw(drawRate, { fullMs: 250 }); // 1 s at first
+  assert.ok(drawRate.ratio < 0.5, `${drawRate.ratio}`);
 });
 
 test("the user can halve the number of images, down to about 4 a second", () => {

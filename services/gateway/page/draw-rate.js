@@ -6,9 +6,9 @@ import { SlidingWindow } from "./sliding-window.js";
 const STEP = 0.85; // factor of the pixel ratio; the number of pixels changes by its square
 const MIN_RATIO = 0.35;
 const MIN_IMAGES = 10; // before their mean time is used
+const FEW_IMAGES = 3; // the same if they take very long
 const SMOOTHING = 0.2;
 const MAX_SHOWN_MS = 200; // an image that is shown for longer belongs to a face that does not move
-const MAX_DELAY_MS = 1000; // after a longer delay the page was hidden
 const WINDOW_MS = 2000; // over which delays are measured
 const TOLERANCE_MS = 8; // half a tick of the display; an image starts later than its tick
 const PERIOD_MS = 50; // 20 images per second
@@ -17,6 +17,7 @@ const POLL_MS = 2; // interval of checking whether an image is done
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const MIN_REST_MS = 10;
 const SLOW_MS = 36; // images that take longer get fewer pixels
+const VERY_SLOW_MS = 150;
 const FAST_MS = 16; // images that take less time get more pixels
 
 /** Decides when to draw and with how many pixels. Time is injected. */
@@ -77,9 +78,10 @@ export class DrawRate {
     this.#tookMs = doneMs - startMs;
     this.#numImages++;
     this.imageMs += Math.max(SMOOTHING, 1 / this.#numImages) * (this.#tookMs - this.imageMs);
-    if (this.#numImages < MIN_IMAGES) return;
+    if (this.#numImages < (this.imageMs > VERY_SLOW_MS ? FEW_IMAGES : MIN_IMAGES)) return;
     const ratio = this.ratio;
-    if (this.imageMs > SLOW_MS) this.ratio = Math.max(MIN_RATIO, STEP * ratio);
+    const step = Math.min(STEP, Math.sqrt(SLOW_MS / this.imageMs));
+    if (this.imageMs > SLOW_MS) this.ratio = Math.max(MIN_RATIO, step * ratio);
     if (this.imageMs < FAST_MS) this.ratio = Math.min(this.#maxRatio, ratio / STEP);
     if (this.ratio !== ratio) this.#numImages = 0;
   }
@@ -89,7 +91,6 @@ export class DrawRate {
     const sinceMs = visibleMs - this.#visibleMs;
     if (sinceMs < MAX_SHOWN_MS) this.#shownMs = sinceMs;
     this.#visibleMs = visibleMs;
-    if (visibleMs - faceMs > MAX_DELAY_MS) return;
     this.#delays.add(visibleMs, visibleMs - faceMs + this.#shownMs / 2);
     this.visibleDelayMs = this.#delays.percentile(0.5);
   }
@@ -111,11 +112,13 @@ export class ImageQueue {
   #gl;
   #drawRate;
   #isDrawing = false;
+  #hiddenMs = -Infinity; // when the page was hidden last, or shown again
 
   /** @param gl a WebGL 2 context; @param {DrawRate} drawRate decides how often to draw */
   constructor(gl, drawRate) {
     this.#gl = gl;
     this.#drawRate = drawRate;
+    document.addEventListener("visibilitychange", () => (this.#hiddenMs = performance.now()));
   }
 
   /**
@@ -138,7 +141,7 @@ export class ImageQueue {
       this.#drawRate.recordDrawn(startMs, doneMs);
       requestAnimationFrame((tickMs) => {
         const visibleMs = Math.max(tickMs, doneMs); // a busy page gets a tick late
-        this.#drawRate.recordVisible(nowMs, visibleMs);
+        if (startMs > this.#hiddenMs) this.#drawRate.recordVisible(nowMs, visibleMs);
         onVisible(visibleMs);
       });
     });

@@ -1,4 +1,4 @@
-// Measures how far a live stream is behind, and decides whether the page shows it. Time is injected.
+// Measures how far the face of a live stream is behind, and decides whether the page shows it. Time is injected.
 
 import { SlidingWindow } from "./sliding-window.js";
 import { SAMPLES_PER_MS } from "./playout.js";
@@ -12,7 +12,7 @@ const OVER_AFTER_MS = 2000; // time without late frames
 const RECENT_MS = 1000; // window of the displayed lateness
 
 /**
- * The lateness of the newest frame. A live client sends audio in real time. The arrival of a frame
+ * The lateness of the face: that of the newest frame, and the delay until its image is visible. A live client sends audio in real time. The arrival of a frame
  * minus its media time is therefore constant for frames in time, and greater for late frames. Frames
  * are compared with the earliest one of the last 10 s, because clocks drift and a client may lose audio.
  */
@@ -39,10 +39,15 @@ export class Lateness {
     this.#differences.add(nowMs, nowMs - mediaTime / SAMPLES_PER_MS);
   }
 
-  /** Update isBehind; call this regularly. isLive: whether frames and sound arrive. */
-  update(nowMs, isLive) {
+  /**
+   * Update isBehind; call this regularly.
+   *
+   * @param isLive whether frames and sound arrive
+   * @param imageDelayMs from computing a face until its image is visible
+   */
+  update(nowMs, isLive, imageDelayMs = 0) {
     const differenceMs = nowMs - this.#newest / SAMPLES_PER_MS;
-    const lateMs = isLive ? Math.max(0, differenceMs - this.#differences.min) : 0;
+    const lateMs = isLive ? imageDelayMs + Math.max(0, differenceMs - this.#differences.min) : 0;
     this.#recent.add(nowMs, lateMs);
     const isLate = lateMs > LATE_MS;
     if (isLate === this.isBehind) this.#agreedMs = nowMs;
