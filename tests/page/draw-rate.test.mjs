@@ -62,16 +62,16 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
   const gl = { fenceSync: () => ({}), flush() {}, clientWaitSync: () => 0, deleteSync() {} };
   const drawRate = new DrawRate(1, 1, false);
   const queue = new ImageQueue({ ...gl, TIMEOUT_EXPIRED: 1 }, drawRate);
-  const draw = (seenAfterMs, isHidden) => {
+  const show = (seenAfterMs, isHidden) => {
     queue.draw(nowMs, () => {});
     if (isHidden) page.dispatchEvent(new Event("visibilitychange"));
     nowMs += seenAfterMs;
     ticks.pop()(nowMs);
   };
-  for (let i = 0; i < 20; i++) draw(40, false);
-  draw(60000, true);
+  for (let i = 0; i < 20; i++) show(40, false);
+  show(60000, true);
   assert.ok(drawRate.visibleDelayMs < 100, `${drawRate.visibleDelayMs}`);
-  draw(1900, false);
+  show(1900, false);
   assert.ok(drawRate.visibleDelayMs >= 1900, `${drawRate.visibleDelayMs}`);
 });
 
