@@ -39,7 +39,10 @@ from kouxing.shared.terminal import (
 if TYPE_CHECKING:
     from kouxing_client import Lateness
 
-SHOWN_METRICS = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
+SHOWN_METRICS = {
+    *("in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"),
+    *("load", "network_hop", "light_sessions"),
+}
 
 Control = Annotated[
     str,

@@ -207,7 +207,10 @@ def test_status_shows_services_and_sessions_and_writes_json(system: System, tmp_
     assert "…" not in result.stdout
     assert max(map(len, result.stdout.splitlines())) <= 80
     report = json.loads(figures.read_text(encoding="utf-8"))
-    assert {service["service"] for service in report["services"]} == {*KINDS}
+    metrics = {service["service"]: service["metrics"] for service in report["services"]}
+    assert metrics.keys() == {*KINDS}
+    assert metrics["recognizer"]["network_hop"] >= 1
+    assert "network_hop" in result.stdout
     (state,) = (state for state in report["sessions"] if state["session"] == "live")
     assert state["lateness"].keys() == {"p50_ms", "p95_ms", "worst_ms"}
 
