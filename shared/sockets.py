@@ -30,6 +30,7 @@ MAX_DROPPED = 20_000  # parts of one message, before other sockets get their tur
 MAX_FOLLOWED = 4096  # subscriptions; with more, messages are also encoded for nobody
 MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
 T = TypeVar("T", int, str)
+_MORE = zmq.DONTWAIT | zmq.SNDMORE
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,9 @@ class Socket:
         if self._routes:
             parts.insert(0, to.address)
         try:
-            self.raw.send_multipart(parts, flags=zmq.DONTWAIT)
+            for part in parts[:-1]:  # faster than send_multipart
+                self.raw.send(part, _MORE)
+            self.raw.send(parts[-1], zmq.DONTWAIT)
         except zmq.Again:
             return False
         if self._limited is not None:

@@ -13,7 +13,7 @@ import multiprocessing
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -45,13 +45,18 @@ class Memory:
 
     def __init__(self, process_id: int) -> None:
         self._folder = Path(f"/proc/{process_id}")
-        (self._folder / "clear_refs").write_text("5")  # resets the peak
         self._start_mb = self._read_mb("VmRSS")
+        self.restart_growth()
+
+    def restart_growth(self) -> None:
+        """Measure the growth from now on."""
+        (self._folder / "clear_refs").write_text("5")  # resets the peak
+        self._before_growth_mb = self._read_mb("VmRSS")
 
     @property
     def growth_mb(self) -> float:
-        """Peak growth since the start."""
-        return self._read_mb("VmHWM") - self._start_mb
+        """Peak growth since the start, or since ``restart_growth``."""
+        return self._read_mb("VmHWM") - self._before_growth_mb
 
     @property
     def kept_mb(self) -> float:
@@ -79,7 +84,7 @@ class Damage:
     attack: str
     target: str
     has_key: bool
-    growth_mb: dict[str, float]  # peak, by service
+    growth_mb: dict[str, float]  # peak during and after the attack, by service
     kept_mb: dict[str, float]  # after up to RELEASE_DEADLINE_S, by service
     restarted: list[str]  # services that ended during the attack; they have no memory figures
     p95_ms: dict[str, float | None]  # of the other client, by phase; None: no frame in time
@@ -140,7 +145,12 @@ def _damage(
     endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
     processes = {kind: system.supervisor.process(kind).pid for kind in KINDS}
     memories = {kind: Memory(process_id) for kind, process_id in processes.items()}
-    with _attacker(name, endpoints.get(target, ""), source):
+
+    def restart_growth() -> None:  # the other client's session has its memory by now
+        for memory in memories.values():
+            memory.restart_growth()
+
+    with _attacker(name, endpoints.get(target, ""), source, restart_growth):
         delays_ms = _delays_ms(system.control, speech, rate_hz)
     restarted = [kind for kind in KINDS if system.supervisor.process(kind).pid != processes[kind]]
     for kind in restarted:
@@ -166,13 +176,20 @@ def _delays_ms(control: str, speech: NDArray[np.float32], rate_hz: int) -> dict[
 
 
 @contextlib.contextmanager
-def _attacker(name: str, endpoint: str, source: str) -> Iterator[None]:
-    """Run an attacking process during the second phase."""
+def _attacker(
+    name: str, endpoint: str, source: str, on_start: Callable[[], None]
+) -> Iterator[None]:
+    """Run an attacking process during the second phase; call ``on_start`` before it."""
     context = multiprocessing.get_context("spawn")
     start = context.Event()
+
+    def begin_attack() -> None:
+        on_start()
+        start.set()
+
     process = context.Process(target=_attack, args=(name, endpoint, source, start), daemon=True)
     process.start()
-    begin = threading.Timer(PHASE_S + SESSION_START_S, start.set)
+    begin = threading.Timer(PHASE_S + SESSION_START_S, begin_attack)
     end = threading.Timer(2 * PHASE_S + SESSION_START_S, process.terminate)
     begin.start()
     end.start()
