@@ -118,8 +118,8 @@ class EarStream:
 
 def process_positions(streams: Sequence[EarStream], frames: Sequence[Floats]) -> list[EarPosition]:
     """Process the next frames, (2, 80), of several streams of one ear in one run."""
-    states = np.stack([stream.state for stream in streams])
-    outputs = streams[0].ear.run(np.stack(frames), states)
+    states = np.array([stream.state for stream in streams])
+    outputs = streams[0].ear.run(np.array(frames), states)
     positions = []
     for stream, of_stream, *rows in zip(streams, frames, *outputs, strict=True):
         features, phones, voice, state = (row.copy() for row in rows)  # a view keeps all rows

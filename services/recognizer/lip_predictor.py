@@ -57,8 +57,10 @@ NUM_OUTPUTS = len(LIP_FAPS) + 2
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # of features, components, units
-_COLUMNS = [MOUTH_FAPS.index(fap) for fap in LIP_FAPS]
-_PAIRS = [(MOUTH_FAPS.index(fap), MOUTH_FAPS.index(other)) for fap, other in OTHER_SIDE.items()]
+_COLUMNS, _ONES, _OTHERS = (
+    np.array([MOUTH_FAPS.index(fap) for fap in faps])
+    for faps in (LIP_FAPS, OTHER_SIDE, OTHER_SIDE.values())
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,8 +212,7 @@ def mouth_faps(lips: Floats) -> Floats:
     """Return all FAPs of the mouth, (28,), from the FAPs that a camera tracks, (15,)."""
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
     faps[_COLUMNS] = lips
-    for one, other in _PAIRS:
-        faps[other] = faps[one]
+    faps[_OTHERS] = faps[_ONES]
     return faps
 
 

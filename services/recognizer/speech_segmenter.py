@@ -190,6 +190,6 @@ class SpeechSegmenter:
 
 def _frames_of(positions: Sequence[tuple[Floats, EarPosition]]) -> SpeechFrames:
     """Return the frames of some positions."""
-    phones = np.stack([position.phones for _, position in positions])
+    phones = np.array([position.phones for _, position in positions])
     features = np.concatenate([features for features, _ in positions])
     return SpeechFrames(features, phones.repeat(FRAMES_PER_POSITION, axis=0))

@@ -94,13 +94,14 @@ class VoiceTraitsStream:
             share = 1.0 / min(self._num_voiced + _PRIOR_FEELING, _MEAN_POSITIONS)
             self._feeling = self._feeling + share * (feeling - self._feeling)
         self._evidence += _EVIDENCE_SHARE * (outputs[2:] - self._evidence)
-        arousal, valence = np.clip(self._feeling - self._mean, -1.0, 1.0)
+        relative: list[float] = (self._feeling - self._mean).tolist()
+        arousal, valence = (min(max(value, -1.0), 1.0) for value in relative)
         laughter, breath = (
             bool(evidence > (_STOP if was_on else _START))
             for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
         )
         self.newest = VoiceTraits(
-            round(float(arousal), _DIGITS), round(float(valence), _DIGITS), laughter, breath
+            round(arousal, _DIGITS), round(valence, _DIGITS), laughter, breath
         )
 
 

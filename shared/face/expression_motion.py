@@ -105,10 +105,11 @@ def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float)
     """Add an expression (68,) to a face (68,), in place; ``free`` is the minimum of ``a``."""
     gap = -(faps[UPPER] + faps[LOWER])
     room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED
-    room = np.tile(np.minimum(room[:3], room[3:]), 2)  # inner and outer lip
+    room = np.concatenate([np.minimum(room[:3], room[3:])] * 2)  # inner and outer lip
     apart = np.maximum(room / (OPEN - CLOSED), free)
     change = -(expression[UPPER] + expression[LOWER])
-    change = np.clip(apart * change, np.minimum(CLOSED - gap, 0.0), np.maximum(_WIDEST - gap, 0.0))
+    change = np.maximum(apart * change, np.minimum(CLOSED - gap, 0.0))
+    change = np.minimum(change, np.maximum(_WIDEST - gap, 0.0))
     upwards = (expression[LOWER] - expression[UPPER]) / 2.0
     upwards = np.where(upwards > 0.0, upwards, apart * upwards)
     upper, lower = -upwards - change / 2.0, upwards - change / 2.0

@@ -202,10 +202,10 @@ class BlockRunner:
             frames[row, : len(block.frames)] = block.frames
         inputs = {
             "frames": frames,
-            "positions": np.stack([self._positions[b.row : b.row + length] for b in blocks]),
+            "positions": np.array([self._positions[b.row : b.row + length] for b in blocks]),
             "num_positions": np.array([block.num_positions for block in blocks]),
             "num_cached": np.array([block.past.num_cached for block in blocks]),
-            self._state: np.stack([block.past.state for block in blocks]),
+            self._state: np.array([block.past.state for block in blocks]),
             _NUM_KEPT: np.array([num_kept]),
             **dict.fromkeys(self._last_kept, np.array(num_kept - 1)),
         }

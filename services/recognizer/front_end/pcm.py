@@ -71,7 +71,8 @@ def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
     """
     if len(samples) == 0:
         return 0.0
-    return float(np.count_nonzero(np.diff(np.signbit(samples)))) / len(samples)
+    is_negative = np.signbit(samples)
+    return float(np.count_nonzero(is_negative[1:] != is_negative[:-1])) / len(samples)
 
 
 class SliceMeter:

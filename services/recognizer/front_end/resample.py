@@ -103,8 +103,8 @@ class Resampler:
         if not np.isfinite(samples).all():
             raise UserError("some samples are not finite; send values in [-1, 1]")
         mono = samples.mean(axis=1) if num_channels > 1 else samples.reshape(-1)
-        clipped: NDArray[np.float32] = np.clip(mono, -1.0, 1.0).astype(np.float32)
-        return clipped
+        clipped: NDArray[np.float32] = np.minimum(np.maximum(mono, -1.0), 1.0)
+        return clipped.astype(np.float32, copy=False)
 
 
 def to_16_khz(samples: NDArray[np.float32], sample_rate_hz: int) -> NDArray[np.float32]:

@@ -44,6 +44,8 @@ class Transition:
 
     def at(self, elapsed_s: float) -> FapState:
         """Return the remaining difference after ``elapsed_s``."""
+        if elapsed_s >= self.longest_s:
+            return still(np.zeros(len(self.duration_s)))
         u = np.minimum(elapsed_s / self.duration_s, 1.0)
         velocity = (1.0 - u) * (
             -6.0 * u * self.difference.value / self.duration_s

@@ -83,7 +83,7 @@ class Amplitude:
 
 def _rate_gain(syllable_onsets_s: NDArray[np.float64], until_s: float) -> float:
     """Return the gain for the rate of the last syllables before ``until_s``."""
-    num_started = int(np.searchsorted(syllable_onsets_s, until_s, side="right"))
+    num_started = int(syllable_onsets_s.searchsorted(until_s, side="right"))
     intervals = np.diff(syllable_onsets_s[max(num_started - _NUM_INTERVALS - 1, 0) : num_started])
     intervals = intervals[(intervals > 0.0) & (intervals < _MAX_INTERVAL_S)]
     if not intervals.size:

@@ -29,8 +29,8 @@ _STEP_S = 1e-3  # of the numerical derivative
 
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return weights that sum to one along the first axis."""
-    weights: NDArray[np.float64] = np.exp(log_weights - log_weights.max(axis=0))
-    weights /= weights.sum(axis=0)
+    weights: NDArray[np.float64] = np.exp(log_weights - np.maximum.reduce(log_weights))
+    weights /= np.add.reduce(weights)
     return weights
 
 
@@ -121,7 +121,7 @@ def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray
     closer to the full model.
     """
     active = (timeline.apex_start_s < time_s + reach_s) & (timeline.apex_end_s > time_s - reach_s)
-    following = int(np.searchsorted(timeline.apex_start_s, time_s, side="right"))
+    following = int(timeline.apex_start_s.searchsorted(time_s, side="right"))
     active[max(following - 1, 0) : following + 1] = True
     return active
 

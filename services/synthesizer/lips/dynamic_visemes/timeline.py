@@ -88,7 +88,7 @@ class Timeline:
         if not len(self.viseme):
             return None
         distance_s = np.maximum(self.apex_start_s - time_s, time_s - self.apex_end_s)
-        return int(self.viseme[np.argmin(distance_s)])
+        return int(self.viseme[distance_s.argmin()])
 
     def extend_open_phone(self, known_s: float) -> Timeline:
         """Extend the open phone, given that the audio is known up to ``known_s``.

@@ -33,7 +33,7 @@ _EDGE_S = 0.02  # rise and fall time of a phone's evidence
 _MIDDLE = 0.3  # half width of a vowel's middle, as a share of its duration
 _PARTED, _WIDE_APART = 100.0, 300.0  # opening, FAP units
 _ROUNDED = -100.0  # width, FAP units
-_INNER_LIPS, _CORNERS = ([MOUTH_FAPS.index(fap) for fap in pair] for pair in ((4, 5), (6, 7)))
+_INNER_UPPER, _INNER_LOWER, _LEFT_CORNER, _RIGHT_CORNER = map(MOUTH_FAPS.index, (4, 5, 6, 7))
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ class ClosureRule:
         ``faps`` are the predicted mouth FAPs (num_mouth_faps,), ``sound`` are the predicted log
         odds and ``phones`` those added by the recognized phones.
         """
-        opening = -float(faps[_INNER_LIPS].sum())
-        width = float(faps[_CORNERS].sum())
+        opening = -float(faps[_INNER_UPPER] + faps[_INNER_LOWER])
+        width = float(faps[_LEFT_CORNER] + faps[_RIGHT_CORNER])
         apart = self.parted * (min(max(opening, _PARTED), _WIDE_APART) - _PARTED)
         narrow = self.rounded * max(0.0, _ROUNDED - width)
         unsupported = 1.0 - phones / self.phone

@@ -63,7 +63,7 @@ _MAX_FAP = 4000.0  # FAP units; larger values are invalid
 _EPSILON = 1e-6  # FAP units, and FAP units per second
 
 _WIDTH_FAPS = (6, 7, 53, 54)  # mouth corners, which move a third as far
-_UNTRACKED = [MOUTH_FAPS.index(fap) for fap in _UNTRACKED_FAPS]
+_UNTRACKED = np.array([MOUTH_FAPS.index(fap) for fap in _UNTRACKED_FAPS])
 _JITTER_SQUARED = np.array(
     [(_JITTER / 3.0 if fap in _WIDTH_FAPS else _JITTER) ** 2 for fap in MOUTH_FAPS]
 )

@@ -42,10 +42,10 @@ class LipTrack:
 
     def append(self, time_s: float, faps: Array) -> None:
         """Append a frame: media time, FAPs (num_mouth_faps,)."""
-        velocity = np.zeros_like(faps)
         if time_s - self.end_s <= MAX_GAP_S:
             velocity = (faps - self._knots[-1].state.value) / (time_s - self.end_s)
         else:
+            velocity = self._rest.velocity
             if self._knots:
                 self._knots.append(_Knot(self.end_s + CLOSE_S, self._rest))
             self._knots.append(_Knot(time_s - _OPEN_S, self._rest))
