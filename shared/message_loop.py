@@ -36,10 +36,12 @@ class MessageLoop:
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
         self._paused: set[Socket] = set()
 
-    def register(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:
-        """Handle the messages of a socket, by type."""
+    def register(
+        self, socket: Socket, handlers: dict[type[Message], Handler], *, is_quiet: bool = False
+    ) -> None:
+        """Handle the messages of a socket, by type; those of a quiet one at the next occasion."""
         self._handlers[socket] = handlers
-        self._poller.add(socket)
+        self._poller.add(socket, is_quiet=is_quiet)
 
     def unregister(self, socket: Socket) -> None:
         """Close a socket, and handle its messages no longer."""

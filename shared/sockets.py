@@ -295,22 +295,32 @@ class Poller:
     def __init__(self) -> None:
         self._poller = zmq.Poller()
         self._sockets: dict[zmq.Socket[bytes], Socket] = {}
+        self._quiet: set[zmq.Socket[bytes]] = set()  # those that end no `wait`
         self.waker = Waker()  # ends each `wait` until it is cleared
         self._poller.register(self.waker.descriptor, zmq.POLLIN)
 
-    def add(self, socket: Socket) -> None:
-        """Watch a socket."""
+    def add(self, socket: Socket, *, is_quiet: bool = False) -> None:
+        """Watch a socket. A quiet one does not end `wait`."""
         self._sockets[socket.raw] = socket
-        self._poller.register(socket.raw, zmq.POLLIN)
+        if is_quiet:
+            self._quiet.add(socket.raw)
+        else:
+            self._poller.register(socket.raw, zmq.POLLIN)
 
     def remove(self, socket: Socket) -> None:
         """Stop watching a socket."""
         del self._sockets[socket.raw]
-        self._poller.unregister(socket.raw)
+        if socket.raw in self._quiet:
+            self._quiet.remove(socket.raw)
+        else:
+            self._poller.unregister(socket.raw)
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Return the readable sockets in the order in which they were added."""
         ready = dict(self._poller.poll(max(0, math.ceil(timeout_s * 1000))))
+        ready.update(
+            (raw, 1) for raw in self._quiet if int(raw.getsockopt(zmq.EVENTS)) & zmq.POLLIN
+        )
         for raw, socket in self._sockets.items():
             if raw not in ready:
                 socket.note_empty()

@@ -145,9 +145,11 @@ class GatewayService(Service):
         timer.cancel()
         return super().wait(0)
 
-    def register(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:
+    def register(
+        self, socket: Socket, handlers: dict[type[Message], Handler], *, is_quiet: bool = False
+    ) -> None:
         """Register handlers for a socket's messages, by message type."""
-        super().register(socket, handlers)
+        super().register(socket, handlers, is_quiet=is_quiet)
         self._loop.add_reader(socket.file_descriptor, self._on_input)
 
     def unregister(self, socket: Socket) -> None:

@@ -111,7 +111,8 @@ class SynthesizerSockets:
         if endpoint not in self._sockets:
             socket = self._loop.bus.connect_dealer(endpoint)
             self._sockets[endpoint] = socket
-            self._loop.register(socket, self._handlers)
+            # While there are sessions, the loop runs often enough for acknowledgements.
+            self._loop.register(socket, self._handlers, is_quiet=True)
         return self._sockets[endpoint]
 
     def close_unused(self, used: AbstractSet[str]) -> None:
