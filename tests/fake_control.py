@@ -4,7 +4,6 @@ import itertools
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Self, TypeVar
 
 from kouxing.shared.bus import Bus
@@ -13,7 +12,7 @@ from kouxing.shared.sockets import Poller, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,

@@ -1,7 +1,6 @@
 """A restarted control learns the sessions from the services."""
 
 import time
-from dataclasses import replace
 
 import pytest
 
@@ -9,6 +8,7 @@ from kouxing.services.control import lifecycle, move_repeats, takeover
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,
@@ -37,7 +37,7 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
     """Return the report of a session that an earlier control has placed on these services."""
-    start = replace(START, session="mine", epoch=4, endpoints=endpoints, **fields)  # type: ignore[arg-type]
+    start = replace(START, session="mine", epoch=4, endpoints=endpoints, **fields)
     return SessionStarted(session="mine", request="r", start=start)
 
 

@@ -5,7 +5,6 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,6 +25,7 @@ from kouxing.shared.service import (
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted
+from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
