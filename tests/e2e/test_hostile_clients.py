@@ -216,7 +216,7 @@ def test_rejects_a_foreign_token_and_drops_a_replay(
     assert caught.value.code == "bad-token"
     token = witness.info["token"]
     output = witness.results(Sound)
-    witness.push(np.zeros(320, np.float32))
+    witness.push(np.zeros(640, np.float32))
     assert list(output.available(LIMIT_S))
     replay = AudioChunk(session=witness.name, token=token, sequence=1, pcm=bytes(1280))
     thief.send(replace(replay, acknowledge=True))
