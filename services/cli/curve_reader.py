@@ -143,6 +143,9 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
             f"{path}: no column has the name of a FAP or of a shape such as jawOpen; rename the"
             " columns"
         )
+    for name, _ in known:
+        if names.count(name.lower()) > 1:
+            raise UserError(f"{path}: several columns have the name {name}; keep one")
     for angle, fap in _HEAD_FAPS.items():
         if angle.lower() in names:
             known.append((angle, fap_rows[FAP_NUMBER[fap] - 1] / RADIANS_PER_ANGLE_UNIT))
