@@ -13,6 +13,7 @@ from pythonosc.dispatcher import Dispatcher
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_server import BlockingOSCUDPServer
 
+from kouxing.services.senders import connection, vtube_studio
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import parse_target
@@ -33,7 +34,10 @@ def open_mouth() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
 
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Use a separate folder of tokens, and short pauses between connection attempts."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    for module in (connection, vtube_studio):
+        monkeypatch.setattr(module, "RETRY_S", 0.05)
 
 
 @pytest.fixture
@@ -176,7 +180,7 @@ def test_does_not_ask_again_after_denial(senders: Senders) -> None:
         url = f"vts://127.0.0.1:{stub.port}"
         senders.start(parse_target(url))
         wait_until(lambda: "denied" in problem(senders, url))
-        time.sleep(2.0)  # longer than the time between connection attempts
+        time.sleep(0.5)  # ten times the pause between connection attempts
         assert stub.requests == ["AuthenticationTokenRequest"]
 
 
