@@ -29,6 +29,12 @@ def _own_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def new_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the test begin without any key."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
 @pytest.fixture(scope="module")  # an idle system costs more than a start
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     """All services on this host."""

@@ -27,9 +27,7 @@ from tests.system import LIMIT_S, start_python
 LOCAL = "tcp://127.0.0.1:*"
 
 
-@pytest.fixture(autouse=True)
-def _new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+pytestmark = pytest.mark.usefixtures("new_keys")
 
 
 class Server:

@@ -14,6 +14,7 @@ from tests.e2e.following import stream
 from tests.system import SERVICE, System, kouxing, own_addresses, start_python, wait_until
 
 WORKERS = ("recognizer", "synthesizer")
+pytestmark = pytest.mark.usefixtures("new_keys")
 
 
 def machine(command: Command, folder: Path, name: str, role: str, file: str) -> Path:
@@ -26,10 +27,7 @@ def machine(command: Command, folder: Path, name: str, role: str, file: str) -> 
     return folder / name
 
 
-def test_init_makes_the_keys_of_all_services(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+def test_init_makes_the_keys_of_all_services(command: Command) -> None:
     assert command("keys", "init")[0] == 0
     roles = {grant.name: grant.roles for grant in read_grants().values()}
     assert roles.keys() == {*KINDS, "client"} - {"control"}
@@ -40,7 +38,6 @@ def test_init_makes_the_keys_of_all_services(
 def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
     settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
     with System(["control"], tmp_path, settings) as system:
         for kind in WORKERS:
@@ -60,7 +57,7 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         status, _, log = command("keys", "add", "friend")
         assert (status, "on control's machine" in log) == (2, True), log
 
-        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
         _, listed, _ = command("keys", "list")
         assert all(name in listed for name in ("recognizer-host", "synthesizer-host", "laptop"))
         assert command("keys", "revoke", "recognizer-host")[0] == 0
@@ -72,20 +69,14 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
         system.assert_all_alive()
 
 
-def test_doctor_recognizes_another_program(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+def test_doctor_recognizes_another_program(command: Command) -> None:
     assert command("keys", "init")[0] == 0
     with socket.create_server(("127.0.0.1", 0)) as other:
         checked = kouxing("doctor", control=f"tcp://127.0.0.1:{other.getsockname()[1]}")
     assert "no kouxing service answers there" in checked.stdout
 
 
-def test_a_service_waits_for_control_and_says_why(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+def test_a_service_waits_for_control_and_says_why(command: Command) -> None:
     assert command("keys", "init")[0] == 0
     addresses = own_addresses(["control", "synthesizer"])
     started = [start_python(*SERVICE, "synthesizer", **addresses)]

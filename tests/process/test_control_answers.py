@@ -21,10 +21,7 @@ from tests.control_stage import Stage
 
 
 @pytest.fixture(params=[True, False])
-def stage(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Stage]:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+def stage(request: pytest.FixtureRequest, new_keys: None) -> Iterator[Stage]:
     made = Stage(insecure=request.param)
     yield made
     made.close()

@@ -2,7 +2,6 @@
 
 import contextlib
 import secrets
-from pathlib import Path
 
 import pytest
 
@@ -67,10 +66,8 @@ def test_reports_one_session_and_its_services(stage: Stage, client: Socket) -> N
     assert getattr(ask(stage, client, session="none"), "code", "") == "unknown-session"
 
 
-def test_only_clients_and_services_see_the_token_of_the_web_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+@pytest.mark.usefixtures("new_keys")
+def test_only_clients_and_services_see_the_token_of_the_web_page() -> None:
     page = "https://face.example:8080/"
     beat = Heartbeat(
         service="gateway",

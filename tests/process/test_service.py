@@ -5,7 +5,7 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 
@@ -249,10 +249,8 @@ def test_registers_at_an_address_where_another_program_answered_before(
         service.bus.close()
 
 
-def test_starts_again_when_a_rejected_key_was_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+@pytest.mark.usefixtures("new_keys")
+def test_starts_again_when_a_rejected_key_was_replaced() -> None:
     local = "tcp://127.0.0.1:*"
     control = ControlService(ControlConfig(control=local, events=local))
     address, _, _ = control.endpoints["commands"].partition(" ")

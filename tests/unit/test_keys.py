@@ -29,10 +29,7 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey, HeartbeatReply
 from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
 
-
-@pytest.fixture(autouse=True)
-def _new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+pytestmark = pytest.mark.usefixtures("new_keys")
 
 
 def test_creates_private_keys_on_first_use() -> None:
