@@ -5,7 +5,6 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import pytest
 
