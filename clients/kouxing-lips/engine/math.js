@@ -18,3 +18,14 @@ export function smoothStep(share) {
 export function smoothingShare(elapsedS, timeConstantS) {
   return -Math.expm1(-elapsedS / timeConstantS);
 }
+
+/** Return a time in whole samples of media time. */
+export function wholeSamples(timeS, { constants: { clock } }) {
+  return Math.round(timeS * clock.MEDIA_RATE_HZ) / clock.MEDIA_RATE_HZ;
+}
+
+/** Return the media time of a feature frame: half an overlap after the start of its window. */
+export function frameTimeS(frame, model) {
+  const { HOP_S, WINDOW_S } = model.constants.segmenter;
+  return wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2, model);
+}

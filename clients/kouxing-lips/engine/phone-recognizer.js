@@ -2,6 +2,7 @@
 // acoustic/light.py, search/output_rule.py and live_decoder.py.
 
 import { Decoder } from "./decoder.js";
+import { frameTimeS, wholeSamples } from "./math.js";
 
 const [FIRST, INSIDE] = [0, 1]; // position of a phone between pauses
 
@@ -98,7 +99,7 @@ export class PhoneRecognizer {
       index: this.#numFinal + this.#open.length,
       symbol: this.#symbols[phone],
       onsetS: this.#timeS(Math.max(start, this.#done)),
-      durationS: this.#wholeSamples(this.#durationsS.values[position * this.#durationsS.shape[1] + phone]),
+      durationS: wholeSamples(this.#durationsS.values[position * this.#durationsS.shape[1] + phone], this.#model),
       confidence,
       isFinal: false,
     };
@@ -152,17 +153,11 @@ export class PhoneRecognizer {
     const span = this.#confidence.slice(start - firstFrame, end - firstFrame);
     const confidence = isFinal ? span.reduce((a, b) => a + b, 0) / span.length : (known?.confidence ?? this.#model.constants.liveDecoder.DEFAULT_CONFIDENCE);
     const onsetS = this.#timeS(start);
-    return { symbol: this.#symbols[phone], onsetS, durationS: this.#wholeSamples(this.#timeS(end) - onsetS), confidence, isFinal };
+    return { symbol: this.#symbols[phone], onsetS, durationS: wholeSamples(this.#timeS(end) - onsetS, this.#model), confidence, isFinal };
   }
 
   #timeS(frame) {
-    const { HOP_S, WINDOW_S } = this.#model.constants.segmenter;
-    return this.#wholeSamples((this.#startFrame + frame) * HOP_S + (WINDOW_S - HOP_S) / 2);
-  }
-
-  #wholeSamples(timeS) {
-    const { MEDIA_RATE_HZ } = this.#model.constants.clock;
-    return Math.round(timeS * MEDIA_RATE_HZ) / MEDIA_RATE_HZ;
+    return frameTimeS(this.#startFrame + frame, this.#model);
   }
 }
 

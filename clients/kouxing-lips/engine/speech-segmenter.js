@@ -3,6 +3,7 @@
 
 import { LipPredictor } from "./lip-predictor.js";
 import { LogMel } from "./log-mel.js";
+import { frameTimeS, wholeSamples } from "./math.js";
 import { VoiceTraits } from "./voice-traits.js";
 
 class VoiceActivityDetector {
@@ -126,20 +127,15 @@ export class SpeechSegmenter {
   }
 
   #speechChange(active, frame) {
-    const { HOP_S, WINDOW_S } = this.#model.constants.segmenter;
-    return { type: "speech", active, timeS: this.#wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2) };
+    return { type: "speech", active, timeS: frameTimeS(frame, this.#model) };
   }
 
   #predict({ features }, newestFrame) {
     const { HOP_S, WINDOW_S } = this.#model.constants.segmenter;
     const frame = this.#lips.processPosition(newestFrame * HOP_S + WINDOW_S, features);
     if (frame.timeS < 0) return [];
-    return [{ ...frame, type: "lips", timeS: this.#wholeSamples(frame.timeS), delayS: this.#wholeSamples(frame.delayS) }];
-  }
-
-  #wholeSamples(timeS) {
-    const { MEDIA_RATE_HZ } = this.#model.constants.clock;
-    return Math.round(timeS * MEDIA_RATE_HZ) / MEDIA_RATE_HZ;
+    const [timeS, delayS] = [frame.timeS, frame.delayS].map((time) => wholeSamples(time, this.#model));
+    return [{ ...frame, type: "lips", timeS, delayS }];
   }
 }
 
