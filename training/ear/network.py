@@ -51,7 +51,6 @@ LOOK_AHEAD = 2  # positions, of all outputs but the early components and the lip
 WIDTH = 448
 NUM_LIPS = len(LIP_DELAYS_S) * NUM_OUTPUTS
 NUM_FEATURES = 2 * NUM_COMPONENTS + NUM_LIPS  # the first outputs
-NUM_OTHER_OUTPUTS = NUM_FEATURES + len(Voice) + 4  # all but the phones
 
 _LIPS_WEIGHT = 3.0
 _PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 2, 1 / 3, 1 / 5

@@ -85,12 +85,10 @@ def scalp(face: FaceMap, texture: Float) -> Float:
     return np.asarray(np.where(face.y > 6.5, parting, dark))
 
 
-def _spot(
-    face: FaceMap, x: float, y: float, width: float, height: float, until: float = 1.5
-) -> Float:
-    """Make a soft spot (H, W) at a place of the face, up to the angle ``until``."""
+def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
+    """Make a soft spot (H, W) on the front of the face."""
     spot = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
-    return spot * np.clip((until - face.angle) / 0.25, 0, 1)
+    return spot * np.clip((1.5 - face.angle) / 0.25, 0, 1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ class Graph:
     def __init__(self, prefix: str = "") -> None:
         self.prefix = prefix
         self._nodes: list[onnx.NodeProto] = []
-        self._num_nodes = 0  # including those of branches
+        self._num_nodes = 0  # for their names
         self._tensors: dict[str, onnx.TensorProto] = {}
         self._zero_points: dict[str, str] = {}  # by the kind of rows
 
@@ -93,14 +93,6 @@ class Graph:
             node = helper.make_node("Split", [inputs], names, axis=axis, num_outputs=len(names))
         self._nodes.append(node)
         return names
-
-    def branch(self, name: str, write: Callable[[], str], *shape: int | str) -> onnx.GraphProto:
-        """Write nodes as a subgraph; its constants stay in the outer graph."""
-        outside, self._nodes = self._nodes, []
-        output = write()
-        graph = helper.make_graph(self._nodes, name, [], [floats(output, *shape)])
-        self._nodes = outside
-        return graph
 
     def constant(self, name: str, array: NDArray[Any] | np.generic | float) -> str:
         """Store a constant once, and return its name."""
