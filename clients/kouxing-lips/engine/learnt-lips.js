@@ -120,10 +120,11 @@ export class LearntLips {
 }
 
 /** Return the log odds of a closure, from those of the sound and those that phones add. */
-function closureLogOdds(faps, sound, phones, rule, { INNER_LIPS, CORNERS, PARTED, WIDE_APART, ROUNDED }) {
-  const sum = (columns) => columns.reduce((total, column) => total + faps[column], 0);
-  const apart = rule.parted * (clamp(-sum(INNER_LIPS), PARTED, WIDE_APART) - PARTED);
-  const narrow = rule.rounded * Math.max(0, ROUNDED - sum(CORNERS));
+function closureLogOdds(faps, sound, phones, rule, c) {
+  const opening = -(faps[c.INNER_UPPER] + faps[c.INNER_LOWER]);
+  const width = faps[c.LEFT_CORNER] + faps[c.RIGHT_CORNER];
+  const apart = rule.parted * (clamp(opening, c.PARTED, c.WIDE_APART) - c.PARTED);
+  const narrow = rule.rounded * Math.max(0, c.ROUNDED - width);
   return rule.sound + sound + phones - (1 - phones / rule.phone) * (apart + narrow);
 }
 

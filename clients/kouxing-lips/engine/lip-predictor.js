@@ -46,10 +46,10 @@ export class LipPredictor {
    */
   processPosition(knownS, features) {
     const outputs = this.#step(features);
-    const { COLUMNS, PAIRS, CLOSURE } = this.#constants;
+    const { COLUMNS, ONES, OTHERS, CLOSURE } = this.#constants;
     const faps = new Array(this.#numMouthFaps).fill(0);
     COLUMNS.forEach((column, i) => (faps[column] = Math.fround(outputs[i])));
-    for (const [one, other] of PAIRS) faps[other] = faps[one];
+    OTHERS.forEach((other, i) => (faps[other] = faps[ONES[i]]));
     return { timeS: knownS - this.#delayS, delayS: this.#delayS, faps, closure: sigmoid(outputs[CLOSURE]) };
   }
 
