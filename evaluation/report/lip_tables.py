@@ -39,6 +39,7 @@ _NAMES = {
     "live2d": "live2d-motionsync 0.0.4",
     "pylipsync": "pylipsync 0.2.1 (uLipSync)",
     "openfacefx": "OpenFaceFX 0.24.0, energy, offline",
+    "rhubarb": "Rhubarb Lip Sync, offline",
     "loudness": "loudness",
 }
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from kouxing.evaluation.rivals.tables import PROGRAMS
+
 ROOT = Path(__file__).resolve().parents[2]  # of the source tree, behind its links
 CONVERSATION = ROOT / "corpora" / "conversation.tsv"
 SAMPLE = ROOT / "shared" / "demo" / "hello-female.wav"
@@ -12,8 +14,7 @@ DELAYS_MS = (0, 30, 60, 100, 160, 220, 300)
 _MODELS = "--acoustic blocks --acoustic light --acoustic gmm"
 _DELAYS = " ".join(f"--delay-ms {delay}" for delay in DELAYS_MS)
 _ALL_LIPS = "--lips learnt --lips dynamic-visemes --lips ferguson"
-_RIVALS = ("headaudio", "wlipsync", "wawa", "live2d", "pylipsync", "openfacefx", "loudness")
-_TABLES = " ".join(f"--from-csv {{rivals}}/{name}" for name in _RIVALS)
+_TABLES = " ".join(f"--from-csv {{rivals}}/{name}" for name in PROGRAMS)
 
 _RECOGNIZER = ("services/recognizer", "shared/phones", "evaluation/recognizer", "corpora")
 _LIPS = (*_RECOGNIZER, "services/synthesizer", "services/*.py", "shared/face", "evaluation/lips")

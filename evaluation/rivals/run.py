@@ -1,6 +1,7 @@
 """``python run.py PROGRAM SOUNDS TABLES``: the curves of Python packages, like ``run.js``."""
 
 import csv
+import subprocess
 import sys
 import tempfile
 import wave
@@ -36,12 +37,11 @@ def openfacefx_rows(samples: Samples) -> Iterator[Row]:
     from openfacefx.cli import main as openfacefx  # type: ignore[import-not-found] # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as folder:
-        sound, table = str(Path(folder) / "sound.wav"), str(Path(folder) / "curves.csv")
-        with wave.open(sound, "wb") as file:
-            file.setparams((1, 2, RATE_HZ, 0, "NONE", ""))
-            file.writeframes((np.clip(samples, -1.0, 1.0) * 32767.0).astype("<i2").tobytes())
-        openfacefx(["energy", "--wav", sound, "-o", table, "--fps", str(FRAMES_PER_S)])
-        with Path(table).open(encoding="utf-8", newline="") as lines:
+        sound, table = Path(folder) / "sound.wav", Path(folder) / "curves.csv"
+        write_wav(sound, samples)
+        rate = ["--fps", str(FRAMES_PER_S)]
+        openfacefx(["energy", "--wav", str(sound), "-o", str(table), *rate])
+        with table.open(encoding="utf-8", newline="") as lines:
             keyframes = list(csv.DictReader(lines))
     channels: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for row in keyframes:
@@ -52,9 +52,33 @@ def openfacefx_rows(samples: Samples) -> Iterator[Row]:
         yield float(time_s), weights
 
 
+def rhubarb_rows(samples: Samples) -> Iterator[Row]:
+    """Yield the mouths of Rhubarb Lip Sync, and their openings. It works offline."""
+    openings = dict(zip("ABCDEFGHX", (0.0, 0.25, 0.6, 1.0, 0.5, 0.2, 0.1, 0.6, 0.0), strict=True))
+    with tempfile.TemporaryDirectory() as folder:
+        sound = Path(folder) / "sound.wav"
+        write_wav(sound, samples)
+        command = ["rhubarb", "-f", "tsv", "-r", "phonetic", str(sound)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    cues = [line.split("\t") for line in done.stdout.splitlines()]
+    starts_s, mouths = [float(start) for start, _ in cues], [mouth for _, mouth in cues]
+    for time_s in np.arange(0.0, len(samples) / RATE_HZ, 1.0 / FRAMES_PER_S):
+        mouth = mouths[max(int(np.searchsorted(starts_s, time_s, side="right")) - 1, 0)]
+        shown = {f"mouth_{name}": float(name == mouth) for name in openings}
+        yield float(time_s), {"opening": openings[mouth], **shown}
+
+
+def write_wav(path: Path, samples: Samples) -> None:
+    """Write mono samples of 16 bit."""
+    with wave.open(str(path), "wb") as file:
+        file.setparams((1, 2, RATE_HZ, 0, "NONE", ""))
+        file.writeframes((np.clip(samples, -1.0, 1.0) * 32767.0).astype("<i2").tobytes())
+
+
 PROGRAMS: dict[str, Callable[[Samples], Iterator[Row]]] = {
     "pylipsync": pylipsync_rows,
     "openfacefx": openfacefx_rows,
+    "rhubarb": rhubarb_rows,
 }
 
 

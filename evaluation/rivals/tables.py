@@ -2,8 +2,8 @@
 
 HeadAudio, wLipSync and live2d-motionsync run in Node as in a browser's audio thread, at 48 kHz in
 blocks of 128 samples. wawa-lipsync reads an analyser node 60 times a second. pylipsync (uLipSync in
-Python) and OpenFaceFX process whole recordings. All have their default settings. ``make report``
-installs them.
+Python), OpenFaceFX and Rhubarb (if it is on the path) process whole recordings. All have their
+default settings. ``make report`` installs them.
 
 wLipSync needs a profile, which its users make from their own voice. Here it is the mean cepstrum of
 each viseme in a quarter of the training clips. Loudness is the level of the last 20 ms, from 40 dB
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 FOLDER = Path(__file__).parent
 NODE_PROGRAMS = ("headaudio", "wlipsync", "wawa", "live2d")
-PYTHON_PROGRAMS = ("pylipsync", "openfacefx")
+PYTHON_PROGRAMS = ("pylipsync", "openfacefx", *(["rhubarb"] if shutil.which("rhubarb") else []))
 LOUDNESS = "loudness"
 PROGRAMS = (*NODE_PROGRAMS, *PYTHON_PROGRAMS, LOUDNESS)
 
