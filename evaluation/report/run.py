@@ -53,12 +53,13 @@ def run_steps(
             print_message(f"{name}: up to date")
         else:
             print_message(f"{name}: kouxing {_without_braces(commands[-1])}")
+            measured = about()
             figures = _run(commands, folders)
             if figures is None:
                 failed.append(name)
             else:
                 shown = [f"kouxing {_without_braces(command)}" for command in commands]
-                write_result(path, {"commands": shown, **about(), "code": code, **figures})
+                write_result(path, {"commands": shown, **measured, "code": code, **figures})
     return failed
 
 
