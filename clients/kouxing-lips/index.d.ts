@@ -17,8 +17,11 @@ export interface LipSyncEventMap {
 
 /** Lip sync in a page. One voice at a time; a new source replaces the last one. */
 export class LipSync extends EventTarget {
-  /** Load the models and the worker. `models` is the URL of their folder; default: the package's. */
-  static create(options?: EngineOptions & { models?: string | URL }): Promise<LipSync>;
+  /**
+   * Load the models and the worker. `models` is the URL of their folder; default: the package's.
+   * `context` is an audio context of the page; default: a new one.
+   */
+  static create(options?: EngineOptions & { models?: string | URL; context?: AudioContext }): Promise<LipSync>;
   /** Names of the weights of each set; available after the first source. */
   readonly names: Partial<Record<ShapeSetName, string[]>>;
   /** The audio context of this lip sync. */

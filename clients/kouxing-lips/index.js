@@ -23,7 +23,8 @@ const TEXTS = {
 export class LipSync extends EventTarget {
   #worker;
   #options;
-  #context = null;
+  #context;
+  #ownsContext;
   #session = 0; // number of the newest
   #track = new FrameTrack();
   #source = null; // { node, release(), startS: null before the first sound, isPlayed }
@@ -35,18 +36,21 @@ export class LipSync extends EventTarget {
   names = {};
 
   /** Use LipSync.create instead. */
-  constructor(worker, options) {
+  constructor(worker, context, options) {
     super();
     this.#worker = worker;
+    this.#context = context;
+    this.#ownsContext = context === null;
     this.#options = options;
+    context?.addEventListener("statechange", this.#onContextState);
     worker.onmessage = ({ data }) => this.#onMessage(data);
     document.addEventListener("visibilitychange", this.#onVisibility);
   }
 
   /** Load the models and the worker. */
-  static async create({ models = MODELS, phones = true, shapes = DEFAULT_SHAPES, ...options } = {}) {
+  static async create({ models = MODELS, phones = true, context = null, shapes = DEFAULT_SHAPES, ...options } = {}) {
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
-    const lips = new LipSync(worker, { shapes, ...options });
+    const lips = new LipSync(worker, context, { shapes, ...options });
     await new Promise((resolve, reject) => {
       lips.#pending.set("loaded", resolve).set("failed", reject);
       worker.onerror = () => reject(new Error("cannot start the worker; serve the package from the page's own origin"));
@@ -150,7 +154,7 @@ export class LipSync extends EventTarget {
   get context() {
     if (this.#context === null) {
       this.#context = new AudioContext({ latencyHint: "interactive" });
-      this.#context.onstatechange = () => this.#onContextState();
+      this.#context.addEventListener("statechange", this.#onContextState);
     }
     return this.#context;
   }
@@ -190,7 +194,8 @@ export class LipSync extends EventTarget {
     this.stop();
     document.removeEventListener("visibilitychange", this.#onVisibility);
     this.#worker.terminate();
-    this.#context?.close();
+    this.#context?.removeEventListener("statechange", this.#onContextState);
+    if (this.#ownsContext) this.#context?.close();
   }
 
   async #open(options, input = null) {
@@ -235,11 +240,11 @@ export class LipSync extends EventTarget {
     this.dispatchEvent(new CustomEvent("frames", { detail: { frames, startS } }));
   }
 
-  #onContextState() {
+  #onContextState = () => {
     if (this.#source === null) return;
     if (this.#context.state === "interrupted") this.#report(TEXTS.interrupted);
     else if (this.#context.state === "running") this.#report("");
-  }
+  };
 
   #onVisibility = () => {
     if (this.#source === null) return;

@@ -3,6 +3,8 @@
 import { LipSync } from "kouxing-lips";
 import { LipEngine } from "kouxing-lips/engine";
 import type { LipFrame } from "kouxing-lips";
+import { HeadAudio } from "kouxing-lips/headaudio";
+import { createWLipSyncNode } from "kouxing-lips/wlipsync";
 
 const lips: LipSync = await LipSync.create({ shapes: ["vrm"], delayMs: 160, feeling: 0 });
 lips.addEventListener("voice", ({ detail }) => console.log(detail.isLaughing));
@@ -21,6 +23,13 @@ const engine = await LipEngine.load({ sampleRateHz: 48000, shapes: ["oculus"], p
 const symbols: string[] = engine.newPhones.map(({ symbol }) => symbol);
 console.log(symbols);
 for (const { timeS, oculus } of engine.push(new Float32Array(480))) console.log(timeS, oculus?.[0]);
+
+const headAudio = new HeadAudio(lips.context);
+headAudio.onvalue = (name, weight) => console.log(name.length, weight.toFixed());
+await headAudio.loadModel();
+headAudio.update(16);
+const { volume, weights } = await createWLipSyncNode(lips.context);
+console.log(volume * weights.A!);
 
 // @ts-expect-error: unknown shapes
 await LipEngine.load({ shapes: ["apple"] });

@@ -1,0 +1,53 @@
+// The interface of HeadAudio (npm @met4citizen/headaudio) with the visemes of this package.
+
+import { LipSync } from "./index.js";
+
+/** An audio node that reports Oculus visemes. Its face is that of the sound 0.1 s ago. */
+export class HeadAudio extends GainNode {
+  /** Called with (name, weight) when the weight of a viseme changes. */
+  onvalue = null;
+  /** Called when speech starts. */
+  onstarted = null;
+  /** Called when speech ends. */
+  onended = null;
+  #lips = null;
+  #weights = []; // the last ones
+
+  /** @param context audio context of the sound */
+  constructor(context) {
+    super(context);
+  }
+
+  /** Load the models of this package; HeadAudio's own model is ignored. */
+  async loadModel() {
+    if (this.#lips) return;
+    this.#lips = await LipSync.create({ context: this.context, shapes: ["oculus"] });
+    this.#lips.addEventListener("voice", ({ detail: { timeS: t, isSpeaking } }) => {
+      if (isSpeaking) this.onstarted?.({ event: "started", t });
+      else this.onended?.({ event: "ended", t });
+    });
+    await this.start();
+  }
+
+  /** Report the weights that have changed. Call it for each image. */
+  update() {
+    const weights = this.#lips?.current?.oculus ?? [];
+    weights.forEach((weight, i) => {
+      if (i > 0 && weight !== this.#weights[i]) this.onvalue?.(`viseme_${VISEMES[i]}`, weight);
+    });
+    this.#weights = weights;
+  }
+
+  /** Follow the sound. */
+  start() {
+    return this.#lips.listenTo(this);
+  }
+
+  /** Stop following the sound. */
+  stop() {
+    this.#lips.stop();
+  }
+}
+
+// HeadAudio never reports the first one, and some avatars lack it.
+const VISEMES = ["sil", "PP", "FF", "TH", "DD", "kk", "CH", "SS", "nn", "RR", "aa", "E", "I", "O", "U"];

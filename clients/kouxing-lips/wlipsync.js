@@ -1,0 +1,52 @@
+// The interface of wLipSync (npm wlipsync) with the mouths of this package.
+
+import { LipSync } from "./index.js";
+
+const VOWELS = { A: "aa", I: "ih", U: "ou", E: "ee", O: "oh" }; // VRM's names
+
+/** An audio node with a volume and weights of vowels. Its face is that of the sound 0.1 s ago. */
+export class WLipSyncAudioNode extends GainNode {
+  #lips;
+  #names;
+
+  /** Use createWLipSyncNode instead. */
+  constructor(context, lips, names) {
+    super(context);
+    this.#lips = lips;
+    this.#names = names;
+  }
+
+  /** How far the mouth moves, 0 to 1: the sum of the vowels' VRM weights. */
+  get volume() {
+    return Math.min(1, this.#sum);
+  }
+
+  /** Shares of the vowels by the names of the profile; their product with the volume is the VRM weight. */
+  get weights() {
+    const sum = this.#sum;
+    return Object.fromEntries(this.#names.map((name) => [name, sum > 0 ? this.#weightOf(name) / sum : 0]));
+  }
+
+  get #sum() {
+    return Object.keys(VOWELS).reduce((sum, vowel) => sum + this.#weightOf(vowel), 0);
+  }
+
+  #weightOf(name) {
+    const index = this.#lips.names.vrm.indexOf(VOWELS[name]);
+    return this.#lips.current?.vrm[index] ?? 0;
+  }
+}
+
+/** Create a node. The profile only names the weights, because the models suit all voices. */
+export async function createWLipSyncNode(context, profile = null) {
+  const lips = await LipSync.create({ context, shapes: ["vrm"] });
+  const names = profile?.mfccs?.map(({ name }) => name) ?? Object.keys(VOWELS);
+  const node = new WLipSyncAudioNode(context, lips, [...new Set(names)]);
+  await lips.listenTo(node);
+  return node;
+}
+
+/** Profiles are not needed; a binary one is ignored. */
+export function parseBinaryProfile() {
+  return null;
+}
