@@ -7,6 +7,7 @@
 # make check-wheel  installs the wheel in an empty environment, and runs it
 # make lips-demo    writes the page with lip sync in the browser to dist/lips-demo
 # make report       measures everything that is out of date, and writes docs/results.md (CLIPS, CORPUS, NATURAL, STEPS, QUICK, FRESH)
+# make ovrlipsync   writes the C library with OVRLipSync's interface to dist/ovrlipsync
 # make lock         updates the locked versions and hashes of all Python packages
 #
 # test and check run all their stages, report each failure, and then exit with an error.
@@ -27,6 +28,7 @@ JAVASCRIPT := clients/javascript
 LIPS := clients/kouxing-lips
 LIPS_MODELS := $(LIPS)/models/model.json
 RIVALS := evaluation/rivals
+OVRLIPSYNC := clients/ovrlipsync
 AVATAR := examples/browser-vrm
 BLENDER := examples/blender/.venv
 BLENDER_LOCK := examples/blender/requirements.lock
@@ -51,7 +53,7 @@ CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos java
 STAGES = $(MAKE) --keep-going --no-print-directory
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo report lock clean $(TEST_STAGES) $(CHECK_STAGES)
+.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo ovrlipsync report lock clean $(TEST_STAGES) $(CHECK_STAGES)
 
 run: setup
 	$(BIN)/kouxing run --play $(SAMPLE)
@@ -134,6 +136,12 @@ lips-demo: setup $(LIPS_MODELS) $(JAVASCRIPT)/node_modules/.package-lock.json
 report: .venv/installed-dev setup $(LIPS_MODELS) $(RIVALS)/node_modules/.package-lock.json $(RIVALS)/.venv/installed
 	$(BIN)/kouxing evaluate report $(STEPS) $(CLIPS:%=--lips %) $(CORPUS:%=--corpus %) $(NATURAL:%=--natural %) \
 		$(QUICK:1=--quick) $(FRESH:1=--fresh)
+
+ovrlipsync: setup $(LIPS_MODELS)
+	rm -rf dist/ovrlipsync
+	mkdir -p dist/ovrlipsync
+	cp $(OVRLIPSYNC)/*.c $(OVRLIPSYNC)/*.h $(OVRLIPSYNC)/CMakeLists.txt dist/ovrlipsync
+	$(BIN)/node $(OVRLIPSYNC)/model.mjs $(LIPS)/models dist/ovrlipsync
 
 # The locks suit every system and Python >= 3.11. The version of torch is fixed: training depends on it.
 # When it changes, copy the hashes of its CPU builds from the index of TORCH_CPU to LOCK_TORCH_CPU.

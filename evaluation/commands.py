@@ -501,16 +501,24 @@ def lips_page(
     package: Annotated[Path, typer.Option(help="Folder of kouxing-lips in a source tree.")] = Path(
         "clients/kouxing-lips"
     ),
+    clips: Annotated[
+        Path | None,
+        typer.Option(help="Folder of clips with tracked lips, to also measure the accuracy."),
+    ] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure size, delay and processor time of lip sync in the browser. Needs Chromium."""
+    """Compare lip sync in the browser: kouxing-lips, HeadAudio, wLipSync, wawa-lipsync.
+
+    The figures are download, time to load, processor time and, with clips, accuracy. Needs
+    Chromium, Node and the npm packages of kouxing-lips.
+    """
     from kouxing.evaluation.system.lips_page import measure, show
 
     check_output(json_file, force=force)
-    figures = measure(audio, package)
+    figures = measure(audio, package, clips)
     show(figures, Console())
-    write_json(json_file, asdict(figures))
+    write_json(json_file, [asdict(page) for page in figures])
 
 
 @bench_app.command()

@@ -16,7 +16,7 @@ export interface KouxingFaceEventMap extends HTMLElementEventMap {
 }
 
 /**
- * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`, or `local`.
+ * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`, or `local`, or `manual`.
  * Events: `load`, `error`, `session`, `phone`, `notice`.
  */
 export class KouxingFace extends HTMLElement {
@@ -29,6 +29,8 @@ export class KouxingFace extends HTMLElement {
   /** Turn the session's sound on. Call it from a click handler. */
   turnSoundOn(): Promise<void>;
   turnSoundOff(): void;
+  /** Show values of the model's set: 68 FAPs, or weights with their names. */
+  show(values: Float32Array, names?: readonly string[]): void;
   /** Play the recording, with the sound of an audio element. Resolved when it ends. */
   play(audio?: HTMLAudioElement | null): Promise<void>;
   addEventListener<K extends keyof KouxingFaceEventMap>(

@@ -108,6 +108,14 @@ export class KouxingFace extends HTMLElement {
     this.#sound.turnOff();
   }
 
+  /** Show values: 68 FAPs, or weights with their names. Nothing happens before the model is loaded. */
+  show(values, names = []) {
+    if (this.#avatar === null) return;
+    this.#values = values;
+    this.#names = names;
+    this.#avatar.pose(values, names);
+  }
+
   /**
    * Play the recording.
    *
@@ -185,7 +193,7 @@ export class KouxingFace extends HTMLElement {
 
   #connect() {
     this.#disconnect();
-    if (this.#avatar === null || this.hasAttribute("recording")) return;
+    if (this.#avatar === null || this.hasAttribute("recording") || this.hasAttribute("manual")) return;
     if (this.hasAttribute("local")) {
       this.lips.catch((error) => this.#fail(error, error.message));
       return;
@@ -235,7 +243,7 @@ export class KouxingFace extends HTMLElement {
     if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize();
     if (this.#recording) this.#poseRecording();
     else if (this.hasAttribute("local")) this.#poseLocally(nowMs);
-    else if (this.#viewer !== null && this.#values !== null) this.#show(this.#player.faps, this.#names);
+    else if (this.#viewer !== null && this.#values !== null) this.show(this.#player.faps, this.#names);
     this.#avatar.update(Math.min(MAX_STEP_S, (nowMs - this.#drawnMs) / 1000));
     this.#drawnMs = nowMs;
     this.#images.draw(nowMs, () => this.#renderer.render(this.#scene, this.#camera));
@@ -248,7 +256,7 @@ export class KouxingFace extends HTMLElement {
     const names = this.#localFaces.names[set] ?? [];
     const values = face[set].slice();
     this.#blinks.apply(values, names, nowMs / 1000);
-    this.#show(values, names);
+    this.show(values, names);
   }
 
   #poseRecording() {
@@ -256,7 +264,7 @@ export class KouxingFace extends HTMLElement {
     const mediaTime = (nowS() + this.#drawRate.visibleDelayMs / 1000) * RATE_HZ;
     const next = frames.findIndex(([time]) => time > mediaTime);
     if (next === -1) {
-      this.#show(frames.at(-1)[1], names ?? []);
+      this.show(frames.at(-1)[1], names ?? []);
       this.#recording = null;
       onEnded();
       return;
@@ -265,13 +273,7 @@ export class KouxingFace extends HTMLElement {
     for (const [time, values] of frames.slice(Math.max(0, next - 1), next + 1)) track.push(time, values);
     const values = new Float32Array(frames[0][1].length);
     track.sample(mediaTime, values);
-    this.#show(values, names ?? []);
-  }
-
-  #show(values, names) {
-    this.#values = values;
-    this.#names = names;
-    this.#avatar.pose(values, names);
+    this.show(values, names ?? []);
   }
 
   #resize() {

@@ -26,6 +26,8 @@ export class LipSync extends EventTarget {
   readonly names: Partial<Record<ShapeSetName, string[]>>;
   /** The audio context of this lip sync. */
   readonly context: AudioContext;
+  /** The audio node of the current source, for example for a meter; null without one. */
+  readonly node: AudioNode | null;
   /** The face to show now; null before the first frame. */
   readonly current: LipFrame | null;
   /** Return the face at a time of the session, seconds; null before the first frame. */

@@ -106,6 +106,7 @@ export class LipSync extends EventTarget {
     const { port1, port2 } = new MessageChannel();
     await this.#open({ sampleRateHz: context.sampleRate }, port1);
     this.#source = {
+      node,
       isPlayed,
       startS: null,
       release() {
@@ -157,6 +158,11 @@ export class LipSync extends EventTarget {
       this.#context.addEventListener("statechange", this.#onContextState);
     }
     return this.#context;
+  }
+
+  /** The audio node of the current source, for example for a meter; null without one. */
+  get node() {
+    return this.#source?.node ?? null;
   }
 
   /** Start suspended sound. Browsers allow this only in a click handler. */

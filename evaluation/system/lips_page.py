@@ -1,116 +1,329 @@
-"""Measures lip sync in the browser: ``kouxing-lips`` in headless Chromium, without a drawn head.
+"""Compares lip sync in headless Chromium: ``kouxing-lips`` and three packages of npm.
 
-The microphone plays a recording in a loop. The delay of a frame is the time from its sound in the
-audio thread to its weights in the page. The processor time is that of the page's process: page,
-worker and audio thread.
+No head is drawn. The microphone plays a recording in a loop. The processor time is that of the
+page's process: page, worker and audio thread. All packages have their default settings.
+
+With clips, one page plays each held-out clip to all packages at the same time, and samples their
+faces. The lag of a package is the one with the highest correlation of the opening. Correlation and
+closures are those of a face whose sound is delayed by this lag.
+
+Weights of visemes become an opening by kouxing's visemes. wLipSync needs a profile, made from the
+samples, or from clips for training.
 """
 
 from __future__ import annotations
 
 import gzip
+import shutil
+import subprocess
+import sys
 import tempfile
 import time
-from dataclasses import dataclass
+import wave
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import track
 
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips, training_clips
+from kouxing.evaluation.lips.agreement import Agreement, agreement_of
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone
+from kouxing.evaluation.tables import format_number
 from kouxing.services.cli.web_model import web_model
+from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.terminal import print_table
 
+Array = NDArray[np.float64]
+
+OURS = "kouxing-lips"
 MEASURE_S = 20.0
 _SIZE_PX = (400, 300)
 _CODE = ("index.js", "worker.js", "worklet.js", "frame-track.js", "engine")
-_DOWNLOAD = ("*.js", "engine/*.js", "models/*")
+_NUM_PROFILE_CLIPS = 60
+_LIMIT_S = 60.0
+_LOWER_LIP = 4  # FAP 5
+_PACKAGES = "packages"
+_HEAD_AUDIO = f"{_PACKAGES}/@met4citizen/headaudio/dist"
+_DOWNLOADS = {  # patterns of files
+    OURS: ("*.js", "engine/*.js", "models/*"),
+    "HeadAudio": (f"{_HEAD_AUDIO}/*",),
+    "wLipSync": (f"{_PACKAGES}/wlipsync/dist/wlipsync-single.js", "wlipsync-profile.json"),
+    "wawa-lipsync": (f"{_PACKAGES}/wawa-lipsync/dist/wawa-lipsync.es.js",),
+}
 _PAGE = """<!doctype html><link rel="icon" href="data:,"><button id="start">Start</button>
+<script type="importmap">{ "imports": {
+  "@met4citizen/headaudio": "./packages/@met4citizen/headaudio/dist/headaudio.min.mjs",
+  "wlipsync": "./packages/wlipsync/dist/wlipsync-single.js",
+  "wawa-lipsync": "./packages/wawa-lipsync/dist/wawa-lipsync.es.js"
+} }</script>
 <script type="module">
 import { LipSync } from "./index.js";
+import { headAudio, wLipSync, wawa } from "./rivals.js";
+const STARTS = { "kouxing-lips": ours, HeadAudio: headAudio, wLipSync, "wawa-lipsync": wawa };
+const names = new URL(location).searchParams.getAll("name");
+const openingOf = ({ faps }) => { const now = faps(); return now ? -now[3] - now[4] : 0; };
 window.delays = [];
+async function ours(context) {
+  const lips = await LipSync.create({ context });
+  lips.addEventListener("frames", ({ detail: { frames, startS } }) => {
+    for (const { timeS } of frames) window.delays.push(context.currentTime - startS - timeS);
+  });
+  const node = new GainNode(context);
+  await lips.listenTo(node);
+  return { node, faps: () => lips.current?.faps };
+}
 document.getElementById("start").onclick = async () => {
   const startMs = performance.now();
-  const lips = await LipSync.create();
+  const context = new AudioContext({ latencyHint: "interactive" });
+  const packages = [];
+  for (const name of names) packages.push(await STARTS[name](context));
   window.loadedMs = performance.now() - startMs;
-  lips.addEventListener("frames", ({ detail: { frames, startS } }) => {
-    for (const { timeS, faps } of frames) {
-      window.delays.push(lips.context.currentTime - startS - timeS);
-      if (-faps[3] - faps[4] > 100) window.movedMs ??= performance.now() - startMs;
-    }
-  });
-  await lips.listenToMicrophone();
-  window.startedMs = performance.now() - startMs;
+  if (names.length > 1) {
+    window.play = (url) => play(context, packages, url);
+    return;
+  }
+  const [lips] = packages;
+  const stream = await navigator.mediaDevices.getUserMedia({ audio: true });
+  new MediaStreamAudioSourceNode(context, { mediaStream: stream }).connect(lips.node);
+  const draw = () => {
+    requestAnimationFrame(draw);
+    if (openingOf(lips) > 100) window.movedMs ??= performance.now() - startMs;
+  };
+  draw();
 };
+async function play(context, packages, url) {
+  const buffer = await context.decodeAudioData(await (await fetch(url)).arrayBuffer());
+  const source = new AudioBufferSourceNode(context, { buffer });
+  for (const { node } of packages) source.connect(node);
+  await new Promise((done) => setTimeout(done, 700)); // all mouths rest
+  const startS = context.currentTime;
+  source.start(startS);
+  const rows = [];
+  await new Promise((done) => {
+    const timer = setInterval(() => {
+      const timeS = context.currentTime - startS;
+      rows.push([timeS, ...packages.map(openingOf)]);
+      if (timeS < buffer.duration + 0.4) return;
+      clearInterval(timer);
+      done();
+    }, 20);
+  });
+  source.disconnect();
+  window.rows = rows;
+}
 window.isReady = true;
 </script>"""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LipsPage:
-    """Figures of lip sync in the browser."""
+    """Figures of a package for lip sync in the browser."""
 
+    name: str
     download_bytes: int  # code and models, compressed by gzip
-    loaded_ms: float  # models and worker, from a local server
+    loaded_ms: float  # from a local server
     first_movement_ms: float  # of the mouth, from the start of loading; the microphone speaks
-    delay_ms: dict[str, float]  # from the sound to its weights: p50, p95
+    delay_ms: dict[str, float] | None  # from the sound to its weights: p50, p95; only kouxing-lips
     processor_share: float  # of one core
+    num_clips: int = 0
+    lag_ms: float | None = None  # of the opening behind the real lips, with the page's delay
+    opening_correlation: float | None = None
+    closure_f1: float | None = None
 
 
-def measure(audio: Path, package: Path) -> LipsPage:
-    """Measure the package in a folder; raise ``UserError`` if Chromium is not installed."""
+def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsPage]:
+    """Measure the package in a folder and its rivals.
+
+    Raises ``UserError`` if Chromium, Node or the npm packages of ``package`` are not installed.
+    """
+    held_out = clips_to_score(clips) if clips else []
+    recordings = [clip.samples for clip in _profile_clips(clips)] if clips else _samples(package)
+    with _site(package, recordings) as folder:
+        voice = folder / "voice.wav"
+        write_microphone(audio, voice)
+        try:
+            with serve_folder(folder) as origin:
+                pages = [
+                    _measure_page(folder, voice, origin, name)
+                    for name in track(_DOWNLOADS, description="packages", transient=True)
+                ]
+                return _with_accuracy(pages, folder, voice, origin, held_out)
+        except TimeoutError as error:
+            raise UserError(f"the page did not respond in time: {error}") from None
+
+
+@contextmanager
+def _site(package: Path, recordings: Iterable[NDArray[np.float32]]) -> Iterator[Path]:
+    """Write the page with all packages to a temporary folder."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         for file in _CODE:
             if not (package / file).exists():
                 raise UserError(f"{package} is not a folder of kouxing-lips: it has no {file}")
             (folder / file).symlink_to((package / file).resolve())
+        modules = package / "node_modules"
+        if not (modules / "wlipsync").is_dir():
+            raise UserError(f"the packages to compare are missing; run npm ci in {package}")
+        (folder / _PACKAGES).symlink_to(modules.resolve())
+        (folder / "rivals.js").symlink_to((package / "demo" / "rivals.js").resolve())
+        table = package / "../../shared/face/high_level.tsv"
+        (folder / "visemes.tsv").symlink_to(table.resolve())
         (folder / "models").mkdir()
         for file, content in web_model().items():
             (folder / "models" / file).write_bytes(content)
         (folder / "index.html").write_text(_PAGE, encoding="utf-8")
-        voice = folder / "voice.wav"
-        write_microphone(audio, voice)
-        files = (path for pattern in _DOWNLOAD for path in folder.glob(pattern))
-        size = sum(len(gzip.compress(path.read_bytes())) for path in files)
-        browser = Chromium(folder / "profile", _SIZE_PX, voice)
+        profile = _wlipsync_profile(package, recordings)
+        (folder / "wlipsync-profile.json").write_bytes(profile)
+        yield folder
+
+
+def _profile_clips(folder: Path) -> list[LipClip]:
+    clips = training_clips(read_clips(folder, language=None))
+    return clips[:: -(-len(clips) // _NUM_PROFILE_CLIPS)]
+
+
+def _samples(package: Path) -> list[NDArray[np.float32]]:
+    files = sorted((package / "../../shared/demo").glob("*.wav"))
+    return [read_audio(file)[0].reshape(-1) for file in files]
+
+
+def _wlipsync_profile(package: Path, recordings: Iterable[NDArray[np.float32]]) -> bytes:
+    """Return a profile for wLipSync from recordings, samples at 16 kHz."""
+    node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
+    if node is None:
+        raise UserError("this comparison needs Node: pip install 'kouxing[page]'")
+    with tempfile.TemporaryDirectory() as name:
+        for number, samples in enumerate(recordings):
+            samples.astype("<f4").tofile(Path(name) / f"{number}.f32")
+        script = package / "demo" / "wlipsync-profile.mjs"
+        done = subprocess.run([node, script, name], capture_output=True, check=False)  # noqa: S603
+    if done.returncode:
+        raise UserError(f"no profile for wLipSync: {done.stderr.decode(errors='replace')[-300:]}")
+    return done.stdout
+
+
+@contextmanager
+def _page(folder: Path, voice: Path, origin: str, names: Sequence[str]) -> Iterator[Chromium]:
+    """Open the page with some packages, and start them."""
+    with tempfile.TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as profile:
+        browser = Chromium(Path(profile), _SIZE_PX, voice)
         try:
-            with serve_folder(folder) as origin:
-                return _measure(browser, origin, size)
-        except TimeoutError as error:
-            raise UserError(f"the page did not respond in time: {error}") from None
+            query = "&".join(f"name={name}" for name in names)
+            browser.command("Page.navigate", url=f"{origin}/?{query}")
+            browser.wait_for("window.isReady")
+            browser.click("start")
+            browser.wait_for("window.loadedMs")
+            yield browser
         finally:
             browser.close()
 
 
-def _measure(browser: Chromium, origin: str, download_bytes: int) -> LipsPage:
-    browser.command("Page.navigate", url=origin)
-    browser.wait_for("window.isReady")
-    browser.click("start")
-    browser.wait_for("window.movedMs && window.startedMs")
-    browser.evaluate("window.delays.length = 0")
-    start_s, start_cpu_s = time.monotonic(), browser.cpu_s("renderer")
-    time.sleep(MEASURE_S)
-    duration_s, cpu_s = time.monotonic() - start_s, browser.cpu_s("renderer") - start_cpu_s
-    delays_ms = 1e3 * np.array(browser.evaluate("window.delays"))
-    return LipsPage(
-        download_bytes=download_bytes,
-        loaded_ms=browser.evaluate("window.loadedMs"),
-        first_movement_ms=browser.evaluate("window.movedMs"),
-        delay_ms={f"p{p}": float(np.percentile(delays_ms, p)) for p in (50, 95)},
-        processor_share=cpu_s / duration_s,
+def _measure_page(folder: Path, voice: Path, origin: str, name: str) -> LipsPage:
+    with _page(folder, voice, origin, [name]) as browser:
+        browser.wait_for("window.movedMs")
+        browser.evaluate("window.delays.length = 0")
+        start_s, start_cpu_s = time.monotonic(), browser.cpu_s("renderer")
+        time.sleep(MEASURE_S)
+        duration_s, cpu_s = time.monotonic() - start_s, browser.cpu_s("renderer") - start_cpu_s
+        delays_ms = 1e3 * np.array(browser.evaluate("window.delays"))
+        files = {path for pattern in _DOWNLOADS[name] for path in folder.glob(pattern)}
+        return LipsPage(
+            name=name,
+            download_bytes=sum(len(gzip.compress(path.read_bytes())) for path in files),
+            loaded_ms=browser.evaluate("window.loadedMs"),
+            first_movement_ms=browser.evaluate("window.movedMs"),
+            delay_ms={f"p{p}": float(np.percentile(delays_ms, p)) for p in (50, 95)}
+            if name == OURS
+            else None,
+            processor_share=cpu_s / duration_s,
+        )
+
+
+def _with_accuracy(
+    pages: Sequence[LipsPage], folder: Path, voice: Path, origin: str, clips: Sequence[LipClip]
+) -> list[LipsPage]:
+    """Add the figures of the clips."""
+    if not clips:
+        return list(pages)
+    takes = []
+    with _page(folder, voice, origin, [page.name for page in pages]) as browser:
+        browser.wait_for("window.play !== undefined")
+        for number, clip in enumerate(track(clips, description="clips", transient=True)):
+            _write_clip(clip, folder / f"{number}.wav")
+            browser.evaluate(f"window.rows = null; window.play('{number}.wav'); 1")
+            browser.wait_for("window.rows !== null", 60.0 * clip.minutes + _LIMIT_S)
+            rows = np.array(browser.evaluate("window.rows"))
+            takes.append((rows, real_mouth(clip.time_s, real_faps(clip))))
+    return [_scored(page, column, takes) for column, page in enumerate(pages, 1)]
+
+
+def _write_clip(clip: LipClip, wav: Path) -> None:
+    with wave.open(str(wav), "wb") as file:
+        file.setparams((1, 2, SAMPLE_RATE_HZ, 0, "NONE", ""))
+        file.writeframes((clip.samples * 32767).astype("<i2").tobytes())
+
+
+def _scored(page: LipsPage, column: int, takes: Sequence[tuple[Array, Mouth]]) -> LipsPage:
+    """Add the agreement with real mouths. A take has rows of a time and openings."""
+
+    def agreement(lag_s: float) -> Agreement:
+        return agreement_of([(_shown_mouth(rows, column, lag_s), real) for rows, real in takes])
+
+    lag_ms = agreement(0.0).lag_ms
+    in_sync = agreement((lag_ms or 0.0) / 1e3)
+    return replace(
+        page,
+        num_clips=len(takes),
+        lag_ms=lag_ms,
+        opening_correlation=in_sync.correlation["opening"],
+        closure_f1=in_sync.closure_f1,
     )
 
 
-def show(page: LipsPage, console: Console) -> None:
+def _shown_mouth(rows: Array, column: int, lag_s: float) -> Mouth:
+    """Return a column of openings as a mouth, earlier by a lag."""
+    time_s = np.arange(int(rows[-1, 0] * FRAME_RATE_HZ)) / FRAME_RATE_HZ
+    faps = np.zeros((len(time_s), NUM_FAPS))
+    faps[:, _LOWER_LIP] = -np.interp(time_s + lag_s, rows[:, 0], rows[:, column])
+    return made_mouth(faps)
+
+
+def show(pages: Sequence[LipsPage], console: Console) -> None:
     """Print the figures as a table."""
-    columns = ("download MB", "loaded ms", "first movement ms", "delay p50 ms", "p95 ms", "core %")
-    row = [
-        f"{page.download_bytes / 1e6:.2f}",
-        f"{page.loaded_ms:.0f}",
-        f"{page.first_movement_ms:.0f}",
-        f"{page.delay_ms['p50']:.0f}",
-        f"{page.delay_ms['p95']:.0f}",
-        f"{100 * page.processor_share:.1f}",
+    columns = "package", "download kB", "loaded ms", "first movement ms", "core %"
+    accuracy = "lag ms", "opening r", "closures F1"
+    rows = [
+        [
+            page.name,
+            f"{page.download_bytes / 1e3:.0f}",
+            f"{page.loaded_ms:.0f}",
+            f"{page.first_movement_ms:.0f}",
+            f"{100 * page.processor_share:.1f}",
+            *(
+                format_number(value, form)
+                for value, form in (
+                    (page.lag_ms, ".0f"),
+                    (page.opening_correlation, ".2f"),
+                    (page.closure_f1, ".2f"),
+                )
+                if page.num_clips
+            ),
+        ]
+        for page in pages
     ]
-    print_table(console, "", columns, [row])
+    has_accuracy = any(page.num_clips for page in pages)
+    print_table(console, "", [*columns, *(accuracy if has_accuracy else ())], rows)
+    for page in pages:
+        if page.delay_ms is not None:
+            delays = ", ".join(f"{name} {ms:.0f} ms" for name, ms in page.delay_ms.items())
+            console.print(f"{page.name}, from the sound to its weights: {delays}")

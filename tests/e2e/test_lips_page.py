@@ -98,6 +98,24 @@ def test_an_avatar_speaks(browser: Browser, site: Path) -> None:
         browser.wait_for(f"({FACE}.shown?.jawOpen ?? {FACE}.shown?.aa) > 0.05")
 
 
+def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path) -> None:
+    faces = "[...document.querySelectorAll('kouxing-face')]"
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.click("compare")
+        browser.wait_for(f"{faces}.length === 3 && {faces}.every(({{ set }}) => set === 'faps')")
+        browser.evaluate(
+            "window.jaws = [0, 0, 0]; setInterval(() => "
+            f"{faces}.forEach((face, i) => {{ const jaw = face.shown?.[2] ?? 0;"
+            " window.jaws[i] = Math.max(window.jaws[i], jaw); }), 20); 1"
+        )
+        browser.click("microphone")
+        browser.wait_for("window.jaws.every((jaw) => jaw > 50)")
+        browser.click("compare")
+        browser.wait_for(f"{faces}.length === 1")
+    assert not [text for text in browser.complaints if "GL Driver" not in text]
+
+
 def test_sound_before_a_click_gives_a_notice(browser: Browser, site: Path) -> None:
     with serve_folder(site) as origin:
         open_demo(browser, origin)

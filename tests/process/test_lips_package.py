@@ -78,14 +78,14 @@ def server_events(samples: Frames) -> list[SoundEvent]:
     return sound_events(load_model("light"), samples, load_lip_predictor(), DELAY_S, config)
 
 
-def server_faps(events: Sequence[SoundEvent]) -> Frames:
+def server_faps(events: Sequence[SoundEvent], feeling: float = FEELING) -> Frames:
     """Return the server's frames without idle motion and tongue."""
     face = FaceAnimator(
         load_lip_model(),
         frame_rate_hz=FRAME_RATE_HZ,
         delay_s=DELAY_S,
         expressiveness=EXPRESSIVENESS,
-        feeling=FEELING,
+        feeling=feeling,
     )
     faps = np.array([frame for event in events for _, frame in face.process(event)])
     faps[:, TONGUE] = 0.0

@@ -5,20 +5,23 @@ import { createHash } from "node:crypto";
 import { cp, mkdir, readFile, readdir, rm, writeFile } from "node:fs/promises";
 import { join, relative } from "node:path";
 import { fileURLToPath } from "node:url";
+import { profileOf } from "./wlipsync-profile.mjs";
 
 const ROOT = fileURLToPath(new URL("../../../", import.meta.url));
 const CLIENT = join(ROOT, "clients/javascript");
 const PAGE = join(ROOT, "services/gateway/page");
 const THREE = join(CLIENT, "node_modules/three");
 const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
-const LAZY_FILES = /^heads\/(?!woman)|^modules\/three\/examples\/jsm\/libs\/draco/; // loaded when first used
+// loaded when first used
+const LAZY_FILES = /^heads\/(?!woman)|^modules\/(three\/examples\/jsm\/libs\/draco|headaudio|wlipsync)|^(rivals|visemes|wlipsync)/;
+const WAV_HEADER_BYTES = 44;
 
 const [folder] = process.argv.slice(2);
 await rm(folder, { recursive: true, force: true });
 await mkdir(folder, { recursive: true });
 const copy = (from, to) => cp(from, join(folder, to), { recursive: true });
 
-for (const name of ["index.html", "demo.js", "demo.css"]) await copy(fileURLToPath(new URL(name, import.meta.url)), name);
+for (const name of ["index.html", "demo.js", "demo.css", "rivals.js"]) await copy(fileURLToPath(new URL(name, import.meta.url)), name);
 await copy(join(PAGE, "icon.svg"), "icon.svg");
 await copy(join(ROOT, "shared/demo/hello-female.wav"), "sample.wav");
 for (const head of HEADS) {
@@ -29,6 +32,14 @@ const lips = fileURLToPath(new URL("../", import.meta.url));
 for (const name of ["index.js", "worker.js", "worklet.js", "frame-track.js", "engine", "models"]) {
   await copy(join(lips, name), `modules/kouxing-lips/${name}`);
 }
+const rivals = { headaudio: "@met4citizen/headaudio", wlipsync: "wlipsync" };
+for (const [to, name] of Object.entries(rivals)) {
+  for (const part of ["dist", "LICENSE"]) await copy(join(lips, "node_modules", name, part), `modules/${to}/${part}`);
+}
+await copy(join(ROOT, "shared/face/high_level.tsv"), "visemes.tsv");
+const samples = join(ROOT, "shared/demo");
+const recordings = (await readdir(samples)).filter((name) => name.endsWith(".wav")).map((name) => readWav(join(samples, name)));
+await writeFile(join(folder, "wlipsync-profile.json"), JSON.stringify(await profileOf(await Promise.all(recordings))));
 const modules = (await readdir(CLIENT)).filter((name) => name.endsWith(".js"));
 for (const name of [...modules, "page"]) await copy(join(CLIENT, name), `modules/kouxing-client/${name}`);
 await copy(join(CLIENT, "node_modules/@pixiv/three-vrm/lib/three-vrm.module.min.js"), "modules/three-vrm.js");
@@ -50,3 +61,9 @@ for (const name of files) hash.update(name).update(await readFile(join(folder, n
 const worker = await readFile(new URL("service-worker.js", import.meta.url), "utf8");
 const constants = `const VERSION = "${hash.digest("hex").slice(0, 16)}";\nconst FILES = ${JSON.stringify(["./", ...files], null, 1)};\n`;
 await writeFile(join(folder, "service-worker.js"), constants + worker);
+
+/** Return the samples of a recording of this project: 16 bits, mono, 16 kHz. */
+async function readWav(file) {
+  const bytes = new Uint8Array(await readFile(file)).slice(WAV_HEADER_BYTES);
+  return Float32Array.from(new Int16Array(bytes.buffer), (sample) => sample / 32768);
+}

@@ -7,6 +7,8 @@ const NUM_PHONES = 12; // on the page
 const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
 const [face, note] = [byId("face"), byId("note")];
+let rivals = null; // [{ face, lips: input and FAPs }], while they are compared
+let followed = null; // audio node that the rivals follow
 
 for (const head of HEADS) {
   const button = document.createElement("button");
@@ -31,6 +33,7 @@ byId("microphone").onclick = () =>
     await lips.listenToMicrophone();
     setMicrophone(true);
   });
+byId("compare").onclick = () => act(rivals ? stopComparing : startComparing);
 byId("sample").onclick = () => act((lips) => play(lips, "sample.wav"));
 byId("file").onchange = ({ target }) => {
   take(target.files[0]);
@@ -79,6 +82,58 @@ async function prepare() {
   show();
 }
 
+/** Show HeadAudio and wLipSync next to this package. */
+async function startComparing(lips) {
+  const { headAudio, wLipSync } = await import("./rivals.js");
+  const shown = [];
+  for (const [title, start] of Object.entries({ HeadAudio: headAudio, wLipSync })) {
+    shown.push({ face: Object.assign(document.createElement("kouxing-face"), { title }), lips: await start(lips.context) });
+  }
+  for (const { face: rival } of shown) rival.setAttribute("manual", "");
+  const [first, second] = shown;
+  byId("faces").prepend(first.face);
+  byId("faces").append(second.face);
+  rivals = shown;
+  setComparing();
+  showRivals(lips);
+}
+
+function stopComparing() {
+  for (const { face: rival, lips: { node } } of rivals) {
+    rival.remove();
+    followed?.disconnect(node);
+  }
+  rivals = followed = null;
+  setComparing();
+}
+
+function setComparing() {
+  byId("compare").ariaPressed = String(rivals !== null);
+  document.body.classList.toggle("comparing", rivals !== null);
+  setRivalHeads();
+}
+
+/** Give the rivals the same head. FAPs move it, so an avatar cannot show them. */
+function setRivalHeads() {
+  const head = face.getAttribute("src");
+  const src = head.startsWith("heads/") ? head : `heads/${HEADS[0]}.glb`;
+  for (const { face: rival } of rivals ?? []) rival.setAttribute("src", src);
+}
+
+/** Show the rivals' faces for each image, and let them follow the current source. */
+function showRivals(lips) {
+  if (rivals === null) return;
+  requestAnimationFrame(() => showRivals(lips));
+  if (lips.node !== followed) {
+    for (const { lips: { node } } of rivals) {
+      followed?.disconnect(node);
+      lips.node?.connect(node);
+    }
+    followed = lips.node;
+  }
+  for (const { face: rival, lips: rivalLips } of rivals) rival.show(rivalLips.faps());
+}
+
 /** Run an action on the lip sync; show its error message. */
 async function act(action) {
   note.textContent = "";
@@ -114,6 +169,7 @@ function take(file) {
 function showHead(head) {
   choose(head);
   face.setAttribute("src", `heads/${head}.glb`);
+  setRivalHeads();
 }
 
 function choose(head) {

@@ -1,0 +1,156 @@
+#include "ear.h"
+
+#include <math.h>
+#include <string.h>
+
+#define PI 3.14159265358979323846
+
+typedef struct {
+  const int8_t *integers; /* (columns, rows) */
+  const float *scales, *bias;
+  int columns, rows;
+} Layer;
+
+#define LAYER(NAME) \
+  ((Layer){NAME##_INTEGERS, NAME##_SCALES, NAME##_BIAS, NAME##_INTEGERS_SIZE_0, NAME##_INTEGERS_SIZE_1})
+
+enum { NUM_BINS = MEL_BANDS_SIZE_0, NUM_VOICES = 4 };
+
+static double sigmoid(double x) { return 0.5 * tanh(0.5 * x) + 0.5; }
+
+static double cosines[MEL_WINDOW_SAMPLES], sines[MEL_WINDOW_SAMPLES];
+
+void ear_init_tables(void) {
+  for (int n = 0; n < MEL_WINDOW_SAMPLES; n++) {
+    cosines[n] = cos(2.0 * PI * n / MEL_WINDOW_SAMPLES);
+    sines[n] = sin(2.0 * PI * n / MEL_WINDOW_SAMPLES);
+  }
+}
+
+void log_mel(const float *window, float *bands) {
+  double sound[MEL_WINDOW_SAMPLES], powers[NUM_BINS];
+  for (int n = 0; n < MEL_WINDOW_SAMPLES; n++) sound[n] = MEL_HANN[n] * window[n];
+  for (int bin = 0; bin < NUM_BINS; bin++) {
+    double real = 0.0, imaginary = 0.0;
+    for (int n = 0, angle = 0; n < MEL_WINDOW_SAMPLES; n++) {
+      real += sound[n] * cosines[angle];
+      imaginary += sound[n] * sines[angle];
+      angle += bin;
+      if (angle >= MEL_WINDOW_SAMPLES) angle -= MEL_WINDOW_SAMPLES;
+    }
+    powers[bin] = real * real + imaginary * imaginary;
+  }
+  for (int band = 0; band < MEL_NUM_MELS; band++) {
+    double total = 0.0;
+    for (int bin = MEL_EDGES[2 * band]; bin < MEL_EDGES[2 * band + 1]; bin++) {
+      total += MEL_BANDS[bin * MEL_NUM_MELS + band] * powers[bin];
+    }
+    bands[band] = (float)((log10(fmax(total, MEL_FLOOR)) + 4.0) / 4.0);
+  }
+}
+
+/* Compute a layer with weights and inputs of 8 bits. As on the server, values have 32 bits after each step. */
+static void apply_layer(Layer layer, const float *inputs, float *outputs) {
+  int8_t integers[EAR_WIDTH];
+  float largest = 0.0f;
+  for (int i = 0; i < layer.rows; i++) largest = fmaxf(largest, fabsf(inputs[i]));
+  const float scale = fmaxf(largest * (float)EAR_STEP, (float)EAR_MIN_SCALE);
+  for (int i = 0; i < layer.rows; i++) {
+    const float rounded = rintf(inputs[i] / scale);
+    integers[i] = (int8_t)fminf(fmaxf(rounded, -128.0f), 127.0f);
+  }
+  const int8_t *weights = layer.integers;
+  for (int column = 0; column < layer.columns; column++, weights += layer.rows) {
+    int32_t sum = 0;
+    for (int i = 0; i < layer.rows; i++) sum += integers[i] * weights[i];
+    const float product = (float)((double)layer.scales[column] * sum);
+    outputs[column] = product * scale + layer.bias[column];
+  }
+}
+
+/* Advance a gated recurrent unit (Cho et al. 2014). */
+static void advance_unit(Layer from_inputs, Layer from_state, const float *inputs, float *state) {
+  float x[3 * EAR_WIDTH], h[3 * EAR_WIDTH];
+  apply_layer(from_inputs, inputs, x);
+  apply_layer(from_state, state, h);
+  for (int i = 0; i < EAR_WIDTH; i++) {
+    const float reset = (float)(1.0 / (1.0 + exp(-(double)(x[i] + h[i]))));
+    const float update = (float)(1.0 / (1.0 + exp(-(double)(x[EAR_WIDTH + i] + h[EAR_WIDTH + i]))));
+    const float next = tanhf(x[2 * EAR_WIDTH + i] + reset * h[2 * EAR_WIDTH + i]);
+    state[i] = next + update * (state[i] - next);
+  }
+}
+
+void ear_process(Ear *ear) {
+  float entered[EAR_WIDTH], outputs[EAR_OUTPUT_INTEGERS_SIZE_0];
+  float *first = ear->state, *second = ear->state + EAR_WIDTH;
+  apply_layer(LAYER(EAR_ENTRY), ear->features, entered);
+  for (int i = 0; i < EAR_WIDTH; i++) entered[i] = fmaxf(entered[i], 0.0f);
+  advance_unit(LAYER(EAR_FIRST_IH), LAYER(EAR_FIRST_HH), entered, first);
+  advance_unit(LAYER(EAR_SECOND_IH), LAYER(EAR_SECOND_HH), first, second);
+  for (int i = 0; i < EAR_WIDTH; i++) entered[i] = first[i] + second[i];
+  apply_layer(LAYER(EAR_OUTPUT), entered, outputs);
+  memcpy(ear->features + NUM_FEATURES - EAR_NUM_FEATURES, outputs, EAR_NUM_FEATURES * sizeof(float));
+
+  const float *logits = outputs + EAR_NUM_FEATURES + EAR_NUM_PHONES;
+  double total = 0.0;
+  for (int voice = 0; voice < NUM_VOICES; voice++) total += exp(logits[voice]);
+  ear->voice = (float)((exp(logits[VOICE_SPEECH]) + exp(logits[VOICE_SUNG])) / total);
+
+  enum { LAUGHTER = 2 }; /* a column of the readout */
+  double laughter = TRAITS_BIAS[LAUGHTER];
+  for (int i = 0; i < 2 * EAR_WIDTH; i++) laughter += (double)ear->state[i] * TRAITS_WEIGHTS[i * TRAITS_NUM_TRAITS + LAUGHTER];
+  ear->laughter += TRAITS_EVIDENCE_SHARE * (laughter - ear->laughter);
+}
+
+/* Compute the product of a vector and a matrix (rows, columns), plus a bias. */
+static void multiply(double *out, const double *vector, const float *matrix, int rows, int columns, const float *bias) {
+  for (int column = 0; column < columns; column++) out[column] = bias ? bias[column] : 0.0;
+  for (int row = 0; row < rows; row++) {
+    for (int column = 0; column < columns; column++) out[column] += vector[row] * matrix[row * columns + column];
+  }
+}
+
+/* Return the number of the longest delay that suits the face's. */
+static int chosen_delay(void) {
+  int chosen = 0;
+  for (int i = 0; i < LIPS_DELAYS_SIZE_0; i++) {
+    if (LIPS_DELAYS[i] + LIP_FRAMES_POSITION_LAG_S <= DELAY_S + 1e-6) chosen = i;
+  }
+  return chosen;
+}
+
+LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const float *features) {
+  enum { PROJECTED = LIPS_PROJECTION_SIZE_1, GATES = LIPS_STATE_BIAS_SIZE_0, DELAYS = LIPS_DELAYS_SIZE_0 };
+  double centered[NUM_FEATURES], projected[PROJECTED], entered[LIP_WIDTH], state[LIP_WIDTH];
+  double from_input[GATES], from_state[GATES], outputs[LIPS_NUM_OUTPUTS];
+  const int delay = chosen_delay();
+  for (int i = 0; i < NUM_FEATURES; i++) centered[i] = (double)features[i] - LIPS_FEATURE_MEAN[i];
+  multiply(projected, centered, LIPS_PROJECTION, NUM_FEATURES, PROJECTED, NULL);
+  multiply(entered, projected, LIPS_ENTRY_WEIGHTS, PROJECTED, LIP_WIDTH, LIPS_ENTRY_BIAS);
+  for (int i = 0; i < LIP_WIDTH; i++) {
+    entered[i] = fmax(entered[i], 0.0);
+    state[i] = predictor->state[i];
+  }
+  multiply(from_input, entered, LIPS_INPUT_WEIGHTS, LIP_WIDTH, GATES, LIPS_INPUT_BIAS);
+  multiply(from_state, state, LIPS_STATE_WEIGHTS, LIP_WIDTH, GATES, LIPS_STATE_BIAS);
+  for (int i = 0; i < LIP_WIDTH; i++) {
+    const double reset = sigmoid(from_input[i] + from_state[i]);
+    const double update = sigmoid(from_input[LIP_WIDTH + i] + from_state[LIP_WIDTH + i]);
+    const double next = tanh(from_input[2 * LIP_WIDTH + i] + reset * from_state[2 * LIP_WIDTH + i]);
+    predictor->state[i] = (float)((1.0 - update) * next + update * state[i]);
+  }
+  for (int output = 0; output < LIPS_NUM_OUTPUTS; output++) {
+    const int place = delay * LIPS_NUM_OUTPUTS + output, stride = DELAYS * LIPS_NUM_OUTPUTS;
+    double sum = LIPS_OUTPUT_BIAS[place];
+    for (int i = 0; i < NUM_FEATURES; i++) sum += (double)features[i] * LIPS_LIP_WEIGHTS[i * stride + place];
+    for (int i = 0; i < LIP_WIDTH; i++) sum += predictor->state[i] * (double)LIPS_OUTPUT_WEIGHTS[i * stride + place];
+    for (int i = 0; i < LIP_WIDTH; i++) sum += entered[i] * LIPS_OUTPUT_WEIGHTS[(LIP_WIDTH + i) * stride + place];
+    outputs[output] = sum;
+  }
+  LipFrame frame = {.time_s = known_s - LIPS_DELAYS[delay], .delay_s = LIPS_DELAYS[delay]};
+  for (int i = 0; i < LIPS_COLUMNS_LENGTH; i++) frame.faps[LIPS_COLUMNS[i]] = (float)outputs[i];
+  for (int i = 0; i < LIPS_PAIRS_LENGTH; i++) frame.faps[LIPS_PAIRS[2 * i + 1]] = frame.faps[LIPS_PAIRS[2 * i]];
+  frame.closure = sigmoid(outputs[LIPS_CLOSURE]);
+  return frame;
+}

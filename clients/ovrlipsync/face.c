@@ -1,0 +1,414 @@
+#include "face.h"
+
+#include <math.h>
+#include <string.h>
+
+static const Mouth AT_REST = {{0}, {0}};
+
+static double clamp(double x, double lowest, double highest) { return fmin(fmax(x, lowest), highest); }
+
+static double smooth_step(double share) {
+  share = clamp(share, 0.0, 1.0);
+  return share * share * (3.0 - 2.0 * share);
+}
+
+/* Return what remains of a difference on its way to zero, a cubic; u goes from 0 to 1. */
+static double remaining(double value, double velocity, double u, double duration_s) {
+  return (1.0 - u) * (1.0 - u) * ((1.0 + 2.0 * u) * value + u * duration_s * velocity);
+}
+
+static double remaining_velocity(double value, double velocity, double u, double duration_s) {
+  return (1.0 - u) * (-6.0 * u * value / duration_s + (1.0 - 3.0 * u) * velocity);
+}
+
+/* ---- track ---- */
+
+static double track_end_s(const Track *track) {
+  return track->num_knots ? track->knots[track->num_knots - 1].time_s : -INFINITY;
+}
+
+static void drop_knots(Track *track, int number) {
+  track->num_knots -= number;
+  memmove(track->knots, track->knots + number, track->num_knots * sizeof(Knot));
+}
+
+static void add_knot(Track *track, double time_s, const Mouth *mouth) {
+  if (track->num_knots == MAX_KNOTS) drop_knots(track, 1);
+  track->knots[track->num_knots].time_s = time_s;
+  track->knots[track->num_knots++].mouth = *mouth;
+}
+
+static void track_append(Track *track, double time_s, const double *faps) {
+  Mouth mouth = AT_REST;
+  const double elapsed_s = time_s - track_end_s(track);
+  memcpy(mouth.value, faps, sizeof mouth.value);
+  if (elapsed_s <= TRACK_MAX_GAP_S) {
+    const double *last = track->knots[track->num_knots - 1].mouth.value;
+    for (int i = 0; i < NUM_MOUTH_FAPS; i++) mouth.velocity[i] = (faps[i] - last[i]) / elapsed_s;
+  } else {
+    if (track->num_knots) add_knot(track, track_end_s(track) + TRACK_CLOSE_S, &AT_REST);
+    add_knot(track, time_s - TRACK_OPEN_S, &AT_REST);
+  }
+  add_knot(track, time_s, &mouth);
+}
+
+/* Return the number of knots up to a time. */
+static int num_until(const Track *track, double time_s) {
+  int number = 0;
+  while (number < track->num_knots && track->knots[number].time_s <= time_s) number++;
+  return number;
+}
+
+static void track_forget_before(Track *track, double time_s) {
+  const int number = num_until(track, time_s) - 1;
+  if (number > 0) drop_knots(track, number);
+}
+
+/* Return the cubic Hermite spline between two knots. */
+static Mouth interpolate(const Knot *before, const Knot *after, double time_s) {
+  const double duration_s = after->time_s - before->time_s;
+  const double u = (time_s - before->time_s) / duration_s;
+  Mouth mouth;
+  for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
+    const double x = before->mouth.value[i], step = after->mouth.value[i] - x;
+    const double v = before->mouth.velocity[i], end = after->mouth.velocity[i];
+    mouth.value[i] = x + u * u * (3 - 2 * u) * step + u * (1 - u) * duration_s * ((1 - u) * v - u * end);
+    mouth.velocity[i] = 6 * u * (1 - u) * step / duration_s + (1 - u) * (1 - 3 * u) * v + u * (3 * u - 2) * end;
+  }
+  return mouth;
+}
+
+static Mouth track_at(const Track *track, double time_s) {
+  if (!track->num_knots || time_s < track->knots[0].time_s) return AT_REST;
+  const Knot *last = &track->knots[track->num_knots - 1];
+  if (time_s < last->time_s) {
+    const int after = num_until(track, time_s);
+    return interpolate(&track->knots[after - 1], &track->knots[after], time_s);
+  }
+  const Knot rest = {last->time_s + track->hold_s + TRACK_CLOSE_S, AT_REST};
+  if (time_s >= rest.time_s) return AT_REST;
+  if (track->hold_s == 0.0) return interpolate(last, &rest, time_s);
+  Knot held = {last->time_s + track->hold_s, AT_REST};
+  memcpy(held.mouth.value, last->mouth.value, sizeof held.mouth.value);
+  return time_s < held.time_s ? interpolate(last, &held, time_s) : interpolate(&held, &rest, time_s);
+}
+
+/* ---- lips in pauses ---- */
+
+static bool is_sound(const Rest *rest, double level_db) {
+  return rest->is_voice && level_db >= rest->loudest_db - REST_RANGE_DB;
+}
+
+static double next_sound_s(const Rest *rest) {
+  for (int i = 0; i < rest->num_levels; i++) {
+    if (is_sound(rest, rest->level_db[i])) return rest->level_s[i];
+  }
+  return INFINITY;
+}
+
+static double ajar_share(const Rest *rest) {
+  const double u = fmin(rest->elapsed_s / rest->duration_s, 1.0);
+  return rest->goal + remaining(rest->start, rest->velocity, u, rest->duration_s);
+}
+
+static void head_for(Rest *rest, double goal, double duration_s) {
+  if (goal == rest->goal) return;
+  const double u = fmin(rest->elapsed_s / rest->duration_s, 1.0);
+  const double share = ajar_share(rest);
+  rest->velocity = remaining_velocity(rest->start, rest->velocity, u, rest->duration_s);
+  rest->start = share - goal;
+  rest->goal = goal;
+  rest->duration_s = duration_s;
+  rest->elapsed_s = 0.0;
+}
+
+/* Process the events up to the time of a frame. */
+static void follow_voice(Rest *rest, double time_s) {
+  int number = 0;
+  for (; number < rest->num_changes && rest->changes[number].time_s <= time_s; number++) {
+    const SpeechChange change = rest->changes[number];
+    if (change.is_active && !rest->is_voice) {
+      rest->sound_s = change.time_s;
+      rest->stays_shut = false;
+    }
+    rest->is_voice = change.is_active;
+  }
+  rest->num_changes -= number;
+  memmove(rest->changes, rest->changes + number, rest->num_changes * sizeof(SpeechChange));
+  for (number = 0; number < rest->num_levels && rest->level_s[number] <= time_s; number++) {
+    if (is_sound(rest, rest->level_db[number])) {
+      rest->sound_s = rest->level_s[number];
+      rest->stays_shut = false;
+    }
+  }
+  rest->num_levels -= number;
+  memmove(rest->level_s, rest->level_s + number, rest->num_levels * sizeof(double));
+  memmove(rest->level_db, rest->level_db + number, rest->num_levels * sizeof(double));
+}
+
+/* Return the log odds that silence subtracts from a closure. */
+static double closure_doubt(Rest *rest, double time_s, double closure) {
+  const double next_s = next_sound_s(rest);
+  const bool is_silent = rest->is_voice && rest->known_s > time_s + REST_LAST_SOUND_S && next_s > rest->known_s;
+  const bool is_onset = REST_YIELD_S < next_s - time_s && next_s - time_s <= REST_ONSET_S;
+  if (closure >= (is_onset ? REST_LIKELY : REST_CERTAIN)) {
+    if (is_silent || is_onset) rest->stays_shut = true;
+    return 0.0;
+  }
+  if (rest->goal > 0.0) return INFINITY;
+  return is_silent ? REST_DOUBT : 0.0;
+}
+
+static double ajar_share_at(Rest *rest, double time_s) {
+  const double next_s = next_sound_s(rest);
+  bool starts_soon = false;
+  for (int i = 0; i < rest->num_changes; i++) {
+    starts_soon |= rest->changes[i].is_active && rest->changes[i].time_s <= time_s + REST_LEAD_S;
+  }
+  if (starts_soon) head_for(rest, 1.0, REST_PART_S);
+  else if (rest->stays_shut || next_s <= time_s + REST_YIELD_S) head_for(rest, 0.0, REST_YIELD_S);
+  else if (time_s > rest->sound_s + REST_HOLD_S) head_for(rest, 0.0, REST_CLOSE_S);
+  else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) head_for(rest, 1.0, REST_PART_S);
+  rest->elapsed_s += fmax(time_s - rest->time_s, 0.0);
+  rest->time_s = time_s;
+  return ajar_share(rest);
+}
+
+/* ---- learnt lips ---- */
+
+/* Move inner lips towards rest, and the outer lips by the same distance. */
+static void move_to_rest(double *faps, double share) {
+  for (int i = 0; i < CLOSURES_INNER_LENGTH; i++) {
+    const double moved = share * faps[CLOSURES_INNER[i]];
+    faps[CLOSURES_INNER[i]] -= moved;
+    faps[CLOSURES_OUTER[i]] -= moved;
+  }
+}
+
+static double sum_of(const double *faps, const int *columns, int number) {
+  double sum = 0.0;
+  for (int i = 0; i < number; i++) sum += faps[columns[i]];
+  return sum;
+}
+
+/* Compute the FAPs of the next lip frame, stabilized and with closures. */
+static void stabilize(Face *face, const LipFrame *frame, double *faps) {
+  if (frame->time_s - track_end_s(&face->track) <= LEARNT_MAX_GAP_S) {
+    for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
+      const double change = frame->faps[i] - face->stable[i];
+      if (change != 0.0) face->stable[i] += change * change * change / (change * change + LEARNT_JITTER_SQUARED[i]);
+    }
+  } else {
+    face->shares[0] = face->shares[1] = 0.0;
+    memcpy(face->stable, frame->faps, sizeof face->stable);
+  }
+  memcpy(faps, face->stable, sizeof face->stable);
+  for (int i = 0; i < CLOSURES_UPPER_LENGTH; i++) { /* lips do not pass through each other */
+    const double crossed = fmax(0.0, faps[CLOSURES_UPPER[i]] + faps[CLOSURES_LOWER[i]]);
+    for (int row = 0; row < CLOSURES_BOTH_LENGTH; row++) faps[CLOSURES_BOTH[row * CLOSURES_UPPER_LENGTH + i]] -= 0.5 * crossed;
+  }
+  const double probability = clamp(frame->closure, CLOSURES_MIN_PROBABILITY, CLOSURES_MAX_PROBABILITY);
+  const double opening = -sum_of(faps, CLOSURES_INNER_LIPS, CLOSURES_INNER_LIPS_LENGTH);
+  const double corners = sum_of(faps, CLOSURES_CORNERS, CLOSURES_CORNERS_LENGTH);
+  double closure = RULE_SOUND + log(probability / (1.0 - probability));
+  closure -= RULE_PARTED * (clamp(opening, CLOSURES_PARTED, CLOSURES_WIDE_APART) - CLOSURES_PARTED);
+  closure -= RULE_ROUNDED * fmax(0.0, CLOSURES_ROUNDED - corners);
+  closure -= closure_doubt(&face->rest, frame->time_s, frame->closure);
+  double share = smooth_step(0.5 + 0.5 * closure / RULE_DOUBT);
+  const double before = face->shares[0], newest = face->shares[1];
+  if (before < LEARNT_CLOSED_SHARE && LEARNT_CLOSED_SHARE <= newest) share = fmax(share, newest);
+  face->shares[0] = newest;
+  face->shares[1] = share;
+  move_to_rest(faps, share);
+}
+
+static void extend_track(Face *face, double time_s) {
+  int number = 0;
+  track_forget_before(&face->track, face->time_s);
+  for (; number < face->num_queued && track_end_s(&face->track) < time_s; number++) {
+    double faps[NUM_MOUTH_FAPS];
+    const LipFrame *frame = &face->queue[number];
+    stabilize(face, frame, faps);
+    track_append(&face->track, frame->time_s, faps);
+    face->late_s = fmax(0.0, frame->delay_s - DELAY_S);
+  }
+  face->num_queued -= number;
+  memmove(face->queue, face->queue + number, face->num_queued * sizeof(LipFrame));
+  face->track.hold_s = face->is_speaking ? TRACK_HOLD_S + face->late_s : 0.0;
+}
+
+static void follow_track(Face *face, double time_s) {
+  const bool continues = track_end_s(&face->track) >= face->time_s;
+  extend_track(face, time_s);
+  if (!continues) {
+    const Mouth now = track_at(&face->track, face->time_s);
+    bool is_different = false;
+    for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
+      is_different |= fabs(face->on_track.value[i] - now.value[i]) > LEARNT_EPSILON;
+      is_different |= fabs(face->on_track.velocity[i] - now.velocity[i]) > LEARNT_EPSILON;
+    }
+    if (is_different) {
+      for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
+        face->difference.value[i] = face->mouth.value[i] - now.value[i];
+        face->difference.velocity[i] = face->mouth.velocity[i] - now.velocity[i];
+      }
+      face->transition_s = face->time_s;
+    }
+  }
+  face->on_track = track_at(&face->track, time_s);
+  const double u = fmin((time_s - face->transition_s) / LEARNT_TRANSITION_S, 1.0);
+  for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
+    const double value = face->difference.value[i], velocity = face->difference.velocity[i];
+    face->mouth.value[i] = face->on_track.value[i] + remaining(value, velocity, u, LEARNT_TRANSITION_S);
+    face->mouth.velocity[i] = face->on_track.velocity[i] + remaining_velocity(value, velocity, u, LEARNT_TRANSITION_S);
+  }
+}
+
+/* ---- size of the movements; modifiers/expressiveness.py has the formulas ---- */
+
+static double growth(double opening) {
+  const double within = fmin(opening, EXPRESSIVENESS_WIDEST / 2.0);
+  return (EXPRESSIVENESS - 1.0) * within * (1.0 - within / EXPRESSIVENESS_WIDEST);
+}
+
+static void apply_expressiveness(double *faps) {
+  const double span = EXPRESSIVENESS_OPEN - EXPRESSIVENESS_CLOSED, more = EXPRESSIVENESS_SIDEWAYS * (EXPRESSIVENESS - 1.0);
+  const double gap = -faps[EXPRESSIVENESS_UPPER[0]] - faps[EXPRESSIVENESS_LOWER[0]];
+  double is_open = 0.0;
+  for (int i = 0; i < EXPRESSIVENESS_UPPER_LENGTH; i++) {
+    double *upper = &faps[EXPRESSIVENESS_UPPER[i]], *lower = &faps[EXPRESSIVENESS_LOWER[i]];
+    const double beyond = fmax(-*upper - *lower - EXPRESSIVENESS_CLOSED, 0.0);
+    const double free_upper = fmax(-*upper - EXPRESSIVENESS_CLOSED, 0.0);
+    const double free_lower = fmax(-*lower - EXPRESSIVENESS_CLOSED, 0.0);
+    const double both = free_upper + free_lower, apart = fmin(free_lower / span, 1.0);
+    if (i == 0) is_open = apart * clamp((gap - EXPRESSIVENESS_CLOSED) / span, 0.0, 1.0);
+    const double grown = apart * growth(fmin(both, beyond)) / fmax(both, 1.0);
+    *upper -= grown * free_upper;
+    *lower -= grown * free_lower;
+  }
+  faps[EXPRESSIVENESS_JAW] += is_open * growth(fmax(faps[EXPRESSIVENESS_JAW], 0.0));
+  for (int i = 0; i < EXPRESSIVENESS_WIDTH_LENGTH; i++) {
+    double *fap = &faps[EXPRESSIVENESS_WIDTH[i]];
+    const double width = *fap - EXPRESSIVENESS_USUAL_WIDTH;
+    *fap = fmax(*fap + more * (width > 0.0 ? is_open * width : width), fmin(*fap, EXPRESSIVENESS_MIN_WIDTH));
+  }
+  for (int i = 0; i < EXPRESSIVENESS_PUSH_LENGTH; i++) {
+    double *fap = &faps[EXPRESSIVENESS_PUSH[i]];
+    *fap = fmin(*fap + more * fmax(*fap - EXPRESSIVENESS_USUAL_PUSH, 0.0), fmax(*fap, EXPRESSIVENESS_MAX_PUSH));
+  }
+}
+
+/* ---- visemes; shared/face/shapes.py has equation (2) and the algorithm ---- */
+
+/* Solve equations with a symmetric positive definite matrix (Cholesky); the right side becomes the solution. */
+static void solve(double matrix[][NUM_SHAPES], double *right, int size) {
+  for (int i = 0; i < size; i++) {
+    for (int j = 0; j <= i; j++) {
+      double sum = matrix[i][j];
+      for (int k = 0; k < j; k++) sum -= matrix[i][k] * matrix[j][k];
+      matrix[i][j] = i == j ? sqrt(sum) : sum / matrix[j][j];
+    }
+  }
+  for (int i = 0; i < size; i++) {
+    for (int k = 0; k < i; k++) right[i] -= matrix[i][k] * right[k];
+    right[i] /= matrix[i][i];
+  }
+  for (int i = size - 1; i >= 0; i--) {
+    for (int k = i + 1; k < size; k++) right[i] -= matrix[k][i] * right[k];
+    right[i] /= matrix[i][i];
+  }
+}
+
+static double lean(const double *right, const double *weights, int shape) {
+  double sum = right[shape];
+  for (int i = 0; i < NUM_SHAPES; i++) sum -= SHAPES_OCULUS_GRAM[shape * NUM_SHAPES + i] * weights[i];
+  return sum;
+}
+
+static void solve_weights(Face *face, const double *right, double *weights) {
+  int fewest = NUM_SHAPES + 1, patience = SHAPES_PATIENCE;
+  for (;;) {
+    double matrix[NUM_SHAPES][NUM_SHAPES], solution[NUM_SHAPES];
+    int inner[NUM_SHAPES], wrong[NUM_SHAPES], num_inner = 0, num_wrong = 0;
+    for (int i = 0; i < NUM_SHAPES; i++) {
+      weights[i] = face->at_one[i];
+      if (face->free[i]) inner[num_inner++] = i;
+    }
+    for (int i = 0; i < num_inner; i++) {
+      solution[i] = lean(right, weights, inner[i]);
+      for (int j = 0; j < num_inner; j++) matrix[i][j] = SHAPES_OCULUS_GRAM[inner[i] * NUM_SHAPES + inner[j]];
+    }
+    solve(matrix, solution, num_inner);
+    for (int i = 0; i < num_inner; i++) weights[inner[i]] = solution[i];
+    for (int i = 0; i < NUM_SHAPES; i++) {
+      const double x = face->free[i] ? 0.0 : lean(right, weights, i);
+      const bool is_outside = weights[i] < -SHAPES_ROUNDING || weights[i] > 1.0 + SHAPES_ROUNDING;
+      if (face->free[i] ? is_outside : (face->at_one[i] ? -x : x) > SHAPES_ROUNDING) wrong[num_wrong++] = i;
+    }
+    if (num_wrong == 0) break;
+    int first = 0;
+    if (num_wrong < fewest) {
+      fewest = num_wrong;
+      patience = SHAPES_PATIENCE;
+    } else if (patience) patience--;
+    else first = num_wrong - 1; /* exchanging only the last one guarantees termination */
+    for (int k = first; k < num_wrong; k++) {
+      const int i = wrong[k];
+      face->at_one[i] = face->free[i] && weights[i] > 1.0 + SHAPES_ROUNDING;
+      face->free[i] = !face->free[i];
+    }
+  }
+}
+
+void face_visemes(Face *face, double time_s, float *weights) {
+  double faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
+  follow_voice(&face->rest, time_s);
+  if (face->has_lip_frames) follow_track(face, time_s);
+  const double ajar = ajar_share_at(&face->rest, time_s);
+  face->time_s = time_s;
+  for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
+    faps[MOUTH_FAPS[i] - 1] = (float)(face->mouth.value[i] + ajar * (REST_AJAR[i] - face->mouth.value[i]));
+  }
+  for (int i = 0; i < LEARNT_UNTRACKED_LENGTH; i++) faps[MOUTH_FAPS[LEARNT_UNTRACKED[i]] - 1] = 0.0;
+  apply_expressiveness(faps);
+  for (int shape = 0; shape < NUM_SHAPES; shape++) {
+    right[shape] = 0.0;
+    for (int i = 0; i < SHAPES_NUM_FAPS; i++) right[shape] += SHAPES_OCULUS_RIGHT[shape * SHAPES_NUM_FAPS + i] * faps[i];
+  }
+  solve_weights(face, right, solution);
+  for (int shape = 0; shape < NUM_SHAPES; shape++) {
+    weights[shape] = (float)clamp(solution[shape], 0.0, 1.0);
+    sum += weights[shape];
+  }
+  weights[0] = (float)fmax(0.0, 1.0 - sum); /* "sil" is 1 minus the sum of the others */
+}
+
+/* ---- events ---- */
+
+void face_init(Face *face) {
+  memset(face, 0, sizeof *face);
+  face->rest.loudest_db = face->rest.known_s = face->rest.sound_s = -INFINITY;
+  face->rest.time_s = INFINITY;
+  face->rest.stays_shut = true;
+  face->rest.duration_s = 1.0;
+}
+
+void face_add_lips(Face *face, const LipFrame *frame) {
+  face->has_lip_frames = true;
+  if (face->num_queued < MAX_QUEUE) face->queue[face->num_queued++] = *frame;
+}
+
+void face_change_speech(Face *face, double time_s, bool is_active) {
+  face->is_speaking = is_active;
+  if (face->rest.num_changes < MAX_CHANGES) face->rest.changes[face->rest.num_changes++] = (SpeechChange){time_s, is_active};
+}
+
+void face_add_level(Face *face, double time_s, double level_db) {
+  Rest *rest = &face->rest;
+  if (rest->num_levels < MAX_LEVELS) {
+    rest->level_s[rest->num_levels] = time_s;
+    rest->level_db[rest->num_levels++] = level_db;
+  }
+  rest->loudest_db = fmax(level_db, rest->loudest_db - REST_FADE_DB);
+  rest->known_s = time_s;
+}
