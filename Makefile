@@ -129,7 +129,7 @@ check-docker:
 check-wheel: wheel
 	$(PYTHON) deploy/check_wheel.py dist/kouxing-*.whl
 
-lips-demo: setup $(LIPS_MODELS) $(JAVASCRIPT)/node_modules/.package-lock.json
+lips-demo: setup $(LIPS_MODELS) $(patsubst %,%/node_modules/.package-lock.json,$(JAVASCRIPT) $(LIPS))
 	$(BIN)/node $(LIPS)/demo/build.mjs dist/lips-demo
 
 # CLIPS, CORPUS and NATURAL are folders of recordings. STEPS names steps; QUICK=1 and FRESH=1 are options.

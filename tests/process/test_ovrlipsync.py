@@ -3,6 +3,7 @@
 import ctypes
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
 from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, read, server_faps
+from tests.documents import code_blocks
 from tests.system import DEMO, NODE, ROOT
 
 SOURCE = ROOT / "clients" / "ovrlipsync"
@@ -79,8 +81,9 @@ def server_weights(samples: Frames) -> Weights:
 
 def at_faces(expected: Weights, known_s: Weights, delays_ms: Weights) -> Weights:
     """Return the weights at the times of faces, which are before what is known by the delay."""
-    time_s = known_s - delays_ms / 1e3
-    return expected[np.maximum(np.round(time_s * FRAME_RATE_HZ).astype(int), 0)]
+    numbers = np.round((known_s - delays_ms / 1e3) * FRAME_RATE_HZ).astype(int)
+    weights: Weights = expected[np.maximum(numbers, 0)]
+    return weights
 
 
 def assert_close(ours: Weights, theirs: Weights) -> None:
@@ -206,6 +209,15 @@ def test_bad_arguments_have_ovrlipsyncs_errors(library: Any) -> None:
     assert library.ovrLipSync_Initialize(4000, BUFFER) == BAD_RATE
     library.ovrLipSync_Shutdown()
     assert create_ex(ctypes.byref(new), ENHANCED, RATE_HZ, False) == CANNOT_CREATE
+
+
+def test_the_python_program_of_the_guide_runs(folder: Path) -> None:
+    (program,) = code_blocks(ROOT / "docs" / "clients" / "ovrlipsync.md", "python")
+    (folder / "build").mkdir()
+    shutil.copy(folder / "libOVRLipSync.so", folder / "build")
+    command = [sys.executable, "-c", program]
+    printed = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+    assert printed.split()[:2] == ["21", "[1."]  # ms, and the weight of "sil"
 
 
 def test_samples_that_are_not_finite_are_silence(library: Any) -> None:
