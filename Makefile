@@ -133,7 +133,8 @@ lips-demo: setup $(LIPS_MODELS) $(patsubst %,%/node_modules/.package-lock.json,$
 	$(BIN)/node $(LIPS)/demo/build.mjs dist/lips-demo
 
 # CLIPS, CORPUS and NATURAL are folders of recordings. STEPS names steps; QUICK=1 and FRESH=1 are options.
-report: .venv/installed-dev setup $(LIPS_MODELS) $(RIVALS)/node_modules/.package-lock.json $(RIVALS)/.venv/installed
+report: .venv/installed-dev setup $(LIPS_MODELS) $(RIVALS)/.venv/installed \
+		$(patsubst %,%/node_modules/.package-lock.json,$(RIVALS) $(LIPS))
 	$(BIN)/kouxing evaluate report $(STEPS) $(CLIPS:%=--lips %) $(CORPUS:%=--corpus %) $(NATURAL:%=--natural %) \
 		$(QUICK:1=--quick) $(FRESH:1=--fresh)
 

@@ -511,14 +511,15 @@ def lips_page(
     """Compare lip sync in the browser: kouxing-lips, HeadAudio, wLipSync, wawa-lipsync.
 
     The figures are download, time to load, processor time and, with clips, accuracy. Needs
-    Chromium, Node and the npm packages of kouxing-lips.
+    Chromium. Other packages are compared after `npm ci` in the folder of kouxing-lips.
     """
     from kouxing.evaluation.system.lips_page import measure, show
 
     check_output(json_file, force=force)
     figures = measure(audio, package, clips)
     show(figures, Console())
-    write_json(json_file, [asdict(page) for page in figures])
+    ours, *others = (asdict(page) for page in figures)
+    write_json(json_file, ours | {"others": others})
 
 
 @bench_app.command()

@@ -142,10 +142,14 @@ class LipsPage:
 
 
 def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsPage]:
-    """Measure the package in a folder and its rivals.
+    """Measure the package in a folder, first, and its rivals, if ``npm ci`` has installed them.
 
-    Raises ``UserError`` if Chromium, Node or the npm packages of ``package`` are not installed.
+    Raises ``UserError`` if Chromium or Node is not installed.
     """
+    has_rivals = (package / "node_modules" / "wlipsync").is_dir()
+    if clips and not has_rivals:
+        raise UserError(f"the packages to compare are missing; run npm ci in {package}")
+    names = list(_DOWNLOADS) if has_rivals else [OURS]
     held_out = clips_to_score(clips) if clips else []
     recordings = [clip.samples for clip in _profile_clips(clips)] if clips else _samples(package)
     with _site(package, recordings) as folder:
@@ -155,7 +159,7 @@ def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsP
             with serve_folder(folder) as origin:
                 pages = [
                     _measure_page(folder, voice, origin, name)
-                    for name in track(_DOWNLOADS, description="packages", transient=True)
+                    for name in track(names, description="packages", transient=True)
                 ]
                 return _with_accuracy(pages, folder, voice, origin, held_out)
         except TimeoutError as error:
@@ -171,10 +175,7 @@ def _site(package: Path, recordings: Iterable[NDArray[np.float32]]) -> Iterator[
             if not (package / file).exists():
                 raise UserError(f"{package} is not a folder of kouxing-lips: it has no {file}")
             (folder / file).symlink_to((package / file).resolve())
-        modules = package / "node_modules"
-        if not (modules / "wlipsync").is_dir():
-            raise UserError(f"the packages to compare are missing; run npm ci in {package}")
-        (folder / _PACKAGES).symlink_to(modules.resolve())
+        (folder / _PACKAGES).symlink_to((package / "node_modules").resolve())
         (folder / "rivals.js").symlink_to((package / "demo" / "rivals.js").resolve())
         table = package / "../../shared/face/high_level.tsv"
         (folder / "visemes.tsv").symlink_to(table.resolve())
@@ -182,8 +183,9 @@ def _site(package: Path, recordings: Iterable[NDArray[np.float32]]) -> Iterator[
         for file, content in web_model().items():
             (folder / "models" / file).write_bytes(content)
         (folder / "index.html").write_text(_PAGE, encoding="utf-8")
-        profile = _wlipsync_profile(package, recordings)
-        (folder / "wlipsync-profile.json").write_bytes(profile)
+        if (package / "node_modules" / "wlipsync").is_dir():
+            profile = _wlipsync_profile(package, recordings)
+            (folder / "wlipsync-profile.json").write_bytes(profile)
         yield folder
 
 

@@ -39,6 +39,10 @@ def open_demo(browser: Browser, origin: str) -> None:
     browser.wait_for(f"{FACE}?.set != null")
     browser.evaluate(f"{FACE}.lips.then((lips) => {{ window.lips = lips; return 1; }})")
     browser.evaluate(
+        f"window.notices = []; {FACE}.addEventListener('notice',"
+        " ({ detail }) => window.notices.push(detail)); 1"
+    )
+    browser.evaluate(
         "window.opened = 0; window.lips.addEventListener('frames', ({ detail: { frames } }) => {"
         " for (const { faps } of frames)"
         " window.opened = Math.max(window.opened, -faps[3] - faps[4]); })"
@@ -140,6 +144,46 @@ def test_a_blocked_microphone_gives_a_sentence(browser: Browser, site: Path) -> 
             )
             browser.click("microphone")
             browser.wait_for(f"{NOTE}.startsWith('{text}')")
+
+
+def test_a_page_without_https_has_no_microphone(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate(
+            "Object.defineProperty(navigator, 'mediaDevices', { value: undefined }); 1"
+        )
+        browser.click("microphone")
+        browser.wait_for(f"{NOTE}.includes('open it by https')")
+
+
+def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) -> None:
+    def wait_for_notice(start: str) -> None:
+        browser.wait_for(f"window.notices.some((text) => text.startsWith('{start}'))")
+
+    def set_hidden(is_hidden: str) -> None:
+        browser.evaluate(
+            f"Object.defineProperty(document, 'hidden', {{ value: {is_hidden}, writable: true }});"
+            "document.dispatchEvent(new Event('visibilitychange')); 1"
+        )
+
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate(
+            "MediaStreamTrack.prototype.getSettings = function () {"
+            " window.track = this; return { sampleRate: 8000 }; }; 1"
+        )
+        browser.click("microphone")
+        wait_for_notice("the microphone sends 8 kHz")
+        browser.wait_for("window.opened > 200")
+        set_hidden("true")
+        wait_for_notice("the tab is in the background")
+        browser.evaluate("window.lips.context.suspend().then(() => 1)")  # as phones do
+        set_hidden("false")
+        browser.wait_for("window.lips.context.state === 'running'")
+        browser.evaluate("window.opened = 0")
+        browser.wait_for("window.opened > 200")
+        browser.evaluate("window.track.dispatchEvent(new Event('ended'))")
+        wait_for_notice("the microphone was unplugged")
 
 
 def test_wrong_files_give_a_sentence(browser: Browser, site: Path) -> None:

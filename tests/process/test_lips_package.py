@@ -145,11 +145,12 @@ def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
     assert_equal(package_faps(models, samples, phones=False), server_faps(without))
 
 
-def test_sound_at_48_khz(models: Path) -> None:
+@pytest.mark.parametrize("rate_hz", [8_000, 48_000])
+def test_sound_at_other_rates(models: Path, rate_hz: int) -> None:
     samples = read(DEMO / "hello-female.wav")
-    resampled = soxr.resample(samples, RATE_HZ, 48_000)
-    ours = package_faps(models, resampled, sampleRateHz=48_000)
-    assert_equal(ours, server_faps(server_events(to_16_khz(resampled, 48_000))))
+    resampled = soxr.resample(samples, RATE_HZ, rate_hz)
+    ours = package_faps(models, resampled, sampleRateHz=rate_hz)
+    assert_equal(ours, server_faps(server_events(to_16_khz(resampled, rate_hz))))
 
 
 def test_any_chunks_give_the_same_frames(models: Path) -> None:

@@ -19,8 +19,8 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
-from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, read, server_faps
 from tests.documents import code_blocks
+from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, read, server_faps
 from tests.system import DEMO, NODE, ROOT
 
 SOURCE = ROOT / "clients" / "ovrlipsync"

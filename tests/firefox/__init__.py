@@ -1,0 +1,1 @@
+"""Tests in Firefox, which ``make test-firefox`` runs."""
