@@ -2,6 +2,7 @@
 # make demo         the same, without a browser; stops after the video (for servers)
 # make wheel        builds dist/kouxing-*.whl, which needs no npm
 # make test         all tests
+# make test-firefox tests lip sync in Firefox, which must be installed
 # make quick        the tests to run while editing, under a minute
 # make check        style, types and import rules
 # make check-wheel  installs the wheel in an empty environment, and runs it
@@ -53,7 +54,7 @@ CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos java
 STAGES = $(MAKE) --keep-going --no-print-directory
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo ovrlipsync report lock clean $(TEST_STAGES) $(CHECK_STAGES)
+.PHONY: run demo setup wheel test quick blender check check-wheel lips-demo ovrlipsync report test-firefox lock clean $(TEST_STAGES) $(CHECK_STAGES)
 
 run: setup
 	$(BIN)/kouxing run --play $(SAMPLE)
@@ -84,6 +85,10 @@ test-page:
 
 test-lips:
 	$(NPM) $(LIPS) test
+
+# Needs the package firefox-esr, which the other tests do not need.
+test-firefox: .venv/installed-dev lips-demo
+	$(PYTEST) -q -s tests/e2e/firefox_lips_page.py
 
 quick: .venv/installed-dev
 	$(PYTEST) -q -n auto --maxprocesses 4 -m "(unit or property or contract) and not slow"

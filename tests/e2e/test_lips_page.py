@@ -23,7 +23,7 @@ NOTE = "document.getElementById('note').textContent"
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "demo"
-    subprocess.run([NODE, PACKAGE / "demo" / "build.mjs", folder], check=True, timeout=60)
+    subprocess.run([NODE, PACKAGE / "demo" / "build.mjs", folder], check=True, timeout=180)
     return folder
 
 

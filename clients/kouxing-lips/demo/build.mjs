@@ -37,8 +37,7 @@ for (const [to, name] of Object.entries(rivals)) {
   for (const part of ["dist", "LICENSE"]) await copy(join(lips, "node_modules", name, part), `modules/${to}/${part}`);
 }
 await copy(join(ROOT, "shared/face/high_level.tsv"), "visemes.tsv");
-const samples = join(ROOT, "shared/demo");
-const recordings = (await readdir(samples)).filter((name) => name.endsWith(".wav")).map((name) => readWav(join(samples, name)));
+const recordings = ["hello-female", "hello-male"].map((name) => readWav(join(ROOT, `shared/demo/${name}.wav`)));
 await writeFile(join(folder, "wlipsync-profile.json"), JSON.stringify(await profileOf(await Promise.all(recordings))));
 const modules = (await readdir(CLIENT)).filter((name) => name.endsWith(".js"));
 for (const name of [...modules, "page"]) await copy(join(CLIENT, name), `modules/kouxing-client/${name}`);

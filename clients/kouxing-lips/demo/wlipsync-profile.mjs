@@ -5,7 +5,9 @@ import { readFile, readdir } from "node:fs/promises";
 import { join } from "node:path";
 import { fileURLToPath } from "node:url";
 import { LipEngine } from "../engine/engine.js";
+import { loadModel } from "../engine/model.js";
 
+const MODELS = new URL("../models/", import.meta.url);
 const RATE_HZ = 16000;
 const NUM_CEPSTRA = 12;
 const [WINDOW, NUM_BANDS, EUCLIDEAN] = [1024, 30, 1]; // as in uLipSync
@@ -14,9 +16,10 @@ const VOWELS = { a: "A", ei: "E", ie: "E", i: "I", o: "O", uo: "O", u: "U" }; //
 /** Return a profile from recordings, samples at 16 kHz. */
 export async function profileOf(recordings) {
   const cepstrumOf = await loadAnalysis();
+  const model = await loadModel(MODELS, { phones: true });
   const cepstra = Object.fromEntries(Object.values(VOWELS).map((vowel) => [vowel, []]));
   for (const samples of recordings) {
-    for (const { symbol, onsetS, durationS } of await phonesOf(samples)) {
+    for (const { symbol, onsetS, durationS } of phonesOf(samples, model)) {
       if (!(symbol in VOWELS)) continue;
       const begin = Math.round((onsetS + durationS / 2) * RATE_HZ - WINDOW / 2); // the middle of the phone
       if (begin >= 0 && begin + WINDOW <= samples.length) {
@@ -42,8 +45,8 @@ export async function profileOf(recordings) {
 }
 
 /** Return the final phones of a recording. */
-async function phonesOf(samples) {
-  const engine = await LipEngine.load();
+function phonesOf(samples, model) {
+  const engine = new LipEngine(model, { shapes: [] });
   engine.push(samples);
   const phones = engine.newPhones;
   engine.finish();

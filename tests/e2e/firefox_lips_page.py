@@ -1,4 +1,4 @@
-"""The demo page of kouxing-lips in Firefox."""
+"""The demo page of kouxing-lips in Firefox; ``make test-firefox`` runs this file."""
 
 import base64
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 
 from kouxing.evaluation.system.chromium import serve_folder
 from tests.e2e.test_lips_page import FACE, NOTE, PACKAGE
-from tests.firefox.firefox import Firefox
+from tests.firefox import Firefox
 from tests.process.test_lips_package import package_faps, read
 from tests.system import DEMO, NODE
 
@@ -18,7 +18,7 @@ from tests.system import DEMO, NODE
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "demo"
-    subprocess.run([NODE, PACKAGE / "demo" / "build.mjs", folder], check=True, timeout=60)
+    subprocess.run([NODE, PACKAGE / "demo" / "build.mjs", folder], check=True, timeout=180)
     return folder
 
 

@@ -1,1 +1,0 @@
-"""Tests in Firefox, which ``make test-firefox`` runs."""
