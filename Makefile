@@ -87,7 +87,7 @@ test-lips:
 	$(NPM) $(LIPS) test
 
 # Needs the package firefox-esr, which the other tests do not need.
-test-firefox: .venv/installed-dev lips-demo
+test-firefox: .venv/installed-dev
 	$(PYTEST) -q -s tests/e2e/firefox_lips_page.py
 
 quick: .venv/installed-dev

@@ -1,11 +1,16 @@
-// Passes sound to the worker in blocks of about 10 ms. Runs in the audio thread.
+// Passes sound to the worker. Runs in the audio thread.
+//
+// A block ends when the engine can process the next 20 ms, because messages cost more than the sound.
 
 const QUANTUM = 128; // samples per call
-const BLOCK = QUANTUM * Math.max(1, Math.round(sampleRate / 100 / QUANTUM));
+const SLICE_S = 0.02; // of the engine
+const RESAMPLER_DELAY_S = 0.002;
 
 class LipSyncInput extends AudioWorkletProcessor {
-  #block = new Float32Array(BLOCK);
+  #block = new Float32Array(Math.ceil(SLICE_S * sampleRate) + 2 * QUANTUM);
   #numFilled = 0;
+  #numSent = 0; // samples
+  #numSlices = 0; // that the sent samples complete
   #port = null; // of the worker
   #isOpen = true;
 
@@ -22,11 +27,13 @@ class LipSyncInput extends AudioWorkletProcessor {
     if (input === undefined) this.#block.fill(0, this.#numFilled, this.#numFilled + QUANTUM); // a paused source
     else this.#block.set(input, this.#numFilled);
     this.#numFilled += QUANTUM;
-    if (this.#numFilled === BLOCK) {
-      const samples = this.#block;
+    const dueS = (this.#numSlices + 1) * SLICE_S + RESAMPLER_DELAY_S;
+    if (this.#numSent + this.#numFilled >= dueS * sampleRate) {
+      const samples = this.#block.slice(0, this.#numFilled);
       this.#port.postMessage({ samples, endS: currentTime + QUANTUM / sampleRate }, [samples.buffer]);
-      this.#block = new Float32Array(BLOCK);
+      this.#numSent += this.#numFilled;
       this.#numFilled = 0;
+      this.#numSlices++;
     }
     return true;
   }

@@ -19,8 +19,9 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
+from kouxing.shared.phones.events import Phone
 from tests.documents import code_blocks
-from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, read, server_faps
+from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, read, server_events, server_faps
 from tests.system import DEMO, NODE, ROOT
 
 SOURCE = ROOT / "clients" / "ovrlipsync"
@@ -76,7 +77,8 @@ def library(folder: Path) -> Iterator[Any]:
 
 def server_weights(samples: Frames) -> Weights:
     """Return the server's visemes (num_frames, 15); feeling does not move them in the library."""
-    return np.array([OCULUS.weights(f) for f in server_faps(samples, phones=False, feeling=0.0)])
+    events = [event for event in server_events(samples) if not isinstance(event, Phone)]
+    return np.array([OCULUS.weights(faps) for faps in server_faps(events, feeling=0.0)])
 
 
 def at_faces(expected: Weights, known_s: Weights, delays_ms: Weights) -> Weights:

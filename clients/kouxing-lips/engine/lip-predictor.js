@@ -7,10 +7,10 @@ export class LipPredictor {
   #weights; // arrays by name
   #constants;
   #numMouthFaps;
-  #delay; // number of the used delay
   #delayS;
   #state;
   #entry; // product of the matrices of x and u: nothing is between them
+  #outputs; // weights at the used delay: an array for each output, and a bias
   #buffers; // of a step
 
   /** @param delayS delay of the face; the longest delay of the model that fits is used */
@@ -23,9 +23,9 @@ export class LipPredictor {
     const delaysS = Array.from(this.#weights.delays.values, (value) => Math.round(1e6 * value) / 1e6);
     const inTime = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
     this.#delayS = inTime.at(-1) ?? delaysS[0];
-    this.#delay = delaysS.indexOf(this.#delayS);
     const { projection, entry_weights, state_weights, output_bias } = this.#weights;
     this.#entry = product(projection, entry_weights);
+    this.#outputs = this.#outputsAt(delaysS.indexOf(this.#delayS));
     const gates = state_weights.shape[1];
     const sizes = [...this.#entry.shape, gates, gates, output_bias.shape[1]];
     this.#buffers = sizes.map((size) => new Float64Array(size));
@@ -69,16 +69,27 @@ export class LipPredictor {
       const next = Math.tanh(fromInput[2 * size + i] + reset * fromState[2 * size + i]);
       this.#state[i] = (1 - update) * next + update * this.#state[i];
     }
-    const numLips = w.lip_weights.shape[0];
     for (let output = 0; output < outputs.length; output++) {
-      const weight = (array, i) => array.values[(i * array.shape[1] + this.#delay) * outputs.length + output];
-      let sum = w.output_bias.values[this.#delay * outputs.length + output];
-      for (let i = 0; i < numLips; i++) sum += features[features.length - numLips + i] * weight(w.lip_weights, i);
-      for (let i = 0; i < size; i++) sum += this.#state[i] * weight(w.output_weights, i);
-      for (let i = 0; i < size; i++) sum += entered[i] * weight(w.output_weights, size + i);
+      const { lips, state, bias } = this.#outputs[output];
+      let sum = bias;
+      for (let i = 0; i < lips.length; i++) sum += features[features.length - lips.length + i] * lips[i];
+      for (let i = 0; i < size; i++) sum += this.#state[i] * state[i];
+      for (let i = 0; i < size; i++) sum += entered[i] * state[size + i];
       outputs[output] = sum;
     }
     return outputs;
+  }
+
+  #outputsAt(delay) {
+    const { lip_weights, output_weights, output_bias } = this.#weights;
+    const [numDelays, numOutputs] = output_bias.shape;
+    const column = ({ values, shape: [rows] }, output) =>
+      Float32Array.from({ length: rows }, (_, row) => values[(row * numDelays + delay) * numOutputs + output]);
+    return Array.from({ length: numOutputs }, (_, output) => ({
+      lips: column(lip_weights, output),
+      state: column(output_weights, output),
+      bias: output_bias.values[delay * numOutputs + output],
+    }));
   }
 }
 

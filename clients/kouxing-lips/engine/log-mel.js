@@ -6,7 +6,7 @@ export class LogMel {
   #hop;
   #window;
   #floor;
-  #bands;
+  #bands; // weights of the bins from the first edge of each band
   #edges;
   #cosines; // (half / 2 + 1, half): of 2 pi k n / size
   #sines;
@@ -20,8 +20,11 @@ export class LogMel {
     this.#hop = mel.HOP_SAMPLES;
     this.#window = Float64Array.from(mel.HANN);
     this.#floor = mel.FLOOR;
-    this.#bands = arrays["mel.bands"];
     this.#edges = mel.EDGES;
+    const { shape, values } = arrays["mel.bands"];
+    this.#bands = mel.EDGES.map(([first, end], band) =>
+      Float64Array.from({ length: end - first }, (_, i) => values[(first + i) * shape[1] + band]),
+    );
     const half = this.#size / 2;
     const table = (wave) =>
       Float64Array.from({ length: (half / 2 + 1) * half }, (_, i) =>
@@ -46,12 +49,11 @@ export class LogMel {
   }
 
   #bandsOf(powers) {
-    const { shape, values } = this.#bands;
     const bands = new Float32Array(this.#edges.length);
     for (let band = 0; band < bands.length; band++) {
-      const [first, end] = this.#edges[band];
+      const [weights, first] = [this.#bands[band], this.#edges[band][0]];
       let total = 0;
-      for (let bin = first; bin < end; bin++) total += values[bin * shape[1] + band] * powers[bin];
+      for (let i = 0; i < weights.length; i++) total += weights[i] * powers[first + i];
       bands[band] = (Math.log10(Math.max(total, this.#floor)) + 4) / 4;
     }
     return bands;

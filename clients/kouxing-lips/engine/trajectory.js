@@ -8,10 +8,12 @@ export function still(value) {
 
 /** Return a state plus a factor times another. */
 export function add(one, other, factor = 1) {
-  return {
-    value: one.value.map((x, i) => x + factor * other.value[i]),
-    velocity: one.velocity.map((x, i) => x + factor * other.velocity[i]),
-  };
+  const [value, velocity] = [one.value.slice(), one.velocity.slice()];
+  for (let i = 0; i < value.length; i++) {
+    value[i] += factor * other.value[i];
+    velocity[i] += factor * other.velocity[i];
+  }
+  return { value, velocity };
 }
 
 /** Leads a difference, a state, to zero along a cubic. */
