@@ -4,9 +4,10 @@ libzmq limits the size of a message part and the length of a queue. It does not 
 of connections, the number of parts of a message, or the rate of a peer. It keeps all parts of a
 message until the last one arrives. So a thread checks every connection within 50 ms after data
 arrives, and at least once a second. It compares the bytes that the kernel received (Linux only)
-with the delivered messages. While messages are undelivered, it checks 20 times a second. It
-disconnects a peer that exceeds a limit. libzmq then frees the peer's memory. An honest client is
-never disconnected, at any speed: its queue fills up, libzmq stops reading, and the client waits.
+with the delivered messages. Until it is clear which bytes belong to an incomplete message, it
+checks 20 times a second. It disconnects a peer that exceeds a limit. libzmq then frees the peer's
+memory. An honest client is never disconnected, at any speed: its queue fills up, libzmq stops
+reading, and the client waits.
 """
 
 from __future__ import annotations
@@ -247,7 +248,7 @@ class ConnectionLimiter:
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
-        self._has_undelivered = False
+        self._has_undelivered = False  # bytes that may belong to a complete message
         self._topic_bytes = 0  # at most; the socket's thread only
         self._trims_s: list[float] = []  # when to give memory back
         self._num_ended = 0  # connections that ended since memory was last freed
@@ -372,7 +373,7 @@ class ConnectionLimiter:
             connections, lambda c: c.incomplete, max_incomplete, "too many incomplete messages"
         )
         _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
-        self._has_undelivered = any(connection.undelivered for connection in connections)
+        self._has_undelivered = any(c.undelivered > c.incomplete for c in connections)
         if self.waker is not None and (has_ended or self._has_undelivered):
             self.waker.wake()  # the loop handles complete messages and ended connections
         if self._trims_s and now_s >= self._trims_s[0]:

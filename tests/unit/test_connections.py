@@ -88,6 +88,21 @@ def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
     assert not honest.is_cut
 
 
+def test_does_not_wake_the_loop_for_a_message_that_is_known_to_be_incomplete(scene: Scene) -> None:
+    scene.limiter.waker = waker = mock.Mock()
+    scene.deliver(1)
+    scene.enforce_limits(0.0)
+    for read, number in ((300, 0), (400, 1)):
+        scene.traffic[1] = Traffic(read=read)
+        for look in range(10):
+            scene.enforce_limits(10.0 * number + look)
+            scene.socket.num_polls += 1  # each time that the loop waits
+        assert waker.wake.called
+        waker.wake.reset_mock()
+        scene.enforce_limits(10.0 * number + 10.0)
+        assert not waker.wake.called
+
+
 def test_sheds_the_owner_with_the_most_undelivered_bytes(scene: Scene) -> None:
     scene.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
     many = [scene.deliver(number, "many") for number in (1, 2, 3)]
