@@ -261,7 +261,8 @@ def rivals(
 ) -> None:
     """Run other lip sync on the clips, and write its curves for ``lips --from-csv``.
 
-    Programs: headaudio, wlipsync, wawa, live2d, pylipsync, openfacefx and loudness.
+    Programs: headaudio, wlipsync, wawa, live2d, pylipsync, openfacefx, loudness, and rhubarb if it
+    is on the path.
     """
     from kouxing.evaluation.rivals.tables import PROGRAMS, write_tables
 
