@@ -150,7 +150,7 @@ LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const fl
   }
   LipFrame frame = {.time_s = known_s - LIPS_DELAYS[delay], .delay_s = LIPS_DELAYS[delay]};
   for (int i = 0; i < LIPS_COLUMNS_LENGTH; i++) frame.faps[LIPS_COLUMNS[i]] = (float)outputs[i];
-  for (int i = 0; i < LIPS_PAIRS_LENGTH; i++) frame.faps[LIPS_PAIRS[2 * i + 1]] = frame.faps[LIPS_PAIRS[2 * i]];
+  for (int i = 0; i < LIPS_OTHERS_LENGTH; i++) frame.faps[LIPS_OTHERS[i]] = frame.faps[LIPS_ONES[i]];
   frame.closure = sigmoid(outputs[LIPS_CLOSURE]);
   return frame;
 }

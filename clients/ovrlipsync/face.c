@@ -185,12 +185,6 @@ static void move_to_rest(double *faps, double share) {
   }
 }
 
-static double sum_of(const double *faps, const int *columns, int number) {
-  double sum = 0.0;
-  for (int i = 0; i < number; i++) sum += faps[columns[i]];
-  return sum;
-}
-
 /* Compute the FAPs of the next lip frame, stabilized and with closures. */
 static void stabilize(Face *face, const LipFrame *frame, double *faps) {
   if (frame->time_s - track_end_s(&face->track) <= LEARNT_MAX_GAP_S) {
@@ -208,11 +202,11 @@ static void stabilize(Face *face, const LipFrame *frame, double *faps) {
     for (int row = 0; row < CLOSURES_BOTH_LENGTH; row++) faps[CLOSURES_BOTH[row * CLOSURES_UPPER_LENGTH + i]] -= 0.5 * crossed;
   }
   const double probability = clamp(frame->closure, CLOSURES_MIN_PROBABILITY, CLOSURES_MAX_PROBABILITY);
-  const double opening = -sum_of(faps, CLOSURES_INNER_LIPS, CLOSURES_INNER_LIPS_LENGTH);
-  const double corners = sum_of(faps, CLOSURES_CORNERS, CLOSURES_CORNERS_LENGTH);
+  const double opening = -(faps[CLOSURES_INNER_UPPER] + faps[CLOSURES_INNER_LOWER]);
+  const double width = faps[CLOSURES_LEFT_CORNER] + faps[CLOSURES_RIGHT_CORNER];
   double closure = RULE_SOUND + log(probability / (1.0 - probability));
   closure -= RULE_PARTED * (clamp(opening, CLOSURES_PARTED, CLOSURES_WIDE_APART) - CLOSURES_PARTED);
-  closure -= RULE_ROUNDED * fmax(0.0, CLOSURES_ROUNDED - corners);
+  closure -= RULE_ROUNDED * fmax(0.0, CLOSURES_ROUNDED - width);
   closure -= closure_doubt(&face->rest, frame->time_s, frame->closure);
   double share = smooth_step(0.5 + 0.5 * closure / RULE_DOUBT);
   const double before = face->shares[0], newest = face->shares[1];
