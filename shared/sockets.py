@@ -30,7 +30,7 @@ MAX_DROPPED = 20_000  # parts of one message, before other sockets get their tur
 MAX_FOLLOWED = 4096  # subscriptions; with more, messages are also encoded for nobody
 MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
 T = TypeVar("T", int, str)
-_MORE = zmq.DONTWAIT | zmq.SNDMORE
+_MORE, _READABLE = zmq.DONTWAIT | zmq.SNDMORE, int(zmq.POLLIN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,9 +318,7 @@ class Poller:
     def wait(self, timeout_s: float) -> list[Socket]:
         """Return the readable sockets in the order in which they were added."""
         ready = dict(self._poller.poll(max(0, math.ceil(timeout_s * 1000))))
-        ready.update(
-            (raw, 1) for raw in self._quiet if int(raw.getsockopt(zmq.EVENTS)) & zmq.POLLIN
-        )
+        ready.update((raw, 1) for raw in self._quiet if int(raw.get(zmq.EVENTS)) & _READABLE)
         for raw, socket in self._sockets.items():
             if raw not in ready:
                 socket.note_empty()
