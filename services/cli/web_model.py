@@ -53,7 +53,7 @@ FORMAT = "kouxing-lips 1"
 
 _ALIGNMENT_BYTES = 8
 _MAX_CONSTANT_SIZE = 400  # longer lists are arrays
-_MODULES = {
+_MODULES = {  # kouxing-lips and ovrlipsync use the numbers of these modules by name
     "animator": face_animator,
     "clock": clock,
     "closures": closures,
