@@ -37,7 +37,7 @@ from kouxing.shared.user_file import check_content, parse_json, read_text, split
 Array = NDArray[np.float64]
 
 SAMPLE_RATE_HZ = 16_000
-_MAX_BYTES = 64 << 20  # of a table
+_MAX_BYTES = 64 << 20  # limit for a table
 _MAX_ROWS = 1_000_000
 _FILMED = "tracked video"  # start of the kind of a filmed clip
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately

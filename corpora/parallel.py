@@ -13,7 +13,7 @@ _AHEAD_PER_CORE = 6  # items that may wait for the caller
 T = TypeVar("T")
 R = TypeVar("R")
 
-_function: Callable[[Any], Any]  # of a worker process
+_function: Callable[[Any], Any]  # the function that a worker process runs
 
 
 def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

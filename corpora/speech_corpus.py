@@ -257,7 +257,7 @@ def _pairs(path: Path) -> Iterator[tuple[str, str]]:
             yield key, value.strip()
 
 
-_PREFIXES = (  # of file names; they cover whole recordings and all recordings of a speaker
+_PREFIXES = (  # prefixes of file names; they cover whole recordings and all recordings of a speaker
     "MOSS-TTSD_",
     "MOSS-TTS_reference_zh_3",
     "MiMo-Audio_aa7ed1",

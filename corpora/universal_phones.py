@@ -31,7 +31,7 @@ from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.universal.segments import read_ipa
 
 _EMODB = "emodb_"
-_MARKS = re.compile("^[!_]|asp$")  # of bursts, closures and aspiration
+_MARKS = re.compile("^[!_]|asp$")  # marks for bursts, closures and aspiration
 _STOPS = ("p", "t", "k")
 _ASPIRATED = "asp"
 _JYUTPING = re.compile(r"(gw|kw|ng|[bpmfdtnlgkhwzcsj])?(aa|yu|oe|eo|[aeiou])?(ng|[mnptkiu])?\d?")

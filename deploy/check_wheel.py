@@ -94,7 +94,7 @@ def check_page(folder: Path, environment: dict[str, str]) -> None:
 def load_modules(page: str) -> int:
     """Load the page's script and every module that it imports; return their number."""
     html = load(page).decode()
-    names = dict(re.findall(r'"(three[^"]*)": "([^"]+)"', html))  # of the import map
+    names = dict(re.findall(r'"(three[^"]*)": "([^"]+)"', html))  # the import map
     pending = [urljoin(page, "main.js")]
     loaded: set[str] = set()
     while pending:

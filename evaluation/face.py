@@ -72,7 +72,7 @@ _ANGLES = [
 class Movements:
     """Rate of a movement, and how often it matches a stressed vowel."""
 
-    per_minute: float  # of speech
+    per_minute: float  # rate per minute of speech
     at_end: float  # share after a phrase
     matched: float | None  # share of the others; None without any or without stressed vowels
 
@@ -84,7 +84,7 @@ class FaceFigures:
     correlations: Mapping[str, float]
     nods: Movements
     brow_raises: Movements
-    chance: float | None  # of matching a stressed vowel
+    chance: float | None  # probability of matching a stressed vowel by chance
     blinks_per_minute: float
     blink_s: float  # median duration
     still_speaking: float  # shares of frames
@@ -97,7 +97,7 @@ class _Session:
     """The face of one speaker."""
 
     faps: Floats  # (frames, 68)
-    spans: Sequence[tuple[float, float]]  # of the recordings
+    spans: Sequence[tuple[float, float]]  # start and end of each recording
     feelings: Sequence[tuple[float, float]]  # estimated at the end of each recording
     stressed_s: Times
 

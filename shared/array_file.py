@@ -15,7 +15,7 @@ from kouxing.shared.user_file import check_content, open_file
 MAX_ARRAYS = 1000
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others need much memory
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-_ENTRY = b"PK\1\2"  # of the table at the end of an archive
+_ENTRY = b"PK\1\2"  # signature in the table at the end of an archive
 
 
 def read_arrays(path: Path, max_bytes: int, expected: str) -> dict[str, NDArray[Any]]:

@@ -33,14 +33,14 @@ from kouxing.shared.user_file import check_content, open_file
 from kouxing.shared.wav_parts import Readable, WavParts, num_parts
 
 MIN_RATE_HZ = 8_000
-MAX_RATE_HZ = 48_000  # of a session; files above are resampled to it
+MAX_RATE_HZ = 48_000  # limit for a session; files above are resampled to it
 BLOCK_S = 0.02
 CLIPPED_LEVEL = 0.999
-CLIPPED_SHARE = 0.01  # of the samples; the user is warned about more
-_MIN_MISSING_S = 0.05  # of a file that is reported as cut off
-_MAX_SPOOLED_BYTES = 64 << 20  # of a pipe that must be read to its end first; more goes to a file
+CLIPPED_SHARE = 0.01  # share of the samples; the user is warned above it
+_MIN_MISSING_S = 0.05  # a file that lacks more is reported as cut off
+_MAX_SPOOLED_BYTES = 64 << 20  # for a pipe that must be read to its end first; more goes to a file
 MAX_FILE_BYTES = 8 << 30
-MAX_DURATION_S = 3 * 3600.0  # of a recording that is held in memory
+MAX_DURATION_S = 3 * 3600.0  # limit for a recording that is held in memory
 _PIPE = Path("-")
 
 

@@ -3,9 +3,9 @@
 import time
 from collections.abc import Callable
 
-BUDGET = 5000.0  # of a connection
+BUDGET = 5000.0  # budget of a connection
 BUDGET_PER_S = 500.0
-MIN_BUDGET = 100.0  # of a new connection: enough for an honest client that shares a misused key
+MIN_BUDGET = 100.0  # for a new connection: enough for an honest client that shares a misused key
 
 
 class Budget:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
 
-_LOST_SHARE = 0.01  # of the loudest channel's energy; a mix with less has lost it
+_LOST_SHARE = 0.01  # share of the loudest channel's energy; a mix with less has lost the channel
 _LOST_SHARE_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one voice
 _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 
@@ -22,7 +22,7 @@ class CancellationGuard:
         self._name = name
         self._num_channels = num_channels
         self._remarks = remarks
-        self._energy: NDArray[np.float64] = np.zeros(1)  # of every channel so far
+        self._energy: NDArray[np.float64] = np.zeros(1)  # energy of every channel so far
         self._mixed_energy = 0.0
         self._has_remarked = False
 

@@ -38,10 +38,10 @@ from kouxing.shared.waker import Waker
 KIB, MIB = 1024, 1024 * 1024
 CHECK_INTERVAL_S = 0.05  # between two checks of all connections, while data arrives
 MAX_INTERVAL_S = 1.0  # between two checks without new data
-RECEIVE_BUFFER = 256 * KIB  # of the kernel, which doubles it
-MAX_UNDELIVERED = 24 * MIB  # of all connections
-MAX_INCOMPLETE = MIB  # of all connections: 16 audio messages on slow links
-SMALL_INCOMPLETE = 4 * KIB  # of each connection, in addition
+RECEIVE_BUFFER = 256 * KIB  # in the kernel, which doubles it
+MAX_UNDELIVERED = 24 * MIB  # limit for all connections together
+MAX_INCOMPLETE = MIB  # limit for all connections together: 16 audio messages on slow links
+SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
 MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
@@ -49,13 +49,13 @@ NEW_LOOKS = 20  # checks in which a connection is new; a flood is disconnected e
 MAX_ENDED = 1024  # ended connections that a service has not handled yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
-MAX_ALL_TOPICS = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
+MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
 PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
-_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # that a monitor reports
-_EVENT = struct.Struct("=HI")  # of a monitor: event and descriptor
+_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
+_EVENT = struct.Struct("=HI")  # a monitor's event and descriptor
 _WARNINGS = RateLimit()
 
 
@@ -91,7 +91,7 @@ class Connection:
         self.inode = inode  # identifies the connection; the kernel reuses descriptors
         self.socket = socket
         self.address = kernel_sockets.address_of(descriptor)
-        self.key = ""  # of the peer; known when its first message is delivered
+        self.key = ""  # the peer's key; known when its first message is delivered
         self.budget = Budget()
         self.num_delivered = 0  # messages
         self.num_looks = 0
@@ -246,14 +246,14 @@ class ConnectionLimiter:
         self._quota = PeerQuota(extra_connections, is_service)
         self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
-        self._budgets: dict[str, Budget] = {}  # of owners whose connections ended
+        self._budgets: dict[str, Budget] = {}  # budgets of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
         self._has_undelivered = False  # bytes that may belong to a complete message
         self._topic_bytes = 0  # at most; the socket's thread only
         self._trims_s: list[float] = []  # when to give memory back
         self._num_ended = 0  # connections that ended since memory was last freed
         self._arrivals = Arrivals()
-        self.waker: Waker | None = None  # of the loop that receives the messages
+        self.waker: Waker | None = None  # wakes the loop that receives the messages
         self._stops = threading.Event()
         self._thread = threading.Thread(target=self._run, name="connections", daemon=True)
 

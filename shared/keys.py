@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 CONTROL = "control"
 CLIENT = "client"
-CLIENT_ROLES = ("client", "operator")  # of the user of control's machine
+CLIENT_ROLES = ("client", "operator")  # roles of the user of control's machine
 MAX_KEYS = 1000  # with MAX_ROLES, what fits in one message from control
-MAX_ROLES = 16  # of a key
-MAX_KEY_SHARE = 0.75  # of the sessions, videos and connections of clients, for one key
+MAX_ROLES = 16  # limit for a key
+MAX_KEY_SHARE = 0.75  # share of the sessions, videos and connections that one key can have
 _MAX_ALLOWED_BYTES = 768 * 1024
 _MAX_FILE_BYTES = 1 << 20
 _ALLOWED = "allowed"

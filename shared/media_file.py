@@ -33,7 +33,7 @@ _JITTER_S = 0.05  # timestamps that differ less from the number of samples are i
 _MAX_OVERLAP_S = 1.0  # timestamps that go back further start again
 _MAX_GAP_S = 3600.0  # a larger one is an error in the timestamps
 _MAX_GAP_OF_BROADCAST_S = 10.0  # its timestamps may start again at any value
-_MIN_MISSING_S = 0.1  # of a track that is reported as cut off
+_MIN_MISSING_S = 0.1  # a track that lacks more is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
 # FFmpeg guesses these from the file's name, and also guesses their rate.
@@ -55,7 +55,7 @@ class WavPcm(NamedTuple):
     """The samples in a WAV file."""
 
     format: RawFormat
-    place: int  # of the first sample, bytes
+    place: int  # position of the first sample, bytes
     num_bytes: int | None  # None: until the end of the file
 
 
@@ -153,8 +153,8 @@ class MediaSound:
 
     def _decode(self) -> Iterator[Any]:
         """Yield the frames of the track. Damaged packets are left out, as FFmpeg does."""
-        self._read_end_s = self._track_end_s = 0.0  # of all tracks, and of this one
-        self._first_place: int | None = None  # of the first packet in the file, bytes
+        self._read_end_s = self._track_end_s = 0.0  # end of all tracks, and of this one
+        self._first_place: int | None = None  # position of the first packet in the file, bytes
         self._num_damaged = 0
         self._is_stopped = False  # the rest cannot be read
         self._damaged_s = 0.0  # time of the first damaged packet

@@ -12,7 +12,7 @@ from kouxing.shared.keys import MAX_KEY_SHARE
 if TYPE_CHECKING:
     from kouxing.shared.connections import Connection
 
-MAX_CONNECTIONS = 400  # of clients; libzmq takes up to 0.1 MB for each
+MAX_CONNECTIONS = 400  # limit for clients; libzmq takes up to 0.1 MB for each
 FILES_PER_CLIENT = 6  # its own, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 

@@ -23,7 +23,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, Joined
 from kouxing.shared.zap import Zap
 
-ERROR_COST = 4.0  # of the sender's budget, for each message that is answered with an error
+ERROR_COST = 4.0  # a message that is answered with an error takes this from the sender's budget
 ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report has 15 MB
 MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
@@ -57,15 +57,15 @@ class Socket:
     ) -> None:
         self.raw = raw
         self._key = key
-        self._zap = zap  # of a socket that is bound with a key
+        self._zap = zap  # for a socket that is bound with a key
         self._limited = limited  # if it is bound
         self._routes = routes
         self._publishes = publishes
         self._on_joined = on_joined
-        self._connection: Connection | None = None  # that the last message came through
-        self._sender = NO_PEER  # of it
-        self._has_rest = False  # parts of it that nobody wants
-        self._rest_from: Connection | None = None  # whose they are
+        self._connection: Connection | None = None  # connection of the last message
+        self._sender = NO_PEER  # sender of the last message
+        self._has_rest = False  # unread parts of the last message remain
+        self._rest_from: Connection | None = None  # connection of the unread parts
         self._name = secrets.token_hex(8)
         self._followed: set[bytes] = set()  # subscriptions, now or before
         self._prefixes: tuple[bytes, ...] = ()  # those that are not a whole topic

@@ -16,7 +16,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import RawFormat
 
 _RATE_HZ = 16_000
-_LATENCY_MS = 20  # of recordings of outputs and programs
+_LATENCY_MS = 20  # latency of recordings of outputs and programs
 _TIMEOUT_S = 5.0
 _NO_SOUND_SERVER = (
     "recording what this machine plays needs PulseAudio or PipeWire, which does not answer; type: "

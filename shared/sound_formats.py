@@ -6,7 +6,7 @@ from typing import Literal
 import av
 
 NUM_BEGIN_BYTES = 16_384  # enough for all of this module; three frames of the largest size
-_NUM_HEADER_BYTES = 4096  # of a WAV or MP4 file
+_NUM_HEADER_BYTES = 4096  # size of the checked start of a WAV or MP4 file
 _SOUND = (
     (0, b"RIFF"), (0, b"RIFX"), (0, b"RF64"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"),
     (0, b"OggS"), (0, b"fLaC"), (0, b"ID3"), (0, b"FORM"), (0, b"caff"), (0, b"#!AMR"),

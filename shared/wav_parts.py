@@ -6,7 +6,7 @@ from typing import BinaryIO, Protocol
 from kouxing.shared.errors import UserError
 from kouxing.shared.sound_formats import MIN_UNKNOWN_BYTES
 
-_MAX_CHUNK_BYTES = 16 << 20  # of pictures and notes between two parts
+_MAX_CHUNK_BYTES = 16 << 20  # limit for pictures and notes between two parts
 
 
 class Readable(Protocol):

@@ -28,7 +28,7 @@ SILENT_DB = -120.0
 JAW, LOWER_LIP, WIDTH = (MOUTH_FAPS.index(fap) for fap in (3, 5, 6))
 
 
-UPPER, LOWER = np.array([[4, 8, 9, 51, 55, 56], [5, 10, 11, 52, 57, 58]]) - 1  # of lips, in FAPs
+UPPER, LOWER = np.array([[4, 8, 9, 51, 55, 56], [5, 10, 11, 52, 57, 58]]) - 1  # FAPs of each lip
 
 
 def viseme_faps(viseme: str) -> NDArray[np.float32]:

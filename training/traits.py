@@ -42,7 +42,7 @@ Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
 _FEELING_RIDGE, _SOUND_RIDGE = 1.0, 1e-4
-_SOUND_WEIGHT = 5.0  # of a position in laughter or breath
+_SOUND_WEIGHT = 5.0  # weight of a position in laughter or breath
 _TRAITS = ("laughter", "breath")
 _OTHER_STEP = 4  # positions without laughter or breath of which one is used
 _MIN_VOICED = 10  # positions
@@ -56,7 +56,7 @@ def train_traits(
     rng = np.random.default_rng(seed)
     speech = read_emotions(recordings, shipping=shipping)
     spoken = [recording for recording in speech if recording.emotion]
-    means, targets, owners = [], [], []  # of the recordings with an emotion
+    means, targets, owners = [], [], []  # one entry per recording with an emotion
     rows, labels = [], []  # positions
     for recording in track(speech, description="speech"):
         for positions in _ear_positions(read_audio(recording.path), rng):

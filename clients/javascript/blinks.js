@@ -9,7 +9,7 @@ const LIDS = [18, 19, 20, 21];
 const CLOSED = [900, 900, 150, 150];
 
 export class Blinks {
-  #startS = null; // of the current or the next blink
+  #startS = null; // start of the current or the next blink
 
   /** Add blinks to the weights or the 68 FAPs of a face, in place; times must rise. */
   apply(values, names, nowS) {

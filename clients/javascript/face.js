@@ -14,7 +14,7 @@ import { Viewer } from "./viewer.js";
 const NO_WEBGL = "this browser has no WebGL; turn on hardware acceleration";
 const FOV_DEGREES = 20;
 const RATE_HZ = 16000;
-const MAX_STEP_S = 0.1; // of the physics of hair
+const MAX_STEP_S = 0.1; // longest time step of the hair physics
 
 /** The custom element; README.md lists its attributes. */
 export class KouxingFace extends HTMLElement {
@@ -27,7 +27,7 @@ export class KouxingFace extends HTMLElement {
   #camera = new THREE.PerspectiveCamera(FOV_DEGREES, 1, 0.01, 100);
   #resizeObserver = new ResizeObserver(() => this.#resize());
   #avatar = null;
-  #loadId = 0; // of the newest load
+  #loadId = 0; // number of the newest load
   #viewer = null;
   #sound = new Sound(() => {});
   #player = new Player(this.#sound);
@@ -35,7 +35,7 @@ export class KouxingFace extends HTMLElement {
   #names = [];
   #recording = null; // { frames, names, nowS, onEnded }
   #lips = null; // a promise of the local lip sync
-  #localFaces = null; // the same, once it is loaded
+  #localFaces = null; // the local faces, once they are loaded
   #blinks = new Blinks();
   #drawnMs = 0;
   #animationFrame = 0;

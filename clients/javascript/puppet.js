@@ -11,11 +11,11 @@ import { MorphedMesh } from "./page/morph.js";
 import { chooseSet, findShapes } from "./shape-names.js";
 
 const UNREADABLE = { DRACOLoader: "KHR_draco_mesh_compression", KTX2: "KHR_texture_basisu" }; // by words of three.js
-const VIEW_HEIGHT = 1.6; // of the camera's view, relative to the face
+const VIEW_HEIGHT = 1.6; // height of the camera's view, relative to the face
 const VRM_FACE_M = 0.24;
 const JAW_BONE = /(^|[.:|_ ])(jaw|jawroot|lowerjaw)$/i;
 const JAW_RADIANS = 0.3; // at full weight of ARKit's jawOpen
-const OPENINGS = { jawOpen: 1, aa: 0.5, oh: 0.35, E: 0.2, ee: 0.2, ou: 0.2 }; // of the jaw
+const OPENINGS = { jawOpen: 1, aa: 0.5, oh: 0.35, E: 0.2, ee: 0.2, ou: 0.2 }; // how far each shape opens the jaw
 // Rotation of the eyes at weight 1, degrees, and the shapes of the sets "vrm" and "arkit".
 const LOOKS = {
   left: [24.6, "lookLeft", "eyeLookOutLeft", "eyeLookInRight"],

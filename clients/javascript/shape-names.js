@@ -72,7 +72,7 @@ export function chooseSet(names) {
 /** Write the side at the end of a name as a word. */
 function sided(name) {
   return name
-    .replace(/_div\d$/, "") // of Daz
+    .replace(/_div\d$/, "") // suffix that Daz appends
     .replace(/(?:[._\- ][Ll]|(?<=[a-z])L)$/, "Left")
     .replace(/(?:[._\- ][Rr]|(?<=[a-z])R)$/, "Right");
 }

@@ -5,7 +5,7 @@ import { loadModel } from "./engine/model.js";
 
 let model = null; // a promise
 let engine = null;
-let port = null; // of the audio thread
+let port = null; // port of the audio thread
 
 self.onmessage = async ({ data: { type, ...data } }) => {
   try {

@@ -10,8 +10,8 @@ class LipSyncInput extends AudioWorkletProcessor {
   #block = new Float32Array(Math.ceil(SLICE_S * sampleRate) + 2 * QUANTUM);
   #numFilled = 0;
   #numSent = 0; // samples
-  #numSlices = 0; // that the sent samples complete
-  #port = null; // of the worker
+  #numSlices = 0; // slices that the sent samples complete
+  #port = null; // port of the worker
   #isOpen = true;
 
   constructor() {

@@ -19,9 +19,9 @@ class Agreement:
     """Agreement of several pairs; None if nothing moves or nothing was measured."""
 
     num_clips: int
-    correlation: dict[str, float | None]  # of opening, width and jaw
-    error: float | None  # of the opening, FAP units
-    lag_ms: float | None  # of the opening
+    correlation: dict[str, float | None]  # for opening, width and jaw
+    error: float | None  # error of the opening, FAP units
+    lag_ms: float | None  # lag of the opening
     closure_f1: float | None
 
 

@@ -13,7 +13,7 @@ from kouxing.evaluation.lips.mouths import Mouth
 
 Array = NDArray[np.float64]
 
-_MIN_CLIPS = 3  # of a speaker
+_MIN_CLIPS = 3  # minimum number of clips per speaker
 
 
 def correlate_by_speaker(

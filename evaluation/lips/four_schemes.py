@@ -185,7 +185,7 @@ def delay_by_one_phone(events: Sequence[SoundEvent]) -> list[SoundEvent]:
     """Keep each phone once, when the next is emitted or speech ends: scheme 4."""
     kept: list[SoundEvent] = []
     latest: dict[int, Phone] = {}  # revision of each phone, by index
-    middle_s = 0.0  # of the last phone kept; a phone that starts earlier is not new
+    middle_s = 0.0  # middle of the last phone kept; a phone that starts earlier is not new
     for event, after in zip_longest(events, events[1:]):
         delayed = None
         if isinstance(event, Phone):

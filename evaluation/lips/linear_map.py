@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 _HISTORY_S = 0.02 * np.arange(10)
 _RIDGE = 1000.0  # weight of zero, frames
-_TOLERANCE = 0.005  # of the correlation
+_TOLERANCE = 0.005  # tolerance of the correlation
 _SHUT_SHARES = range(0, 65, 5)  # percentages of the frames that the constant may close
 _JAW, _LOWER_LIP, _CORNERS = 2, 4, (5, 6)  # columns of FAPs
 
@@ -44,7 +44,7 @@ class LinearMap:
     delay_s: float
     weights: Array  # (10 * num_curves, 3)
     opening: float  # constant, FAP units
-    correlation: float  # of the opening on the clips of the fit
+    correlation: float  # correlation of the opening on the clips of the fit
 
     def faps(self, table: CurveTable, time_s: Array) -> Array:
         """Return FAPs (num_frames, 68) at given times."""

@@ -36,7 +36,7 @@ class _SeveralPredictors:
     """Runs several lip predictors, each with several delays, on one run of the recognizer."""
 
     predictors: Sequence[LipFrameModel]
-    delays_s: Sequence[float]  # of all predictors
+    delays_s: Sequence[float]  # delays of all predictors
 
     def create_stream(self, _delays_s: Sequence[float]) -> _SeveralStreams:
         return _SeveralStreams(

@@ -13,13 +13,13 @@ from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CURVES: dict[str, Callable[[Array], Array]] = {  # of FAPs (num_frames, 68), in FAP units
+CURVES: dict[str, Callable[[Array], Array]] = {  # functions of FAPs (num_frames, 68), in FAP units
     "opening": lambda faps: -faps[:, 3] - faps[:, 4],
     "width": lambda faps: faps[:, 5] + faps[:, 6],
     "jaw": lambda faps: faps[:, 2],
 }
 _CLOSED = 20.0  # opening of made lips in FAP units: 0.6 mm on a face
-_CLOSED_SHARE = 0.1  # of a real mouth's range
+_CLOSED_SHARE = 0.1  # share of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)

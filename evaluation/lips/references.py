@@ -37,7 +37,7 @@ class Reference:
     mouth: Mouth
     phones: Sequence[Phone]  # aligned with the text, or recognized
     voice: Sequence[SpeechChange]  # the recognizer's voice activity
-    visemes: Mapping[str, Sequence[tuple[str, float]]]  # of phones, with shares of the duration
+    visemes: Mapping[str, Sequence[tuple[str, float]]]  # phone: visemes with shares of its duration
 
     @cached_property
     def loud_s(self) -> Array:

@@ -52,7 +52,7 @@ class ConditionScore:
     face_delay_ms: float | None  # None: not live
     phone_delay_p50_ms: float | None
     phone_delay_p95_ms: float | None
-    jerk: float | None  # of the opening, FAP units per second cubed
+    jerk: float | None  # jerk of the opening, FAP units per second cubed
     like_scheme_1: Agreement | None
     like_real_lips: Agreement | None
 

@@ -24,7 +24,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
 WHISKERS = 1.5  # interquartile ranges from the quartiles to the fences
-Scores = dict[tuple[int, str], int]  # of one condition on one scale, by judge and sentence
+Scores = dict[tuple[int, str], int]  # one condition on one scale, by judge and sentence
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ class Answer:
     condition: str
     scale: str
     score: int  # 1 (bad) to 5 (excellent)
-    language: str  # of the page: zh or en
+    language: str  # language of the page: zh or en
     unix_s: float
 
 
@@ -52,7 +52,7 @@ class Store:
                 f"{folder}: another process is serving this study; stop it first"
             ) from None
         self.judges: dict[str, int] = {}  # number by token
-        self.last_places: dict[int, int] = {}  # that a judge has scored
+        self.last_places: dict[int, int] = {}  # newest place that each judge has scored
         for line in _read_lines(path):
             self._note(line)
         self._file.write("\n")  # ends a line that a crash has cut

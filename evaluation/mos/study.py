@@ -22,7 +22,7 @@ from kouxing.shared.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "study.json"
 SUFFIXES = {".mp4", ".webm", ".mov"}
-LANGUAGES = ("zh", "en")  # of the page
+LANGUAGES = ("zh", "en")  # languages of the page
 _MAX_BYTES = 16 << 20
 SCALES = ("sync", "realism")
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from kouxing.corpora.scoring import matched_pairs
 from kouxing.shared.phones.inventory import PhoneInventory
 
-_VISEMES = {"b", "f"}  # of b p m and of f
+_VISEMES = {"b", "f"}  # visemes of b p m and of f
 
 
 class Labials:

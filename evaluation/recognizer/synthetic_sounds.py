@@ -25,7 +25,7 @@ from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 Samples = NDArray[np.float32]  # (n,), 16 kHz, in [-1, 1]
 _TWELFTH = 2 ** (1 / 12)
 
-_FORMANTS_HZ = {  # of a male voice
+_FORMANTS_HZ = {  # formants of a male voice
     "a": (850, 1250, 2600, 3500),
     "o": (550, 850, 2500, 3400),
     "e": (500, 1150, 2450, 3400),

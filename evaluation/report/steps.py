@@ -6,7 +6,7 @@ from pathlib import Path
 
 from kouxing.evaluation.rivals.tables import PROGRAMS
 
-ROOT = Path(__file__).resolve().parents[2]  # of the source tree, behind its links
+ROOT = Path(__file__).resolve().parents[2]  # root of the source tree, behind its links
 CONVERSATION = ROOT / "corpora" / "conversation.tsv"
 SAMPLE = ROOT / "shared" / "demo" / "hello-female.wav"
 

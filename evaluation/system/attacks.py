@@ -87,7 +87,7 @@ class Damage:
     growth_mb: dict[str, float]  # peak during and after the attack, by service
     kept_mb: dict[str, float]  # after up to RELEASE_DEADLINE_S, by service
     restarted: list[str]  # services that ended during the attack; they have no memory figures
-    p95_ms: dict[str, float | None]  # of the other client, by phase; None: no frame in time
+    p95_ms: dict[str, float | None]  # the other client's p95, by phase; None: no frame in time
 
 
 def measure(path: Path, names: Collection[str], console: Console) -> list[Damage]:

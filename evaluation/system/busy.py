@@ -47,7 +47,7 @@ class Usage:
     """Resources that a service used per second."""
 
     cpu_cores: float
-    wake_ups: float  # of all threads
+    wake_ups: float  # wake-ups of all threads
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,9 +27,9 @@ class Continuity:
     phones_doubled: int
     phones_changed: int
     frames_lost: int
-    frames_doubled: int  # whose media time had been received before
+    frames_doubled: int  # frames whose media time had been received before
     rest_frames: int  # frames of a silent client, though the client was not silent
-    largest_step: float  # of all FAPs, relative to the largest step without a fault
+    largest_step: float  # maximum over all FAPs, relative to the largest step without a fault
     largest_step_fap: str
     late_p50_ms: float  # after the audio of a frame was due
     late_p95_ms: float

@@ -52,7 +52,7 @@ signal.signal(signal.SIGUSR1, spin)
 class Timing:
     """Durations of a session and its fault, seconds."""
 
-    length_s: float = 24.0  # of the audio
+    length_s: float = 24.0  # duration of the audio
     fault_at_s: float = 8.0
     also_at_s: tuple[float, ...] = (3.2, 4.6)  # in other sessions
     frozen_s: float = 10.0  # how long a service or the machine is blocked

@@ -132,11 +132,11 @@ class LipsPage:
     name: str
     download_bytes: int  # code and models, compressed by gzip
     loaded_ms: float  # from a local server
-    first_movement_ms: float  # of the mouth, from the start of loading; the microphone speaks
+    first_movement_ms: float  # from loading to the first motion of the mouth; the microphone speaks
     delay_ms: dict[str, float] | None  # from the sound to its weights: p50, p95; only kouxing-lips
-    processor_share: float  # of one core
+    processor_share: float  # share of one core
     num_clips: int = 0
-    lag_ms: float | None = None  # of the opening behind the real lips, with the page's delay
+    lag_ms: float | None = None  # lag of the opening behind the real lips, with the page's delay
     opening_correlation: float | None = None
     closure_f1: float | None = None
 

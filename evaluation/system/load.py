@@ -53,7 +53,7 @@ class Step:
     num_sessions: int  # admitted
     refusals: dict[str, int]  # by code
     delay_ms: dict[str, float]  # percentiles over all sessions' frames
-    worst_p95_ms: float  # of the worst session
+    worst_p95_ms: float  # p95 of the worst session
     num_rest_frames: int  # frames at rest while the speaker spoke
     cpu_cores: dict[str, float]  # by service, and of the client
     memory_mb: dict[str, float]  # by service, at the end
@@ -70,9 +70,9 @@ class Load:
     """Figures of one run."""
 
     steps: list[Step]
-    cores: int  # of this machine, shared with the client
+    cores: int  # cores of this machine, shared with the client
     machine_load: float  # load average of the minute before
-    delay_ms: float  # of the synthesizer
+    delay_ms: float  # delay of the synthesizer
 
     @property
     def best(self) -> Step | None:

@@ -31,7 +31,7 @@ class Drawing:
     """Figures of the page in one situation."""
 
     pictures_per_s: float
-    size_px: tuple[int, int]  # of the drawn picture, in a page of SIZE_PX
+    size_px: tuple[int, int]  # size of the drawn picture, in a page of SIZE_PX
     picture_ms: float  # from the start of drawing to its end
     picture_cpu_ms: float  # on all cores, compositing included
     voice_to_frame_ms: float | None  # until the frame has reached the page; None: nobody spoke

@@ -32,8 +32,8 @@ class Sizes:
     """Figures of this machine and this version."""
 
     model_bytes: dict[str, int]
-    frame_bytes: int  # of a message with a face's FAPs
-    gemm_gflops: float  # of one core, float32
+    frame_bytes: int  # size of a message with a face's FAPs
+    gemm_gflops: float  # speed of one core, float32
     network_gflop_per_s: dict[str, float]  # per second of speech
 
     def floor_cores(self, hop: int = 1) -> float:

@@ -29,7 +29,7 @@ from kouxing.shared.keys import CLIENT, control_endpoint, read_key, user_key
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 180.0
 ON_HOSTS = ("control", "recognizer", "synthesizer")
-PORTS = {  # of services on virtual hosts
+PORTS = {  # ports of services on virtual hosts
     "control": {"control": 5550, "events": 5551},
     "recognizer": {"audio": 5560, "phones": 5561, "unpaced_audio": 5562},
     "synthesizer": {"phone_input": 5570, "faps": 5571},
@@ -40,7 +40,7 @@ class System:
     """Running services."""
 
     control: str  # address and key
-    key: Key  # of a client
+    key: Key  # a client's key
 
     def on_client(self) -> contextlib.AbstractContextManager[None]:
         """Open the sockets of this thread on the client's host."""

@@ -82,7 +82,7 @@ SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL")
 
 def sided(name):
     """Write the side at the end of a name as a word."""
-    name = re.sub(r"_div\d$", "", name)  # of Daz
+    name = re.sub(r"_div\d$", "", name)  # suffix that Daz appends
     name = re.sub(r"([._\- ][Ll]|(?<=[a-z])L)$", "Left", name)
     return re.sub(r"([._\- ][Rr]|(?<=[a-z])R)$", "Right", name)
 

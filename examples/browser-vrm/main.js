@@ -9,7 +9,7 @@ import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
 const FAP_FRAME = 1; // types of binary messages, proto/GATEWAY.md
 const FACE_AT_REST = 3;
-const WEIGHTS = [4, 5]; // of a frame, of the face at rest
+const WEIGHTS = [4, 5]; // message types: weights of a frame, weights at rest
 const HEADER_BYTES = 16;
 const HEAD_ROTATION = [47, 48, 49]; // indices of FAPs 48 to 50: pitch, yaw, roll
 const RADIANS_PER_UNIT = 1e-5;

@@ -34,7 +34,7 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
 
 T = TypeVar("T", Phone, TimedSyllable)
-_IMAGE_RATE_HZ = 25.0  # of a video, if the source is sound
+_IMAGE_RATE_HZ = 25.0  # for a video made from sound
 _MAX_IMAGE_RATE_HZ = 240.0
 
 

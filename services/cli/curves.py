@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 Values = NDArray[np.float32]
 Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
 _SHAPE_FORMS = (CurveForm.ARKIT, CurveForm.OCULUS, CurveForm.VRM)
-_LIVE_LINK_RATE_HZ = 60  # of the time code; the app's default
+_LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Curves:
     frame_rate_hz: float | None = None  # None: estimated from the times of the frames
     phones: Sequence[Phone] | None = None  # spoken phones by onset; tables get a column for them
     source: Path | None = None  # recording
-    duration_s: float | None = None  # of the recording; None: until the last frame
+    duration_s: float | None = None  # duration of the recording; None: until the last frame
 
 
 class CurveExporter(ABC):

@@ -20,7 +20,7 @@ from kouxing.shared.keys import CLIENT, CLIENT_ROLES, local_keys, rejection_hint
 from kouxing.shared.terminal import plural
 
 MAX_CLOCK_OFFSET_MS = 1000.0
-MAX_AGE_S = 2.0  # of the newest heartbeat
+MAX_AGE_S = 2.0  # limit for the age of the newest heartbeat
 MIN_SERVICES = ("control", "recognizer", "synthesizer")  # without them, no face moves
 PUBLISHERS = ("phones", "faps", "events")  # accept every allowed key
 ROUTERS = {"audio": "client", "unpaced_audio": "client", "phone_input": "service"}  # and its role

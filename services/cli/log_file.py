@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-MAX_BYTES = 10_000_000  # of a file; the one before is kept as NAME.log.1
+MAX_BYTES = 10_000_000  # per file; the previous file is kept as NAME.log.1
 _TOKEN = re.compile(rb"(token=)[^\s\"'&]+")
 
 

@@ -77,7 +77,7 @@ class _Mouth:
     widths: tuple[Array, Array]  # times, and the width at each, relative to the mouth at rest
     inventory: PhoneInventory
     smooth: bool  # whether the velocity of the opening is continuous
-    num_points: int  # of each line of the contour, in a table
+    num_points: int  # for each line of the contour, in a table
 
     def widths_at(self, times_s: Sequence[float] | Array) -> Array:
         """Return the width at times (n,), relative to the mouth at rest."""

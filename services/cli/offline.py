@@ -167,7 +167,7 @@ def render(
     inputs = [*(source for source, _ in pairs), sound, mouth, Path(head)]
     if text is not None:
         inputs.append(Path(text))
-    targets = (None if target.is_dir() else target for _, target in pairs)  # of numbered pictures
+    targets = (None if target.is_dir() else target for _, target in pairs)  # folder of pictures
     check_output(*targets, inputs=inputs, force=force)
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,

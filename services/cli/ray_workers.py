@@ -25,7 +25,7 @@ from kouxing.shared.keys import key_text, load_key
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 from kouxing.shared.service_kind import ServiceKind
 
-NAMESPACE = "kouxing"  # of the actors' names
+NAMESPACE = "kouxing"  # namespace of the actors' names
 PLACEMENT_LIMIT_S = 60.0  # maximum wait for Ray to start one actor per core
 
 

@@ -19,7 +19,7 @@ from kouxing.shared.terminal import print_message
 
 SEARCH_PERIOD_S = 0.2
 STEP_S = 0.05
-_TOLERANCE_S = 0.05  # of the times at which a session was opened
+_TOLERANCE_S = 0.05  # two opening times that differ less are equal
 
 
 def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_seed: int) -> None:

@@ -75,7 +75,7 @@ class _Streaming:
         self._client = client
         self._source = source
         self._console = console
-        self._duration_s = self._clipped = self._peak = 0.0  # of what was sent
+        self._duration_s = self._clipped = self._peak = 0.0  # statistics of the sent audio
         self._num_phones = 0
         self._is_recorded = False
 

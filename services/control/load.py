@@ -13,9 +13,9 @@ from collections import deque
 EQUAL_LOAD = 0.05  # loads that differ by less are equal
 MIN_SESSIONS = 2  # never refused; on a busy machine every session seems to be expensive
 MEASURED_S = 2.0  # period over which a worker measures its load
-DEFAULT_COST = 0.1  # of a session until it is measured; typical of a slow machine
-COST_HALF_LIFE_S = 60.0  # of the highest measured cost
-SPEAKING_HALF_LIFE_S = 4.0  # of the cost, while the speaking sessions cost less than that
+DEFAULT_COST = 0.1  # cost of a session until it is measured; typical of a slow machine
+COST_HALF_LIFE_S = 60.0  # half-life of the highest measured cost
+SPEAKING_HALF_LIFE_S = 4.0  # half-life of the cost while speaking sessions cost less
 RETRY_AFTER_S = 5.0  # for a client that is refused
 
 
@@ -30,7 +30,7 @@ class WorkerLoad:
         self._measured_s = 0.0
         self._idle: float | None = None  # lowest load without sessions
         self._cost: float | None = None
-        self._speaking_cost = 0.0  # of a session, when most of them last spoke
+        self._speaking_cost = 0.0  # cost of a session, when most sessions last spoke
         self._placed_s: deque[float] = deque()  # times of recent placements
         self._ended_s: deque[float] = deque()  # times of recent ends
 

@@ -60,7 +60,7 @@ class Registry:
         self._by_endpoint: dict[tuple[str, str], str] = {}  # by name and address
         self._providers: dict[str, dict[str, ServiceRecord]] = {}  # workers by endpoint
         self._num_per_key: Counter[str] = Counter()
-        self._loads: dict[str, WorkerLoad] = {}  # of workers that run or have sessions
+        self._loads: dict[str, WorkerLoad] = {}  # loads of workers that run or have sessions
         self._lost: OrderedDict[str, Peer] = OrderedDict()  # by time
 
     def __len__(self) -> int:

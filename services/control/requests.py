@@ -37,7 +37,7 @@ class Requests:
 
     def __init__(self, bus: Bus, commands: Socket, metrics: Metrics) -> None:
         self.defers = False
-        self.key_versions: dict[str, tuple[int, int]] = {}  # that workers have, by instance
+        self.key_versions: dict[str, tuple[int, int]] = {}  # by instance of the worker
         self._bus = bus
         self._commands = commands
         self._metrics = metrics

@@ -72,7 +72,7 @@ class ControlService(Service):
         self._resting_face = CurrentFace(FaceSettings(), now_s)
         self._takeover = Takeover(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
-        self._keys_version = (0, 0)  # of the list whose revoked keys have no sessions
+        self._keys_version = (0, 0)  # version of the list whose revoked keys have no sessions
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._sleep_s = 0.0  # planned time until the next tick
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)

@@ -29,10 +29,10 @@ class SessionRecord:
     started_s: float  # when its services were last told to start it, or a worker was lost
     workers: dict[str, str]  # instance by endpoint, lost ones included
     endpoints: dict[str, str]  # address by endpoint
-    facts: SessionFacts  # that its workers state
+    facts: SessionFacts  # as stated by its workers
     face: CurrentFace
     waiting_for: set[str]  # instances that have not started it yet
-    deferred: set[str] = field(default_factory=set)  # of these, to be told after the others
+    deferred: set[str] = field(default_factory=set)  # subset of `waiting_for` to be notified last
     lost: set[str] = field(default_factory=set)  # lost workers
     epoch: int = 1
     announced: bool = False  # the client has its endpoints
@@ -43,7 +43,7 @@ class SessionRecord:
     next_sequence: int = 1  # first audio message that a new recognizer would need
     resume_sequence: int | None = None  # first one to resend; None: the recognizer stays
     media_time: int = 0  # its phones are final up to here
-    lateness: Lateness | None = None  # of the session's frames in the last 10 s
+    lateness: Lateness | None = None  # lateness of the session's frames in the last 10 s
     skipped_s: dict[str, float] = field(default_factory=dict)  # by instance
 
     @property

@@ -23,7 +23,7 @@ from kouxing.services.driver.video.recording import Recording
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG, configure
 
-MAX_QUEUED_FRAMES = 180_000  # of one video: an hour at 50 frames per second, 75 MB
+MAX_QUEUED_FRAMES = 180_000  # per video: an hour at 50 frames per second, 75 MB
 MAX_COMMANDS = 500  # commands handled before the next image
 ALIVE_S = 1.0  # between two reports that the process runs
 

@@ -22,14 +22,14 @@ from kouxing.shared.phones.inventory import language_titles
 PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
 PING_S = 20.0  # a browser that has vanished is detected within this time
-MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message, unless it has audio
-CHUNK_BYTES = 32 * 1024  # of a file; a client that does not read occupies two
+MAX_MESSAGE_BYTES = 128 * 1024  # limit for a WebSocket message, unless it has audio
+CHUNK_BYTES = 32 * 1024  # size of a piece of a file; a client that does not read occupies two
 DISCARD_S = 5.0
 LINGER_S = 1.0  # data is still read, and discarded, after an invalid message
-MAX_REASON_BYTES = 123  # of a close frame, RFC 6455
+MAX_REASON_BYTES = 123  # limit for the reason in a close frame, RFC 6455
 MAX_BODY_BYTES = 128 * 1024  # unless a handler reads the body in pieces
 FACE_MESH_FRAME = "face-mesh.html"
-_CLOSE_REASONS: dict[int, str] = {  # of the closes that aiohttp makes
+_CLOSE_REASONS: dict[int, str] = {  # reasons for the closes that aiohttp makes
     WSCloseCode.OK: "the connection has ended",
     WSCloseCode.PROTOCOL_ERROR: "the data is not a valid WebSocket message",
     WSCloseCode.INVALID_TEXT: "a text message is not valid UTF-8",

@@ -9,7 +9,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import parse_json
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
-MAX_OBJECT_BYTES = 128 * 1024  # of a JSON message
+MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
 RATES_HZ = (8000, 48000)
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file

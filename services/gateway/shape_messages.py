@@ -20,7 +20,7 @@ class ShapeEncoder:
     """Encodes frames as weights of one shape set."""
 
     shape_set: str
-    message_format: str  # of FORMATS
+    message_format: str  # one of FORMATS
 
     def names_message(self) -> str:
         """Return the message with the names of the shapes, in the order of binary weights."""

@@ -14,7 +14,7 @@ from kouxing.shared.errors import UserError
 
 UPLOAD_LIMIT_S = 60.0
 PRESENCE_CHECK_S = 0.5  # interval at which a disconnected browser is noticed
-NICENESS = 19  # of the processes, so that live streams do not suffer
+NICENESS = 19  # lowest priority, so that live streams do not suffer
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 

@@ -23,7 +23,7 @@ from kouxing.shared.metrics import trim_heap
 MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # until a request arrives, and until the next one
 BODY_TIMEOUT_S = 70.0  # for the body on unlimited paths; an upload is answered before that
-MAX_HEAD_BYTES = 64 * 1024  # of a request: its first line and its headers
+MAX_HEAD_BYTES = 64 * 1024  # limit for the first line and the headers of a request
 ANSWER_TIMEOUT_S = 120.0  # to send a file; a head has 5 MB
 BACKLOG = 128
 KEEPALIVE_S = 20  # without data, until a client that has vanished is looked for
@@ -34,7 +34,7 @@ _SHUTDOWN_S = 0.5  # after which handlers are canceled
 _RETRY_S = 1.0  # when the system has no free descriptor
 # If a connection ends during the system call sendfile, asyncio logs an error.
 web_fileresponse.NOSENDFILE = True  # type: ignore[misc]
-_HEADERS = {  # of every answer
+_HEADERS = {  # sent with every answer
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
     "Referrer-Policy": "no-referrer",

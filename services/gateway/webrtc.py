@@ -37,7 +37,7 @@ class WebRtcPeer:
     ``on_channel`` is called with each data channel that the client opens.
     """
 
-    rate_hz, num_channels = 48_000, 2  # of decoded Opus, as s16le
+    rate_hz, num_channels = 48_000, 2  # decoded Opus, as s16le
 
     def __init__(self, on_channel: Callable[[RTCDataChannel], None]) -> None:
         # No STUN or TURN servers: this machine's addresses are not reported to any server.
@@ -102,7 +102,7 @@ class WebRtcPeer:
 
     async def close(self) -> None:
         """End the connection."""
-        with contextlib.suppress(Exception):  # of a connection that was never complete
+        with contextlib.suppress(Exception):  # the connection may never have been complete
             await self._connection.close()
 
     def _on_track(self, track: MediaStreamTrack) -> None:

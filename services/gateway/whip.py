@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_CLIENTS = 16
 SDP = "application/sdp"
 MAX_COMMANDS = 100  # queued, for one client
-MAX_BUFFERED_BYTES = 16 * 1024  # of a data channel; more messages stay in the viewer's queue
+MAX_BUFFERED_BYTES = 16 * 1024  # limit for a data channel; more messages stay in the viewer's queue
 BUFFER_CHECK_S = 0.02
 MISSING = (
     "this gateway has no WebRTC; install it where the gateway runs: pip install 'kouxing[webrtc]'\n"
@@ -48,7 +48,7 @@ class _Client:
     peer: WebRtcPeer | None = None
     session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session
-    tasks: set[asyncio.Task[None]] = field(default_factory=set)  # of the data channel
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)  # tasks of the data channel
 
 
 class WhipClients:

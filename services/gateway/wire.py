@@ -58,8 +58,8 @@ class Hello:
 
     pcm_format: PcmFormat
     is_ahead: bool  # audio may arrive faster than real time
-    mouth_profile: bytes  # of the speaker; empty: the average speaker
-    language: str  # of the speech; empty: that of the recognizer
+    mouth_profile: bytes  # the speaker's; empty: the average speaker
+    language: str  # spoken language; empty: the recognizer's
 
 
 def parse_hello(message: str) -> Hello:

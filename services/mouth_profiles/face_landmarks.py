@@ -77,7 +77,7 @@ LANDMARKS = tuple(sorted({*_STEADY, _UNDER_NOSE, *(point for point, _, _ in _FAP
 _QUIET_DB = 30.0  # silent frames are this far below the loud ones
 _LOUD_PERCENTILE = 95.0
 _CLOSED_SHARE = 0.35  # fraction of the frames whose lips count as closed
-_CLOSED_SHARE_SPEAKING = 0.08  # likewise, without silent frames
+_CLOSED_SHARE_SPEAKING = 0.08  # the same share, without silent frames
 _MIN_NEUTRAL = 5  # frames
 
 

@@ -45,7 +45,7 @@ from kouxing.shared.errors import UserError
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # of the ridge, positions
+STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # ridge parameters to try, positions
 FACE_DELAY_S = 0.06  # delay of the face for which the gain is measured
 MIN_SPEECH_S = 10.0
 
@@ -54,7 +54,7 @@ _BLOCK = 250  # adjacent positions that stay in one fold
 _MAX_FOLDS = 5
 _SCALE_SHRINKAGE = 250.0  # weight of a scale of 1, positions
 _HELD_OUT = 0.25  # fraction, at the end
-_LAGS_S = np.arange(-20, 21) / 100  # of a camera
+_LAGS_S = np.arange(-20, 21) / 100  # possible lags of a camera
 _MIN_LAG_CORRELATION = 0.3  # below this a camera's lag is not estimated
 
 
@@ -247,7 +247,7 @@ class LearnedProfile:
 
     content: bytes
     speech_s: float  # speech that it was learned from
-    gain: ProfileGain  # of a profile that was learned from the first three quarters
+    gain: ProfileGain  # gain of a profile that was learned from the first three quarters
 
     def figures(self) -> dict[str, object]:
         """Return the figures that ``kouxing adapt --json`` writes, see ``docs/my_mouth.md``."""

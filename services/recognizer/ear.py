@@ -44,7 +44,7 @@ EAR_PATH = Path(__file__).parent / "models" / "ear.npz"
 FORMAT = "ear 1"
 
 PHONES_LAG_FRAMES = 5
-LIP_DELAYS_S = (0.015, 0.055, 0.155)  # of the lips at the end of the features
+LIP_DELAYS_S = (0.015, 0.055, 0.155)  # delays of the lips at the end of the features
 
 _OUTPUTS = ["features", "phones", "voice", "new_state"]
 _MAX_WIDTH = 4096

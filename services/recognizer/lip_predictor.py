@@ -56,7 +56,7 @@ CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outpu
 NUM_OUTPUTS = len(LIP_FAPS) + 2
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
-_MAX_SIZE = 4096  # of features, components, units
+_MAX_SIZE = 4096  # limit for the numbers of features, components and units
 _COLUMNS, _ONES, _OTHERS = (
     np.array([MOUTH_FAPS.index(fap) for fap in faps])
     for faps in (LIP_FAPS, OTHER_SIDE, OTHER_SIDE.values())

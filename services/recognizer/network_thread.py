@@ -27,7 +27,7 @@ class NetworkThread:
 
     def __init__(self, recognizer: Recognizer, on_decoded: Callable[[], None]) -> None:
         self.work_s = 0.0  # processor time of the batches so far
-        self.batch_s = 0.0  # of the newest batch
+        self.batch_s = 0.0  # duration of the newest batch
         self._recognizer = recognizer
         self._on_decoded = on_decoded
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="network")

@@ -26,7 +26,7 @@ from kouxing.shared.phones.events import (
 )
 from kouxing.shared.phones.final_time import FinalTime
 
-WARM_UP_S = 2.8  # of audio before that time; docs/recognition.md says how this was chosen
+WARM_UP_S = 2.8  # duration of audio before that time; docs/recognition.md explains the choice
 # Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
 # aligned as in a session without a loss.
 GRID_S = 0.16
@@ -40,7 +40,7 @@ class ReplayWindow:
 
     def __init__(self) -> None:
         self.last_droppable_sequence = 0  # newest message that no other recognizer would need
-        self._final = FinalTime()  # of the events that the synthesizer has
+        self._final = FinalTime()  # final time of the events that the synthesizer has
         self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED)  # sequence, end
 
     @property

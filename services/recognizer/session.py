@@ -36,7 +36,7 @@ from kouxing.shared.wire.speech import (
 )
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
-MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
+MAX_LEAD_S = 15.0  # limit for a paced client ahead of the clock; a delayed one may catch up as much
 ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
 STALLED_AFTER_S = 0.2  # without audio of a live client
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer

@@ -29,7 +29,7 @@ _DETECTION_S = 0.06  # the ear's look-ahead, and a position
 # Positions end at odd frames, POSITION_LAG_S before a multiple of 20 ms. Speech starts at one.
 _FIRST_FRAME_PARITY = 1
 _SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip frame needs
-_BLOCK_FRAMES = 4  # of a block of the network; blocks start with the speech
+_BLOCK_FRAMES = 4  # frames in a block of the network; blocks start with the speech
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + _DETECTION_S) / HOP_S)
 _MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_POSITION
 

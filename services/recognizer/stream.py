@@ -54,7 +54,7 @@ class SpeechStream:
     ) -> None:
         self.num_gaps = 0  # so far
         self._needs_light_model = False
-        self._hop = 1  # of the block network, in blocks
+        self._hop = 1  # hop of the block network, in blocks
         self._model = model
         self._rule = rule
         self._rate_hz = sample_rate_hz

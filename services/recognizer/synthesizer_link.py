@@ -27,7 +27,7 @@ class SynthesizerLink:
         self._sender: ReliableSender | None = None
         self._kept: deque[Message] = deque()  # acknowledged messages of the last KEPT samples
         self._speech: Speech | None = None  # the newest one before those
-        self._newest_frame: NewestFrame | None = None  # that the synthesizer has published
+        self._newest_frame: NewestFrame | None = None  # published by the synthesizer
         self._full_since_s: float | None = None
         self._drops = False
 

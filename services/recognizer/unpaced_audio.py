@@ -15,7 +15,7 @@ class UnpacedAudio:
 
     def __init__(self) -> None:
         self._items: deque[tuple[RecognizerSession, Chunk | None]] = deque()
-        self.duration_s = 0.0  # of the queued audio
+        self.duration_s = 0.0  # duration of the queued audio
 
     def __len__(self) -> int:
         return len(self._items)

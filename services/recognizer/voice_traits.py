@@ -39,10 +39,10 @@ NUM_TRAITS = 4  # arousal, valence, laughter, breath
 MIN_VOICE = 0.5  # smallest probability of a voice at which arousal and valence count
 
 _FEELING = slice(0, 2)
-_MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # of the averages of arousal and valence; at the start
-_PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # of voice: weight of the prior mean, memory of m
+_MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # memory of the mean arousal and valence; its prior
+_PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean, memory of m
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
-_EVIDENCE_SHARE = 0.1  # of a new position
+_EVIDENCE_SHARE = 0.1  # weight of a new position
 _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
 
 
@@ -81,7 +81,7 @@ class VoiceTraitsStream:
         self._readout = readout
         self._feeling = self._mean = readout.mean.astype(np.float64)
         self._num_voiced = 0  # positions with a voice
-        self._evidence = np.zeros(NUM_TRAITS - 2)  # of laughter, of breath
+        self._evidence = np.zeros(NUM_TRAITS - 2)  # evidence of laughter and of breath
 
     def accept_position(self, position: EarPosition) -> None:
         """Take the next position of the ear."""

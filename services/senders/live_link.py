@@ -22,7 +22,7 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.face.high_level import fap_table
 
 VERSION = 6
-FRAME_RATE_HZ = 50  # of the time code
+FRAME_RATE_HZ = 50  # rate of the time code
 ORDER = tuple(
     row["shape"] for row in sorted(fap_table("arkit.tsv")[0], key=lambda row: int(row["live_link"]))
 )

@@ -23,7 +23,7 @@ from pythonosc.osc_message_builder import build_msg
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
 from kouxing.services.senders.face_frame import FaceFrame
 
-_MAX_DEPTH = 4  # of bundles in received packets
+_MAX_DEPTH = 4  # nesting of bundles in received packets
 MAX_BYTES = 1500 - 28  # payload of an Ethernet frame without the IP and UDP headers
 _HEADER = b"#bundle\0" + struct.pack(">Q", 1)  # 1: immediately
 

@@ -62,9 +62,9 @@ class PlayoutClock:
     """
 
     def __init__(self) -> None:
-        self._time_s = -math.inf  # of the newest frame
+        self._time_s = -math.inf  # time of the newest frame
         self._window_end_s = -math.inf
-        self._shortest_s = self._previous_shortest_s = math.inf  # of this window and the last one
+        self._shortest_s = self._previous_shortest_s = math.inf  # this window's and the last one's
 
     def earliest_s(self, time_s: float, now_s: float) -> float:
         """Return the earliest time at which a frame that has just arrived could have arrived.

@@ -26,7 +26,7 @@ from kouxing.shared.user_file import parse_json, read_text
 
 _TOKENS = "vtube-studio.json"
 _MAX_TOKENS_BYTES = 1 << 20
-TIMEOUT_S = 5.0  # of a connection attempt, and of sending a frame
+TIMEOUT_S = 5.0  # limit for a connection attempt, and for sending a frame
 
 PLUGIN = {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
 _ACCESS_OFF, _UNAUTHENTICATED, _DENIED, _ASKING, _IN_USE = 1, 8, 50, 51, 454  # error IDs

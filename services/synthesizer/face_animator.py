@@ -52,7 +52,7 @@ _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
 # Frames of a resumed face before it is shown. Older levels all act in the first of them. A brow or
 # head movement that they start must end, and no longer block the next one, before the face is shown
 _REHEARSAL_S = 1.6
-_MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # of mouth FAPs, of other FAPs
+_MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # for mouth FAPs, for other FAPs
 _BIND_S = 0.04  # after this part of a transition, lips close fully for speech
 _VOICE_LEAD_S = 0.06  # feeling and laughter are applied this early, if known
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
@@ -111,11 +111,11 @@ class FaceAnimator:
     def _start_at(self, number: int) -> None:
         """Start at rest with a frame number."""
         self._next_frame = number
-        self._time_s = number / self._frame_rate_hz  # of the last frame
+        self._time_s = number / self._frame_rate_hz  # time of the last frame
         self._known_s = -math.inf  # the sound is known up to here
         self._phones = PhoneNumbers()
         self._is_speaking = False  # at the last frame
-        self._changes: deque[SpeechChange] = deque()  # that concern future frames
+        self._changes: deque[SpeechChange] = deque()  # changes in future frames
         self._levels: list[tuple[float, float]] = []  # since the last frame
         self._pitches: list[tuple[float, float]] = []  # since the last frame
         self._voice: deque[Progress] = deque()  # the current one and later ones

@@ -19,7 +19,7 @@ Float32 = NDArray[np.float32]
 Cue: TypeAlias = tuple[float, str]  # start in seconds, and the mouth
 
 CLOSED, REST = "A", "X"
-SILENCE = "sil"  # of the Oculus visemes
+SILENCE = "sil"  # the Oculus viseme of silence
 _MAX_CLOSED, _MAX_SLIGHTLY_OPEN, _MAX_OPEN = 60.0, 370.0, 500.0  # largest opening of A, B and C
 _ROUNDED = 90.0  # smallest rounding of E and F
 _PUCKERED = 200.0  # largest opening of F

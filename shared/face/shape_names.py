@@ -80,7 +80,7 @@ def _key(name: str) -> str:
 
 def _sided(name: str) -> str:
     """Write the side at the end as a word."""
-    name = re.sub(r"_div\d$", "", name)  # of Daz
+    name = re.sub(r"_div\d$", "", name)  # suffix that Daz appends
     return re.sub(
         r"(?:[._\- ]([LRlr])|(?<=[a-z])([LR]))$",
         lambda match: _SIDES[(match[1] or match[2]).upper()],

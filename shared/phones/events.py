@@ -89,7 +89,7 @@ class EndOfSound:
 class Waveform:
     """A stretch of the session's audio as the recognizer processes it."""
 
-    time_s: float  # of the first sample
+    time_s: float  # time of the first sample
     samples: NDArray[np.float32]  # (n,) 16 kHz mono
 
 

@@ -12,14 +12,14 @@ from kouxing.shared.phones.known_text import Characters, match_syllables
 # phones, index of the character, first phone of the next syllable
 _Source: TypeAlias = tuple[list[Phone], int | None, list[Phone]]
 
-MAX_PHONES = 40  # that may still be revised; older ones are dropped
+MAX_PHONES = 40  # phones that may still be revised; older ones are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Syllable:
     """One syllable, or a pause. As with phones, the same ``index`` again is a revision."""
 
-    index: int  # of its first phone
+    index: int  # index of its first phone
     text: str  # "shi", or the character; the inventory's silence for a pause
     onset_s: float  # seconds from the session's first sample
     duration_s: float  # seconds; 0 withdraws the syllable

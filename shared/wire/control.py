@@ -55,7 +55,7 @@ class SessionInput(Struct, frozen=True, kw_only=True):
     idle_s: Seconds = 0.0  # since its last input
     sequence: Count = 0  # newest audio message that a recognizer in its place would not need
     media_time: Samples = 0  # the session's phones are final up to here
-    lateness: Lateness | None = None  # of a synthesizer's frames; None: no live frames
+    lateness: Lateness | None = None  # lateness of a synthesizer's frames; None: no live frames
     skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service
 
 
@@ -67,7 +67,7 @@ class Heartbeat(Message, frozen=True, kw_only=True):
     role: Role  # a worker is placed in sessions, an observer takes part in all of them
     state: ServiceStatus
     sent_ns: int  # the sender's clock, which may be wrong
-    endpoints: EndpointMap = field(default_factory=dict)  # that it provides, by name
+    endpoints: EndpointMap = field(default_factory=dict)  # endpoints that it provides, by name
     needs: Annotated[list[Name], Meta(max_length=16)] = field(
         default_factory=list
     )  # names of the endpoints that it connects to
@@ -80,7 +80,7 @@ class Heartbeat(Message, frozen=True, kw_only=True):
     metrics: MetricMap = field(default_factory=dict)
     sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
         default_factory=dict
-    )  # that it takes part in
+    )  # sessions that it takes part in
 
 
 class AllowedKey(Struct, frozen=True, kw_only=True):
@@ -98,7 +98,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True):
     replied_ns: int  # control's clock
     control: Name  # generated when control starts; when it changes, control has restarted
     keys: Annotated[dict[Name, AllowedKey], Meta(max_length=MAX_KEYS)] | None = (
-        None  # that may connect to the worker's sockets, by public key; None: as before
+        None  # keys that may connect to the worker, by public key; None: as before
     )
 
 
@@ -116,13 +116,13 @@ class StartSession(Message, frozen=True, kw_only=True):
     record: bool
     paced: bool
     facts: SessionFacts
-    endpoints: EndpointMap  # of the session's workers: audio, phones, phone_input, faps, ...
+    endpoints: EndpointMap  # the session's workers: audio, phones, phone_input, faps, ...
     face: FaceSettings = field(default_factory=FaceSettings)
     mouth_profile: MouthProfile | None = None
     speech_time: Samples | None = None  # start of the speech in progress; None: silence, or unknown
     client: Annotated[bytes, Meta(max_length=255)] = b""  # its routing id at control
     client_key: Name | None = None  # its public key; None: the system is insecure
-    client_request: Name | None = None  # of its open-session
+    client_request: Name | None = None  # request of the client's open-session
 
 
 class SessionStarted(Message, frozen=True, kw_only=True):
@@ -131,7 +131,7 @@ class SessionStarted(Message, frozen=True, kw_only=True):
     The session's phones are final up to ``media_time``; 0 if the service has no phones.
     """
 
-    request: Name  # of the start-session
+    request: Name  # request of the start-session
     start: StartSession | None = None  # for a restarted control, which does not have the session
 
 

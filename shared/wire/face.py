@@ -37,7 +37,7 @@ class FaceSettings(Struct, frozen=True, kw_only=True):
     expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (
         None  # scales the mouth's motion; 1: as the lip model moves it
     )
-    feeling: Strength | None = None  # of the voice's feeling on the face; 0: off
+    feeling: Strength | None = None  # strength of the voice's feeling on the face; 0: off
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer
     listen_to: SessionName | None = None  # session that the face listens to; "": none

@@ -54,10 +54,10 @@ class ErrorCode(StrEnum):
 class SessionFacts(Struct, frozen=True, kw_only=True):
     """Facts about a session's results; each of its workers states some facts."""
 
-    language: Name | None = None  # of the phones
-    frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # of the FAP frames
+    language: Name | None = None  # language of the phones
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # FAP frames per second
     delay_ms: Annotated[float, Meta(ge=0, le=1000)] | None = None  # from audio to its FAP frame
-    lip_model: Name | None = None  # of a face without a chosen one
+    lip_model: Name | None = None  # used unless the face settings name one
 
 
 class Lateness(Struct, frozen=True, kw_only=True):
@@ -77,8 +77,8 @@ class OpenSession(Message, frozen=True, kw_only=True):
     num_channels: NumChannels = 1
     record: bool = False  # the driver writes a video named after the session
     paced: bool = True  # audio arrives in real time; false: as fast as the services accept it
-    mouth_profile: MouthProfile | None = None  # of the speaker, for a lip model that uses the audio
-    language: Name | None = None  # of the speech: "auto", a code or a name; None: the recognizer's
+    mouth_profile: MouthProfile | None = None  # the speaker's, for a lip model that uses the audio
+    language: Name | None = None  # spoken: "auto", a code or a name; None: the recognizer's
     face: FaceSettings = field(default_factory=FaceSettings)
 
 
@@ -154,7 +154,7 @@ class SessionState(Struct, frozen=True, kw_only=True):
     state: SessionStatus
     age_s: float
     speaking: bool
-    endpoints: EndpointMap  # of the session's workers: audio, phones, faps, ...
+    endpoints: EndpointMap  # the session's workers: audio, phones, faps, ...
     workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
     facts: SessionFacts
     lateness: Lateness | None = None  # None: not live, or no frames in the last 10 s

@@ -74,8 +74,8 @@ class LipPositions(Message, frozen=True, kw_only=True):
 
     values: LipValues  # float32, little-endian, FAP units, in the order of MOUTH_FAPS
     delay: LipDelay  # how much audio after media_time the model has used; below 0: it predicts
-    closure: Probability  # that the lips touch
-    lip_to_teeth: Probability  # that the lower lip touches the teeth
+    closure: Probability  # probability that the lips touch
+    lip_to_teeth: Probability  # probability that the lower lip touches the teeth
 
 
 class NewestFrame(Struct, frozen=True, kw_only=True):
@@ -93,7 +93,7 @@ class Progress(Message, frozen=True, kw_only=True):
     level_db: Annotated[float, Meta(ge=-200, le=20)] = -200.0  # RMS of the newest 20 ms, dBFS
     zero_crossing_rate: Probability = 0.0  # sign changes per sample in the newest 20 ms
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
-    arousal: Feeling = 0.0  # of the voice, relative to the speaker's mean
+    arousal: Feeling = 0.0  # arousal in the voice, relative to the speaker's mean
     valence: Feeling = 0.0  # likewise; below 0: unpleasant
     is_laughter: bool = False  # someone laughs, which is not speech
     is_breath: bool = False  # audible breath
@@ -116,4 +116,4 @@ class Acknowledge(Message, frozen=True, kw_only=True):
     Sent by the recognizer to the client, and by the synthesizer to the recognizer.
     """
 
-    newest_frame: NewestFrame | None = None  # of a synthesizer; None: no frame yet
+    newest_frame: NewestFrame | None = None  # a synthesizer's newest frame; None: no frame yet

@@ -106,7 +106,7 @@ def assert_equal(ours: Frames, theirs: Frames) -> None:
     """Rounding to 8 bits amplifies differences in the last digit, so a few frames may differ."""
     assert ours.shape == theirs.shape
     difference = np.abs(ours - theirs)
-    difference[:, HEAD_TURN] /= 100  # of 1e-5 radians; a hundredth of a degree is not visible
+    difference[:, HEAD_TURN] /= 100  # in 1e-5 radians; a hundredth of a degree is not visible
     assert difference.mean() < 0.3
     assert np.percentile(difference.max(axis=1), 90) < 3
     assert np.corrcoef(opening(ours), opening(theirs))[0, 1] > 0.999

@@ -21,8 +21,8 @@ class Path:
     score: float
     ended: tuple[Segment, ...]
     phone: int
-    state: int  # of the phone
-    start: int  # of the phone
+    state: int  # state of the phone
+    start: int  # start frame of the phone
 
 
 def brute_force(

@@ -16,7 +16,7 @@ from tests.lips import viseme_faps
 
 VISEMES = "a i u o e v f b".split()
 SIZE_PX = (640, 480)
-MIN_PIXELS = 300  # that differ between two mouths,
+MIN_PIXELS = 300  # pixels that differ between two mouths,
 MIN_CHANGE = 0.13  # each by this share of the region's mean brightness
 
 

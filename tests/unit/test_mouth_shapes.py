@@ -19,7 +19,7 @@ from tests.system import VOWELS_FILE
 
 REST, OPEN, WIDE = np.zeros((3, NUM_FAPS), np.float32)
 OPEN[4], WIDE[4] = -400.0, -600.0  # the lower lip
-HI = [(0.0, "X"), (0.05, "D"), (0.27, "C"), (0.31, "B"), (0.43, "X")]  # of Rhubarb's README
+HI = [(0.0, "X"), (0.05, "D"), (0.27, "C"), (0.31, "B"), (0.43, "X")]  # example in Rhubarb's README
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from tests.receivers import SENT, received
 
 Values = NDArray[np.float32]
 PHONE_S, FRAME_RATE_HZ = 0.2, 50
-VISIBLE = 0.1  # of a whole shape
+VISIBLE = 0.1  # share of a whole shape
 LIPS = ("2.2", "2.3", "2.4", "2.5", "2.6", "2.7", "2.8", "2.9", *(f"8.{k}" for k in range(1, 9)))
 
 # The columns of the table: the values, 0 to 1, that a receiver gets for FAPs (68,).

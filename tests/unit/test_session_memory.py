@@ -19,8 +19,8 @@ pytestmark = pytest.mark.slow
 
 NUM_SESSIONS = 4
 CHUNK = 320  # samples: 20 ms
-MAX_MB = 4.0  # of a session
-MAX_GROWTH_MB = 0.2  # of a session, from one round to the next
+MAX_MB = 4.0  # limit for a session
+MAX_GROWTH_MB = 0.2  # limit for a session, from one round to the next
 
 
 class Sessions:

@@ -39,12 +39,12 @@ _BEYOND = 25  # further positions that only the teacher sees
 # lengths of a block and its right context, positions: live, then offline
 _BLOCKS = ((2, 14), (3, 12), (4, 12), (5, 10), (10, 10), (20, 10), (40, 10))
 _BLOCK_PROBS = (0.25, 0.1, 0.1, 0.15, 0.1, 0.2, 0.1)
-_FROM_START_PROB = 0.5  # of a recording
+_FROM_START_PROB = 0.5  # probability that an excerpt begins with the recording
 _FIRST_ROW_PROB, _MAX_START = 0.7, 1200  # row of the table of positions
 _MAX_SPEED = 1.2
 _DISTURB_PROB, _TEMPO_PROB, _HURRY_PROB = 0.9, 0.3, 0.4
 _MIN_LOG_TEMPO, _MAX_LOG_TEMPO = -0.2, 0.3
-_MAX_SHORTENING = 0.8  # of a frame that resembles its neighbors
+_MAX_SHORTENING = 0.8  # limit for shortening a frame that resembles its neighbors
 _MEAN_STEADINESS = 0.6
 _STEADY_FRAMES = 5  # steadiness is averaged over them
 _TEACHER_PEAK = 0.5

@@ -64,7 +64,7 @@ _GRU_WEIGHTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 class Layout:
     """The positions that are computed for a recording, and their attention mask."""
 
-    num_positions: int  # of the recording
+    num_positions: int  # number of positions in the recording
     places: Tensor  # (n,) in the recording: all positions, then each block's right context
     may_attend: Tensor  # (n, n)
     blocks: Tensor  # (blocks, B + R), the positions of a block and its right context, of n
@@ -97,7 +97,7 @@ def layout(
     blocks[~exists] = 0
     positions = torch.arange(num_positions)
     block_of = torch.cat([positions // block_length, copied.nonzero()[:, 0]])
-    begin = begins[block_of][:, None]  # of the block of the one that attends
+    begin = begins[block_of][:, None]  # start of the attending position's block
     may_attend = block_of == block_of[:, None]
     may_attend[:, :num_positions] |= (positions < begin) & (positions >= begin - PAST)
     of_block = exists & ~copied

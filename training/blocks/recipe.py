@@ -53,7 +53,7 @@ _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY = 2.0  # most of the network's errors are deletions
 _MIX = Mix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
 _SUNG_SHARE, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
-_MAX_SUNG_FRAMES = 800  # of a recording, that are sung
+_MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
 _FRAMES_PER_POSITION = 2
 
 

@@ -40,14 +40,14 @@ from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.networks.optimizer import cross_entropy, optimize
 from kouxing.training.networks.teacher import WholeEncoder
 
-_RATE, _READOUT_RATE = 1.5e-4, 1.5e-3  # of the last layer, of the readout
+_RATE, _READOUT_RATE = 1.5e-4, 1.5e-3  # learning rates of the last layer and of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above
 _READOUT_STEPS = 150
 _WARM_UP_STEPS = 60
 _FALLING = 0.6  # fraction of the steps, at the end, over which the rates fall to 0
 _NUM_STANDARDIZED = 4  # batches that mean and deviation of the features are computed from
 _JOINED = BATCHES_PER_STEP if DEVICE.type == "cuda" else 1  # batches that are computed together
-_HIDDEN_WEIGHT, _RIGHT_WEIGHT = 0.5, 0.5  # of a loss
+_HIDDEN_WEIGHT, _RIGHT_WEIGHT = 0.5, 0.5  # weights of the losses
 
 
 class BlockNetwork(nn.Module):

@@ -32,19 +32,19 @@ Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
 
-NUM_POSITIONS = 250  # of an excerpt, 5 s
+NUM_POSITIONS = 250  # length of an excerpt, 5 s
 NUM_EXCERPTS = 28
 BATCH_S = NUM_EXCERPTS * NUM_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
 _MAX_SPEED = 1.3
 _MAX_PIECE = 400  # positions of one recording in an excerpt
 _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
 _LEVEL_DB = 5.0  # deviation of the levels of recordings in an excerpt
-_MIDDLE = 0.875  # of a position's frames, positions after its first sample
+_MIDDLE = 0.875  # middle of a position's frames, positions after its first sample
 _KNOWN = 2.25  # end of the audio that the network has received, likewise
 _CLEAN_PROB, _ONLY_BACKGROUND_PROB, _BACKGROUND_PROB = 0.15, 0.08, 0.65
-_VOICES_PROB, _MAX_VOICES = 0.35, 6  # of a background with other speakers
+_VOICES_PROB, _MAX_VOICES = 0.35, 6  # for a background with other speakers
 _MIN_SNR_DB, _MAX_SNR_DB = 0.0, 25.0
-_MIN_PITCH, _MAX_PITCH = 0.75, 1.33  # of music and noise
+_MIN_PITCH, _MAX_PITCH = 0.75, 1.33  # for music and noise
 _TINY = 1e-9
 
 

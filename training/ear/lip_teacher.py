@@ -53,7 +53,7 @@ _NUM_COMPONENTS = 128
 _MAX_DEVIATIONS = 6.0
 _MIN_DEVIATION = 1e-3
 _STRIDE = 2  # every second position is used for the principal components
-_PART_SAMPLES, _MIN_SAMPLES = 320_000, 8000  # of a recording
+_PART_SAMPLES, _MIN_SAMPLES = 320_000, 8000  # limits for a recording
 _NUM_NETWORKS = 4
 _PARTS = ("mean", "deviation", "directions")
 

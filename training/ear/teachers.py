@@ -42,8 +42,8 @@ from kouxing.training.networks.whisper import init_encoder
 Floats = NDArray[np.float32]
 
 POSITION_SAMPLES = 320
-_ENCODER_LAYERS = (1, 3, 5)  # of Whisper's encoder, the first is 0
-_BLOCK_POSITIONS = 50  # of the block network; longer blocks than live cost less
+_ENCODER_LAYERS = (1, 3, 5)  # layers of Whisper's encoder, counted from 0
+_BLOCK_POSITIONS = 50  # for the block network; longer blocks than live cost less
 _LOW_BANDS, _HIGH_BANDS = slice(1, 27), slice(27, 69)  # below 1 kHz, and 1 to 5 kHz
 _LOUD_PERCENTILE = 95
 _TINY_POWER = 1e-7

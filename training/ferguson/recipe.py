@@ -133,10 +133,10 @@ def _means(
     return means
 
 
-_FULL_PERCENTILE = 98.0  # of a speaker's opening, where R is 5
+_FULL_PERCENTILE = 98.0  # percentile of a speaker's opening, where R is 5
 _OPENING_RIDGE = 10.0  # weight of the value from a phone's visemes, video frames
 _CLOSED = (REST, "b")  # visemes whose lips touch
-_DEFAULT_OPENING = 2.0  # of a viseme without data
+_DEFAULT_OPENING = 2.0  # opening of a viseme without data
 
 
 def relative_openings(clips: Sequence[LipClip]) -> list[Array]:

@@ -30,7 +30,7 @@ from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.training_set import Example, load_examples
 
 _STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
-_HALF_WIDTH = 2  # of the differences, frames
+_HALF_WIDTH = 2  # half width of the differences, frames
 _FLAT_START_STEP = 4  # the flat start uses every fourth copy
 _FLAT_START_ITERATIONS = 4
 _DECORRELATED_AT = 8  # mixtures per state when the features are decorrelated

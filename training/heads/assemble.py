@@ -55,7 +55,7 @@ _HAIR_TEXTURES = {"afro01": "afro"}
 _FRINGES = {"bob01": 0.73, "bob02": 0.73, "short03": 0.69}
 _COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
 _SWEEP = 0.62  # share of the angle to the right ear by which it is turned
-_BROW_RAISE = 0.006  # of their inner ends, dm
+_BROW_RAISE = 0.006  # how far the inner ends rise, dm
 _HAIR_HEIGHT = 0.45  # above the scalp, dm
 _LASH_COLOR = (0.09, 0.07, 0.065)
 

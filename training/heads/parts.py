@@ -76,7 +76,7 @@ def pupil_growth(part: Geometry, center: Float) -> Float:
 
 
 _FIRST_UPPER_TOOTH = 15060  # vertex of the base mesh; the lower teeth come before
-_TEETH_DEPTH = 0.29  # of the rows; the molars behind are never seen
+_TEETH_DEPTH = 0.29  # depth of the rows; the molars behind are never seen
 TRANSPARENT = ("brows", "lashes", "hair")
 
 

@@ -91,7 +91,7 @@ def tint(color: Color) -> Float:
     return np.asarray(np.minimum((np.array(color) / GRAY) ** 2, 1.0))
 
 
-_EYE_CENTER = (302, 727)  # of an eye in MakeHuman's texture, row and column
+_EYE_CENTER = (302, 727)  # center of an eye in MakeHuman's texture, row and column
 _EYE_IRIS, _EYE_WHITE = 118.0, 250.0  # radii in that texture
 
 

@@ -36,14 +36,14 @@ LIP_RING = (
     7206, 7266, 7265, 7264, 523, 517, 518, 519, 446, 445, 3708, 435, 434, 3731, 436, 420, 421, 516,
     5360, 515, 514, 522, 521,
 )  # fmt: skip
-_HINGE_Z = 0.35  # of the jaw's axis, dm
+_HINGE_Z = 0.35  # position of the jaw's axis, dm
 
 
 @dataclass(slots=True)
 class Skin:
     """A subdivided surface; a coarse vertex keeps its number in the fine one."""
 
-    number: Index  # of a base mesh vertex on the surface, or -1
+    number: Index  # number of a base mesh vertex on the surface, or -1
     coarse_quads: Index
     quads: Index
     matrix: sparse.csr_array  # coarse vertices -> fine vertices

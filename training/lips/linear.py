@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 _RIDGE, _CLOSURE_RIDGE = 0.1, 0.01
 _MIN_DEVIATION = 1e-2
-_MIN_POSITIONS = 20  # of a speaker
+_MIN_POSITIONS = 20  # minimum for a speaker
 _MAX_ITERATIONS = 40
 _NUM_FAPS = len(LIP_FAPS)
 

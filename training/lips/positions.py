@@ -34,7 +34,7 @@ class Speech:
     clip: LipClip
     features: NDArray[np.float16]  # (positions, features), inputs of the lip model
     known_s: Array  # (positions,) media time up to which the audio is known
-    speed: float  # of the copy; above 1 is faster than the clip
+    speed: float  # speed of the copy; above 1 is faster than the clip
 
 
 def speech_of(clips: Iterable[LipClip], copy: int = 0) -> Iterator[list[Speech]]:

@@ -56,7 +56,7 @@ COMPONENTS = ((160, 32, 0.5, 0.5), (128, 96, 1.0, 0.2), (128, 96, 1.0, 0.2), (51
 # without clips in training.
 _EAR_SHARE, _LINEAR_SHARE, _NETWORK_SHARE = 0.5, 0.3, 0.2
 _LINEAR_CLOSURE = 0.85  # share of a closure's log odds; the rest is the network's
-_MAX_REPEATS = 6  # of the clips of a small source
+_MAX_REPEATS = 6  # limit for the clips of a small source
 _NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
 _CLOSURE_BIAS = (0.055, 0.155), (0.1, 0.7)  # by delay, added to the log odds of a closure

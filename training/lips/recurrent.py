@@ -26,8 +26,8 @@ _PIECE = 200  # positions
 _MIN_PIECE = 10
 _BATCH = 32  # pieces
 _RATE, _WEIGHT_DECAY = 2e-3, 1e-2
-_PROBABILITY_WEIGHT = 0.3  # of closure and lip to teeth in the loss
-_UNITS_WEIGHT = 0.01  # of a speaker's squared scale (log) and offset
+_PROBABILITY_WEIGHT = 0.3  # weight of closure and lip to teeth in the loss
+_UNITS_WEIGHT = 0.01  # weight of a speaker's squared scale (log) and offset
 _MAX_GRADIENT = 1.0
 _NUM_FAPS = len(LIP_FAPS)
 

@@ -44,7 +44,7 @@ _TINY = 1e-9
 # Probabilities of the changes.
 _SPEED_PROB, _ROOM_PROB, _NOISE_PROB, _COLOR_PROB = 0.75, 0.35, 0.6, 0.5
 _TELEPHONE_PROB, _CODEC_PROB = 0.14, 0.2
-_FLUTTER_PROB, _KNOCKS_PROB = 0.35, 0.15  # of a noise
+_FLUTTER_PROB, _KNOCKS_PROB = 0.35, 0.15  # probabilities of a change to a noise
 
 _SPEED_STEPS, _MIN_STEPS, _MAX_STEPS = 20, 17, 24  # new lengths are 17/20 to 24/20
 _MIN_T60_S, _MAX_T60_S, _MAX_ROOM_S = 0.1, 0.7, 0.5

@@ -49,7 +49,7 @@ class Recording:
     """A recording with its targets."""
 
     samples: NDArray[np.int16]  # (n,) 16 kHz
-    targets: Targets  # of its frames
+    targets: Targets  # targets of its frames
     weight: float  # relative to the others', how often it is sampled
 
 

@@ -38,7 +38,7 @@ from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_untra
 STATES_PER_PHONE = 3
 _MIN_STAY, _MAX_STAY = 0.05, 0.98
 _LM_SCALE = 2.0  # chosen on development data
-_PRIOR_SCALE = 0.5  # of the states' log priors; chosen on development data
+_PRIOR_SCALE = 0.5  # scale of the states' log priors; chosen on development data
 _TEACHER_SET = 2000  # recordings of each kind that the teacher is trained on
 _FULL_FOLDER_MINUTES = 45  # longer folders get the weight of this much speech
 

@@ -33,7 +33,7 @@ from torch.nn.functional import gelu, log_softmax, scaled_dot_product_attention
 from kouxing.services.recognizer.acoustic.network import position_table
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
-PADDING_FRAMES = 2  # of zeros, before a segment's first
+PADDING_FRAMES = 2  # zeros before a segment's first frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +120,7 @@ class ReadoutShape:
     noise: float  # added to each feature in training, deviations
     constant_noise: float = 0.0  # upper limit of noise that is constant in a recording
     feature_dropout: float = 0.0  # fraction of the features that are 0 in a whole recording
-    num_masks: int = 0  # of positions; each is used with a probability of 1/2
+    num_masks: int = 0  # masked ranges of positions; each is used with a probability of 1/2
 
 
 class Readout(nn.Module):

@@ -21,13 +21,13 @@ from torch import nn
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
-DOMAIN = "com.microsoft"  # of onnxruntime's own operators
+DOMAIN = "com.microsoft"  # domain of onnxruntime's own operators
 _OPERATORS = 20  # version of the ONNX operator set
 _FORMAT = 9  # version of the ONNX file format
 _MAX_INTEGER = 127
 _ZERO_POINT = 128  # the integer for an input of 0
 _MIN_SCALE = 1e-12
-_EPSILON = 1e-5  # of the norms, as PyTorch's
+_EPSILON = 1e-5  # epsilon of the norms, as in PyTorch
 
 Floats = NDArray[np.float32]
 

@@ -50,7 +50,7 @@ from kouxing.training.networks.batches import (
 from kouxing.training.networks.network import Encoder, Readout, ReadoutShape, Shape
 from kouxing.training.networks.optimizer import cross_entropy, optimize
 
-NUM_LAYERS = 6  # of Whisper base's encoder
+NUM_LAYERS = 6  # layers of Whisper base's encoder
 _NUM_STEPS = 600  # batches of up to 70 s of sound
 KEPT_LAYERS = (-3, -2, -1)  # indices of the layers that are read
 _PIECE_FRAMES = 2960  # with the padding, less than 30 s

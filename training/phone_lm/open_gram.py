@@ -24,7 +24,7 @@ from kouxing.shared.user_file import open_file, read_file
 from kouxing.training.phone_lm.recipe import Stream, phones_of_text
 
 _MAX_BYTES = 4 << 30
-_BASE = 100_000  # of the n-grams' codes, greater than the number of words
+_BASE = 100_000  # base of the n-grams' codes, greater than the number of words
 _NUM_CHAINS = 100_000  # drawn in parallel
 _CONTEXT_WORDS = 2
 _NUM_LEVELS = 4  # n-grams of 0 to 3 words

@@ -25,7 +25,7 @@ from kouxing.training.networks.onnx_graph import halves
 
 BLOCK_LENGTH, RIGHT_CONTEXT, PAST = 10, 14, 120  # positions
 LENGTH = BLOCK_LENGTH + RIGHT_CONTEXT
-MAX_FRAMES = 2980  # of a recording: the table of positions ends after 30 s
+MAX_FRAMES = 2980  # limit for a recording: the table of positions ends after 30 s
 
 
 class FeatureEncoder:

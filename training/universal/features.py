@@ -28,9 +28,9 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, MAX_FRAMES, FeatureEncoder
 
-LAYERS = (-2, -1)  # of the block network, the last ones
+LAYERS = (-2, -1)  # the last layers of the block network
 WIDTH = 512 * len(LAYERS)
-STEP = MAX_DEVIATIONS / 127  # of the integers, deviations
+STEP = MAX_DEVIATIONS / 127  # step of the integers, deviations
 _BATCH = 8  # recordings that are encoded together
 _SHARD = 400  # recordings in a file
 _NUM_STANDARDIZED = 240  # recordings for mean and deviation
@@ -40,7 +40,7 @@ _NUM_STANDARDIZED = 240  # recordings for mean and deviation
 class Features:
     """The features of a recording."""
 
-    name: str  # of the recording
+    name: str  # name of the recording
     num_frames: int
     rows: NDArray[np.int8]  # (blocks, B + R, 1024)
 

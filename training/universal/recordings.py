@@ -22,9 +22,9 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, load_inventory
 from kouxing.training.training_set import MAX_WORD_PHONES
 
-_MANDARIN_LIMITS = {"sentence": 560, "word": 350, "synthetic": 450}  # of a corpus
+_MANDARIN_LIMITS = {"sentence": 560, "word": 350, "synthetic": 450}  # limits for a corpus
 _MAX_OF_SPEAKER = 13  # recordings of a speaker of English by native speakers of Mandarin
-_LEARNERS_LICENSE = "CC BY 4.0"  # of speechocean762, whose manifest has no licenses
+_LEARNERS_LICENSE = "CC BY 4.0"  # license of speechocean762, whose manifest has no licenses
 _MAX_S = 25.0
 _HELD_OUT_LANGUAGES = ("it", "ko")
 _HELD_OUT_SPEAKERS = frozenset(

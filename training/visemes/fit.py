@@ -128,7 +128,7 @@ _ALPHA_RANGE, _THETA_RANGE, _OFFSET_RANGE = 4.0, 2.0, 2.0
 _MAX_GAIN = 2.0
 _EXPONENTS = (1.3, 1.5, 1.8)  # lower ones give visible corners at the apexes
 _ROUNDS = 2
-_SILENCE_STEP = 1e-4  # of the finite differences, in spreads
+_SILENCE_STEP = 1e-4  # step of the finite differences, in spreads
 _UNKNOWNS = ("alpha", "theta_minus", "theta_plus", "offset_s", "target")
 _SILENCE_UNKNOWNS = ("theta_left", "theta_right", "offset_left_s", "offset_right_s")
 

@@ -6,10 +6,10 @@ import { clamp, smoothingShare } from "./math.js";
 /** The current expressions of the face. */
 export class Expressions {
   #c; // constants
-  #faps; // of each expression at full strength
+  #faps; // FAPs of each expression at full strength
   #numFaps;
   #goal;
-  #halfway; // of the two-pole filter
+  #halfway; // value between the two poles of the filter
   #shown;
   #isShown = false;
   #remainingS = 0;

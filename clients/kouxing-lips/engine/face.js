@@ -18,7 +18,7 @@ export class Face {
   #voice = []; // the current progress and later ones
   #nextFrame = 0;
   #isSpeaking = false; // at the last frame
-  #changes = []; // of future frames
+  #changes = []; // changes in future frames
 
   constructor(model, { delayS, expressiveness, feeling }) {
     this.#model = model;

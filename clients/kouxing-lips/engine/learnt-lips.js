@@ -23,7 +23,7 @@ export class LearntLips {
   #transitionStartS = 0;
   #resting;
   #lateS = 0;
-  #timeS = 0; // of the last frame
+  #timeS = 0; // time of the last frame
   #mouth;
 
   constructor(model, delayS) {

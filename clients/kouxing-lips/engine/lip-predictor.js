@@ -11,7 +11,7 @@ export class LipPredictor {
   #state;
   #entry; // product of the matrices of x and u: nothing is between them
   #outputs; // weights at the used delay: an array for each output, and a bias
-  #buffers; // of a step
+  #buffers; // buffers of a step
 
   /** @param delayS delay of the face; the longest delay of the model that fits is used */
   constructor({ arrays, constants, mouthFaps }, delayS) {

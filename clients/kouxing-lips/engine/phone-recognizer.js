@@ -19,7 +19,7 @@ export class PhoneRecognizer {
   #lastRow = null;
   #startFrame = 0;
   #done = 0; // frame of the speech up to which phones are final
-  #confidence = []; // of the frames from `done` on
+  #confidence = []; // confidence of the frames from `done` on
   #numFinal = 0;
   #lastFinal;
   #open = []; // emitted, not yet final

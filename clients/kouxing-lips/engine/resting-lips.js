@@ -5,8 +5,8 @@ import { Transition } from "./trajectory.js";
 /** The share of the ajar mouth in one session. */
 export class RestingLips {
   #c; // constants
-  #levels = []; // of future frames: [time s, dB]
-  #changes = []; // of future frames
+  #levels = []; // levels of future frames: [time s, dB]
+  #changes = []; // changes in future frames
   #isVoice = false;
   #hasEnded = false;
   #loudestDb = -Infinity;

@@ -21,8 +21,8 @@ export class ShapeSet {
   #gram;
   #right;
   #scratch; // a matrix
-  #atOne; // which weights were 1 in the last solution, the first guess of the next
-  #free; // which were between 0 and 1
+  #atOne; // weights that were 1 in the last solution, the first guess for the next
+  #free; // weights between 0 and 1 in the last solution
   #finish;
   #c; // constants
 

@@ -32,12 +32,12 @@ export class SpeechSegmenter {
   #model;
   #mel;
   #lips;
-  #state; // of the ear
+  #state; // state of the ear
   #detector;
   #traits;
   #phones; // a PhoneRecognizer, or null
-  #frames = []; // of the next position
-  #recent = []; // of the positions before speech: { features, row: log posteriors of the phones }
+  #frames = []; // frames of the next position
+  #recent = []; // positions before speech: { features, row: log posteriors of the phones }
   #numFrames = 0;
   #isSpeaking = false;
 

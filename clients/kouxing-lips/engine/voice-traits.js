@@ -12,7 +12,7 @@ export class VoiceTraits {
   #feeling; // arousal and valence
   #mean;
   #numVoiced = 0;
-  #evidence = [0, 0]; // of laughter, of breath
+  #evidence = [0, 0]; // evidence of laughter and of breath
 
   constructor({ arrays, constants, voices }) {
     this.#c = constants.traits;

@@ -34,7 +34,7 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
         view = memoryview(audio)
     except TypeError:
         return _pack(array("d", audio), encoding)
-    flat = memoryview(view.tobytes())  # of any number of dimensions
+    flat = memoryview(view.tobytes())  # a view with any number of dimensions is flattened
     if view.format in ("B", "b", "c"):
         return flat.tobytes()
     return _pack(flat.cast(view.format), encoding)  # type: ignore[call-overload]
@@ -70,7 +70,7 @@ class AudioStream:
         self.acknowledged = 0  # number of the newest message that the recognizer has
         self.round_trip_ms: int | None = None  # twice the shortest time to an acknowledgement
         self._sample_rate_hz = sample_rate_hz
-        self._num_frames = 0  # of all chunks
+        self._num_frames = 0  # in all chunks
         self._kept: deque[Fields] = deque(maxlen=MAX_KEPT)
         self._next = 1  # number of the next message for the socket
         self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED)  # sequence and time

@@ -104,7 +104,7 @@ class Follower:
         self._stays = False  # one of the addresses was also among those before
         self._confirmed: set[str] = set()  # publishers
         self._first_epoch = 0
-        self._epochs: dict[str, int] = {}  # of the newest message, by publisher
+        self._epochs: dict[str, int] = {}  # publisher: epoch of its newest message
         self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
         self._newest_before: dict[str, _Number] = {}  # when it subscribed again
         self._seen: set[tuple[str, _Number]] = set()  # since then

@@ -19,7 +19,7 @@ class PhoneTrack:
 
     def __init__(self) -> None:
         self.num_missed = 0
-        self._epoch = 0  # of the newest phone
+        self._epoch = 0  # epoch of the newest phone
         self._base = 0  # added to the recognizer's indices
         self._next = 0  # after the greatest index
         self._open: dict[int, Phone] = {}  # phones that are not final, by index

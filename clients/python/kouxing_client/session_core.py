@@ -209,7 +209,7 @@ class SessionCore:
         if options is not None:
             self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_live)
         self.signal = signal
-        self.errors: deque[Refused] = deque()  # of audio
+        self.errors: deque[Refused] = deque()  # errors about the audio
         self.failure: KouxingError | None = None  # why the session is over; None: it was closed
         self.is_over = False
         self.is_blocked = False  # the audio socket takes no more

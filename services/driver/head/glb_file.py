@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import check_content, parse_json, read_file
 
-MAX_BYTES = 512 << 20  # of all files, unpacked
+MAX_BYTES = 512 << 20  # limit for all files together, unpacked
 MAX_COUNT = 2_000_000  # elements of an accessor
 MAX_NODES = 20_000
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

@@ -69,7 +69,7 @@ class Head:
     parts: tuple[HeadPart, ...]  # skin, garment, eyes, teeth, tongue, hair, lashes
     vertices: Float32  # (V, 3), neutral face, m
     triangles: NDArray[np.uint32]  # (F, 3), counter-clockwise from outside
-    coarse_triangles: tuple[NDArray[np.uint32], ...]  # of each part in the coarse head, (C, 3)
+    coarse_triangles: tuple[NDArray[np.uint32], ...]  # per part of the coarse head, (C, 3)
     uv: Float32  # (V, 2), v downwards
     colors: Float32  # (V, 3), linear factors on the texture: ambient occlusion and tint
     head_weight: Float32  # (V,), share of the head rotation, 0 on the shoulders

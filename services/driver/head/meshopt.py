@@ -14,7 +14,7 @@ Bytes = NDArray[np.uint8]
 
 _HEADERS = {"ATTRIBUTES": 0xA0, "TRIANGLES": 0xE1, "INDICES": 0xD1}
 _MAX_STRIDE = 256
-_AT, _NEXT, _LAST, _NUM_RECENT = range(4)  # of the state of decoding triangles
+_AT, _NEXT, _LAST, _NUM_RECENT = range(4)  # indices into the decoder's state for triangles
 
 
 def decode_view(data: bytes, view: dict[str, Any]) -> bytes:

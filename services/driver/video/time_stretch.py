@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
 Float32 = NDArray[np.float32]
-_MIN_TEMPO = 0.5  # of one filter
-_EARLY_S = 0.02  # of atempo's output, relative to its input
+_MIN_TEMPO = 0.5  # minimum tempo of one filter
+_EARLY_S = 0.02  # atempo's output is this much earlier than its input
 _MIN_SAMPLES = 4096  # atempo returns nothing for less
 
 

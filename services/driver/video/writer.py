@@ -60,7 +60,7 @@ class _Format:
     opaque: _Codec
     transparent: _Codec | None
     sound: str | None  # codec
-    options: dict[str, str] = field(default_factory=dict)  # of the container
+    options: dict[str, str] = field(default_factory=dict)  # options of the container
 
 
 # visually lossless

@@ -26,7 +26,7 @@ export class DrawRate {
   visibleDelayMs = 0; // from a face to the middle of the time for which it is visible, median
   #rests;
   #maxRatio;
-  #startMs = -Infinity; // of the last image
+  #startMs = -Infinity; // start of the last image
   #tookMs = 0;
   #numImages = 0;
   #visibleMs = -Infinity; // when the last image became visible

@@ -8,13 +8,13 @@ export const LANDMARKS = [
 ];
 
 const NO_FACE_MS = 1000; // without a face, until the user is advised
-const QUIET_MS = 4000; // of quiet, until the user is advised
+const QUIET_MS = 4000; // duration of quiet before the user gets advice
 const QUIET_RMS = 0.005; // -46 dB of full scale
 const MIN_LOUD = 0.1; // fraction of the chunks
 const MIN_FACES = 0.7; // fraction of the images that must show a face
 
 export class FaceRecording {
-  static minRateHz = 4.5; // of the images
+  static minRateHz = 4.5; // minimum rate of the images
   #rateHz;
   #chunks = [];
   #numSamples = 0;

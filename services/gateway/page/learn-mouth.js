@@ -11,8 +11,8 @@ import { curvePath, extent, figures, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
-const GOOD_RATE_HZ = 10; // of the images; at lower rates the reading is longer
-const SLOW_SHARE = 1.5; // of the usual time
+const GOOD_RATE_HZ = 10; // rate of the images; below it, the reading is longer
+const SLOW_SHARE = 1.5; // multiple of the usual time
 const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the first image
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
 const CURVES = ["tracked", "before", "after"];

@@ -6,7 +6,7 @@ import { capture, openCaptureContext, openFileSpeech } from "./capture.js";
 import { UserError, say } from "./language.js";
 
 const RETRY_MS = 500;
-const TAIL_MS = 1000; // of silence after a file, for its last frames
+const TAIL_MS = 1000; // silence after a file, for its last frames
 const GIVE_UP_MS = 30000; // a crashed service is restarted within this time
 
 export class Microphone {

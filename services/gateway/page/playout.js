@@ -13,7 +13,7 @@ const WITH_SOUND = { percentile: 0.95, marginMs: FRAME_MS, leapMs: 30 };
 const WITHOUT_SOUND = { percentile: 0.8, marginMs: 0, leapMs: 5 };
 const ADJUST_EVERY_MS = 500;
 const MAX_GLIDE = 0.005; // change of speed; a twelfth of a semitone, which is inaudible
-const WINDOW_MS = 10000; // of the percentiles; long enough to ignore a single hiccup
+const WINDOW_MS = 10000; // window of the percentiles; long enough to ignore a single hiccup
 const MIN_FRAMES = 20; // before the percentile is used
 const JUMP_MS = 300; // restart if the stream is late or early by more than this
 const LATE_MS = 100; // and late for this long; less than the delay, so that no sound is lost
@@ -57,7 +57,7 @@ export class Playout {
   imageDelayMs = 0; // from computing a face until its image is visible; it is drawn earlier by this
   offsetMs = null; // read only
   #startMs = 0; // when the first offset was set
-  #targetMs = null; // of the offset
+  #targetMs = null; // target of the offset
   #adjustedMs = 0; // when the target was set
   #glidedMs = 0; // when the offset was moved last
   #lateFrames;

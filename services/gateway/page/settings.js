@@ -4,7 +4,7 @@ import { element } from "./elements.js";
 import { languageFor, say, setLanguage } from "./language.js";
 import { TEXTS } from "./texts.js";
 
-const STRENGTH = 0.8; // of an expression
+const STRENGTH = 0.8; // strength of an expression
 const AMOUNTS = ["expressiveness", "feeling"];
 export const MOTIONS = [...AMOUNTS, "still", "eye_contact"]; // names of face settings
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];

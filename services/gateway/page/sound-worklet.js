@@ -8,7 +8,7 @@ const FADE = 1 / 64; // change of the gain per sample; a fade takes 4 ms and avo
 const MIN_LEAP = 160; // samples, 10 ms; smaller distances are corrected by resampling
 const GLIDE_LENGTH = 1600; // samples in which a small distance shrinks to a third
 const MAX_GLIDE = 0.01; // change of speed; a sixth of a semitone
-const TAPS = 16; // of the interpolation filter
+const TAPS = 16; // length of the interpolation filter
 const PHASES = 512; // positions between two samples
 const FILTER = makeFilter();
 
@@ -25,9 +25,9 @@ function makeFilter() {
 
 class SoundPlayer extends AudioWorkletProcessor {
   #samples = new Float32Array(CAPACITY);
-  #mediaTimes = new Float64Array(CAPACITY).fill(-1); // of the samples
+  #mediaTimes = new Float64Array(CAPACITY).fill(-1); // media times of the samples
   #anchor = null;
-  #target = null; // of the anchor
+  #target = null; // target of the anchor
   #gain = 0;
   #numPlayed = 0;
   #reportedAt = 0;

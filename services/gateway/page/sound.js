@@ -5,7 +5,7 @@ import { SlidingWindow } from "./sliding-window.js";
 
 const RATE_HZ = 16000;
 const ALIGN_EVERY_MS = 50;
-const MAX_LATENCY_S = 2; // of a loudspeaker
+const MAX_LATENCY_S = 2; // limit for the latency of a loudspeaker
 const RECORDER_MS = 30; // delay of the sound that a recorder itself adds (Chromium)
 const CLOCK_MS = 1000; // window for the sound card's clock; one reading is off by some ms
 

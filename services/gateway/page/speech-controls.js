@@ -5,8 +5,8 @@ import { Microphone } from "./microphone.js";
 
 export class SpeechControls {
   microphone;
-  state = "off"; // of the microphone
-  session = null; // of the microphone
+  state = "off"; // state of the microphone
+  session = null; // session of the microphone
   #sound;
   #handlers;
   #wasSoundWanted = false; // before the microphone or a lesson muted the sound

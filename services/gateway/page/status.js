@@ -14,7 +14,7 @@ export class GatewayState {
   isConnected = false;
   wasConnected = false;
   session = null; // name of the session that is shown
-  epoch = 0; // of the session; it increases with each restart
+  epoch = 0; // epoch of the session; it increases with each restart
   isSample = false; // whether the session is the sample sentence that this page asked for
   lips = null; // lip model of the session; null: unknown
   acoustic = ""; // acoustic model of the session: full or light

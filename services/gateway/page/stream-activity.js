@@ -8,7 +8,7 @@ export class StreamActivity {
   #lastFrameMs = -Infinity;
   #lastSoundMs = -Infinity;
   #updatedMs = null;
-  #share = 0; // of the stream's face, 0 to 1; the rest is the face at rest
+  #share = 0; // share of the stream's face, 0 to 1; the rest is the face at rest
 
   frameArrived(nowMs) {
     this.#lastFrameMs = nowMs;

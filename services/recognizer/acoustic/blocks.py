@@ -81,7 +81,7 @@ _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
 _MAX_SIZE = 4096
-_MAX_CACHE_BYTES = 3_000_000  # of a session
+_MAX_CACHE_BYTES = 3_000_000  # per session
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +153,7 @@ class BlockSizes:
 class NetworkState:
     """A session's network state before a block."""
 
-    state: Floats  # of the recurrent layer, (width,)
+    state: Floats  # state of the recurrent layer, (width,)
     rings: Float16  # keys and values, (2 layers, heads, PAST, size), finite
     num_cached: int = 0  # positions in the rings
 
@@ -163,7 +163,7 @@ class Block:
     """A block of one session with its right context, to be computed."""
 
     frames: Floats  # (2 positions + 3, 80), from two before the first position's
-    row: int  # of the first position in the table
+    row: int  # row of the first position in the table
     num_positions: int
     num_settled: int  # the first ones, whose scores are settled
     num_kept: int  # the first ones, whose keys and values are kept; 0 if nothing follows
@@ -212,7 +212,7 @@ class BlockRunner:
         for ring, name in enumerate(self._names):
             of_sessions = [block.past.rings[ring] for block in blocks]
             inputs[name] = of_sessions[0][np.newaxis] if len(blocks) == 1 else np.stack(of_sessions)
-        if self._first_state:  # of the readout that is not used
+        if self._first_state:  # the readout that is not used has a state
             inputs["state"] = np.zeros((len(blocks), self._first_state), np.float32)
         start_s = time.thread_time()
         log_posteriors, state, new = run_session(self._session, self._outputs, inputs)
@@ -238,7 +238,7 @@ class BlockStream(AcousticStream):
         """Forget the segment. The network has no memory of the speaker."""
         self.provisional = self._empty_scores
         self._settled: list[Floats] = []  # not yet returned
-        self._num_frames = 0  # of the segment
+        self._num_frames = 0  # number of frames in the segment
         self._num_settled = 0
         self._loudest = np.float32(-np.inf)  # band of the segment
         self._frames = np.zeros((_PADDING, NUM_MELS), np.float32)  # from the next block's first on
@@ -247,7 +247,7 @@ class BlockStream(AcousticStream):
 
     def _start_table(self) -> None:
         """Start at the first row of the table of positions, with an empty past."""
-        self._row = 0  # of the next block
+        self._row = 0  # table row of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
         self._past = NetworkState(np.zeros(self._sizes.state, np.float32), self._rings)
 

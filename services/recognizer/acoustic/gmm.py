@@ -50,9 +50,9 @@ from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTract
 
 FORMAT = "gmm 3"
 _MAX_MIXTURES = 1024
-_MAX_HALF_WIDTH = 4  # of the differences, feature frames
+_MAX_HALF_WIDTH = 4  # limit for the half width of the differences, feature frames
 
-_MIN_LOG_WEIGHT = -1e30  # of an absent component: finite, so that no NaN arises
+_MIN_LOG_WEIGHT = -1e30  # for an absent component: finite, so that no NaN arises
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +98,7 @@ class GmmModel(AcousticModel):
     mixtures: GaussianMixtures
     rotation: Floats  # (39, 39)
     prior_mean: Floats  # (13,) cepstral mean of the training corpus
-    half_width: int  # of the differences
+    half_width: int  # half width of the differences
     acoustic_scale: float = 1.0  # weight of the log scores: neighboring frames are correlated
 
     @cached_property

@@ -19,7 +19,7 @@ from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 # For model files without a phone language model.
 PHONE_LM_PATH = Path(__file__).parents[1] / "models" / "phone_lm.npz"
 
-MAX_BYTES = 256 * 1024 * 1024  # of a file, packed or not
+MAX_BYTES = 256 * 1024 * 1024  # limit for a file, packed or not
 _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0

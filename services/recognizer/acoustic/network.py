@@ -15,7 +15,7 @@ from kouxing.services.recognizer.onnx_session import open_network
 MAX_POSITIONS = 1500  # rows of the table of positions
 FRAMES_PER_POSITION = 2  # feature frames from one position to the next
 
-_LONGEST_WAVE = 10_000.0  # of the sinusoids, over 2 pi
+_LONGEST_WAVE = 10_000.0  # longest period of the sinusoids, over 2 pi
 
 
 def position_table(width: int) -> Floats:

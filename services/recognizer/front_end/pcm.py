@@ -84,7 +84,7 @@ class SliceMeter:
     def __init__(self, start: int = 0) -> None:
         self.media_time = start  # end of the audio so far
         self._start = start
-        self._pieces: list[NDArray[np.float32]] = []  # of the incomplete slice
+        self._pieces: list[NDArray[np.float32]] = []  # pieces of the incomplete slice
         self._pitch = PitchTracker(start // SLICE)
 
     def accept_waveform(

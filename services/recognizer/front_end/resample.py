@@ -34,7 +34,7 @@ MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000
 MAX_CHANNELS = 8
 _HALF_WIDTH = 32  # samples of the lower rate
-_CUTOFF = 15 / 16  # of half the lower rate
+_CUTOFF = 15 / 16  # relative to half the lower rate
 _KAISER_BETA = 8.0
 
 

@@ -76,7 +76,7 @@ _SPAN = _WINDOW + _MAX_LAG
 _HOP = round(HOP_S * _RATE_HZ)
 _FRAME = round(WINDOW_S * _RATE_HZ)
 _ENERGY_FLOOR = 1e-9  # squared energy: below -60 dB of full scale, the strength approaches 0
-_PEAK_RATIO = 0.88  # of the highest peak: the first peak above it is the period, not a multiple
+_PEAK_RATIO = 0.88  # relative to the highest; the first peak above it is the period, not a multiple
 
 VOICED_STRENGTH = 0.8  # only frames above it count in the mean pitch
 REFERENCE_HZ = 220.0
@@ -239,7 +239,7 @@ def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
 
 @numba.njit(cache=True, nogil=True)
 def _factor(state: NDArray[np.float64]) -> float:
-    log_ratio = state[0] / (_PRIOR_FRAMES + state[1])  # of the reference to the mean
+    log_ratio = state[0] / (_PRIOR_FRAMES + state[1])  # log of reference over mean
     return min(max(math.exp(_EXPONENT * log_ratio), 1.0), MAX_FACTOR)
 
 

@@ -38,7 +38,7 @@ from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, Graph
 _NO_RECORD = -1
 _NO_TOKEN = -1
 _IMPOSSIBLE = np.float32(-1e30)
-_BEAM = np.float32(20.0)  # of log scores; a wider beam changes nothing on development data
+_BEAM = np.float32(20.0)  # in log scores; a wider beam changes nothing on development data
 _MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
 _MIN_RECORDS = 4 * _MAX_TOKENS
 _MAX_CHAIN = MAX_ORDER + 1  # contexts from the longest to the empty one

@@ -5,7 +5,7 @@ import math
 from kouxing.shared.phones.events import Phone, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 
-_MIN_AGE_S = 0.02  # of a phone that ends with the speech
+_MIN_AGE_S = 0.02  # minimum age of a phone that ends with the speech
 
 
 class KnownPhones:

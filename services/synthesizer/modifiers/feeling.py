@@ -20,7 +20,7 @@ from kouxing.shared.face.smoothing import TwoPoleFilter
 _GAIN = 2.5  # usual voices differ from their mean by up to 0.4
 _FILTER_S = 0.4  # time constant of each filter pole
 _VISIBLE = 1e-3  # weaker feelings are not shown
-_SIZE = 0.25  # of the mouth's movements, at full arousal
+_SIZE = 0.25  # scale of the mouth's movements grows by this much at full arousal
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 

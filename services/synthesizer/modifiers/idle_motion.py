@@ -40,7 +40,7 @@ from kouxing.shared.face.smoothing import TwoPoleFilter
 _NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # prominence of syllables with these movements
 _MAX_EXCESS = 1.2  # prominence above that of the weakest nod, of the largest one
 _MIN_NOD_INTERVAL_S, _MIN_BROW_INTERVAL_S = 1.0, 2.5
-_MIN_SIZE = 0.5  # of the weakest nod, relative to the largest one
+_MIN_SIZE = 0.5  # size of the weakest nod, relative to the largest one
 _STARTING_S = 0.9  # duration of speech after a pause
 _ENDING_S, _THINKING_S, _LISTENING_S = 0.2, 0.9, 2.5  # duration of silence
 _NOD_HOLD_S, _BROW_HOLD_S, _TILT_HOLD_S, _TURN_HOLD_S = 0.14, 0.22, 0.6, 0.7
@@ -79,7 +79,7 @@ class SpeechIdleMotion:
         self._seed = seed
         self._prosody = ProsodyTracker()
         self._silence_s = math.inf  # at the last frame
-        self._start_s = -math.inf  # of the speech
+        self._start_s = -math.inf  # start of the speech
         self._nod_s = self._brow_s = -math.inf  # times of the last movements
         self._is_still = self._is_listening = self._has_heard_pause = False
         self._brow, self._nod = _Movement(_FILTER_S), _Movement(_FILTER_S)

@@ -68,7 +68,7 @@ _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
 _TONED_WORDS = r"[(（]?(?<![A-Za-z])[a-zü:]+[1-5](?:[ ']?[a-zü:]+[1-5])*(?![A-Za-z\d])[)）]?"
 _ANNOTATION = re.compile(f"{WORDS_IN_BOPOMOFO.pattern}|{_TONED_WORDS}")
 _MAX_WORD_LETTERS = 500
-_MAX_LETTERS = 10  # of a syllable with its tone, decomposed
+_MAX_LETTERS = 10  # limit for a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
 _SPACE_BESIDE_CHARACTER = re.compile(f"(?<![{_LATIN}]) | (?![{_LATIN}])")
 # Traditional characters with two simplified ones, where the reading differs from the usual one.
@@ -77,7 +77,7 @@ _READ_AS = (
     (re.compile("乾(?![隆坤卦])"), "干"),
 )
 _KEYCAP = re.compile("[0-9#*]\ufe0f?\u20e3")  # emoji of a key, a bullet
-_LETTERS = str.maketrans("ɑɡ\u0306", "ag\u030c")  # of schoolbooks; a breve instead of a caron
+_LETTERS = str.maketrans("ɑɡ\u0306", "ag\u030c")  # schoolbook letters; a breve instead of a caron
 _TONES = {"\u0304": 1, "\u0301": 2, "\u030c": 3, "\u0300": 4}  # combining marks
 
 
@@ -234,7 +234,7 @@ def _split_toneless(word: str) -> list[str]:
         return []
     word = _plain(word)
     for later_starts in ("", "aoeê"):
-        splits: dict[int, list[str]] = {len(word): []}  # of the rest of the word, by its start
+        splits: dict[int, list[str]] = {len(word): []}  # by start: splits of the rest of the word
         for place in range(min(len(word), _MAX_WORD_LETTERS) - 1, -1, -1):
             if place and word[place] in "aoeê" and not later_starts:
                 continue

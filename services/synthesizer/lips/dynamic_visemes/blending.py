@@ -24,7 +24,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeP
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 from kouxing.services.synthesizer.lips.trajectory import FapState
 
-_STEP_S = 1e-3  # of the numerical derivative
+_STEP_S = 1e-3  # step of the numerical derivative
 
 
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:

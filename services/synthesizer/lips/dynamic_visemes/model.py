@@ -49,7 +49,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 
 _REST_S = 0.3  # duration of the way to rest without sound
 _TRANSITION_S = 0.04  # duration of the change to a new target trajectory
-_SLOW_TRANSITION_S = 0.14  # the same after an interruption, and from rest
+_SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _MEMORY_S = 1.5  # phones that ended earlier have no weight
 
 
@@ -112,7 +112,7 @@ class VisemeStream:
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # while media time stands still
-        self._time_s = start_s  # of the last frame
+        self._time_s = start_s  # time of the last frame
         self._mouth: Callable[[], FapState] = lambda: still(parameters.neutral)
 
     def add_event(self, event: SoundEvent) -> None:

@@ -71,7 +71,7 @@ class VisemeParameters:
     c: float
     closure_ratio: float  # C of Wang & Cai 2003, eq. 7
     closure_reach_s: float  # T of Wang & Cai 2003, eq. 7, seconds
-    # of each viseme: offset_s, log alpha, theta_minus and theta_plus
+    # columns for each viseme: offset_s, log alpha, theta_minus and theta_plus
     dominance: NDArray[np.float64] = dataclasses.field(
         init=False
     )  # (num_visemes, 4, num_mouth_faps)

@@ -45,8 +45,8 @@ LINES = {
     "outer lower": ("8.4", "8.8", "8.2", "8.7", "8.3"),
 }
 _ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without travel
-_MOUTH_WIDTHS_PER_MNS = 0.39  # of the head "woman"
-_WIDTH_RANGE = (0.6, 1.2)  # of rounded and spread lips
+_MOUTH_WIDTHS_PER_MNS = 0.39  # for the head "woman"
+_WIDTH_RANGE = (0.6, 1.2)  # from rounded to spread lips
 _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
 
 

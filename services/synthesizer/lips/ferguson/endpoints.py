@@ -76,7 +76,7 @@ class SyllableSegmenter:
     """Divides the speech of one stream into segments, slice by slice."""
 
     def __init__(self) -> None:
-        self.start_s: float | None = None  # of the current segment; None in silence
+        self.start_s: float | None = None  # start of the current segment; None in silence
         self._levels_db = deque([_INITIAL_LEVEL_DB] * _RANGE_SLICES, maxlen=_RANGE_SLICES)
         self._before: Progress | None = None
         self._recent: deque[_Loudness] = deque(maxlen=_MEMORY_SLICES)

@@ -52,7 +52,7 @@ _EXPECTED_S = 0.15  # the mouth waits this long for an expected phone before it 
 _CLOSING_S = 0.1
 _MEMORY_S = 1.5
 _TRANSITION_S = 0.04  # duration of the change to new key frames
-_SLOW_TRANSITION_S = 0.14  # the same after an interruption, and from rest
+_SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _REST_S = 0.15  # duration of the way to rest without sound
 _DERIVATIVE_STEP_S = 1e-3
 
@@ -112,7 +112,7 @@ class FergusonStream:
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # while media time stands still
-        self._time_s = start_s  # of the last frame
+        self._time_s = start_s  # time of the last frame
         self._mouth = still(np.zeros(NUM_MOUTH_FAPS))
 
     def add_event(self, event: SoundEvent) -> None:

@@ -49,8 +49,8 @@ class ClosureRule:
     vowel: float = 0.0  # factor of the log odds subtracted by a vowel between two closing phones
     doubt: float = 0.8  # log odds around 0 at which lips close partly
     # log odds subtracted per FAP unit, unless a phone supports the closure
-    parted: float = 0.02  # of an opening above 100, up to 300
-    rounded: float = 0.012  # of a width below -100
+    parted: float = 0.02  # for an opening above 100, up to 300
+    rounded: float = 0.012  # for a width below -100
 
     def log_odds(self, faps: Array, sound: float, phones: float) -> float:
         """Return the log odds of a closure.

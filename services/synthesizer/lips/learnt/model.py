@@ -52,7 +52,7 @@ Array = NDArray[np.float64]
 
 _UNTRACKED_FAPS = (14, 44, 45, 46, 47)  # jaw thrust and tongue
 _TRANSITION_S = 0.04  # duration of the change to a new track
-_SLOW_TRANSITION_S = 0.14  # the same after an interruption, and from rest
+_SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _REST_S = 0.15  # duration of the way to rest without sound
 _FLUSHED_S = 0.3  # audio whose lip frames may arrive after an interruption
 _MEMORY_S = 0.5
@@ -119,7 +119,7 @@ class LearntStream:
         self._resting = RestingLips()
         self._ajar = 0.0  # share of the ajar mouth at the last frame
         self._late_s = 0.0  # lateness of the newest lip frame
-        self._time_s = start_s  # of the last frame
+        self._time_s = start_s  # time of the last frame
         self._mouth = still(self._neutral)
         self._tongue = self._neutral
 

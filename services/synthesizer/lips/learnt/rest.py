@@ -63,15 +63,15 @@ class RestingLips:
     """The share of the ajar mouth in one session."""
 
     def __init__(self) -> None:
-        self._levels: deque[tuple[float, float]] = deque()  # of future frames: time s, dB
-        self._changes: deque[SpeechChange] = deque()  # of future frames
+        self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
+        self._changes: deque[SpeechChange] = deque()  # changes in future frames
         self._is_voice = self._has_ended = False
         self._loudest_db = -math.inf
         self._known_s = -math.inf  # the levels are known up to here
         self._sound_s = -math.inf  # end of the last sound, or start of the voice activity
         self._stays_shut = True  # until the next sound
         self._is_phone = False  # a phone closes the lips
-        self._time_s = math.inf  # of the last frame
+        self._time_s = math.inf  # time of the last frame
         self._goal = 0.0
         self._way, self._elapsed_s = _way_to(0.0, 0.0, 0.0, 1.0), 0.0
 
