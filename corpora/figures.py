@@ -25,4 +25,4 @@ def save_figure(figure: Any, path: Path) -> None:
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: the picture cannot be written: {error}") from error
+        raise UserError(f"{path}: cannot write the picture: {error}") from error

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 CONSOLE = Console(stderr=True)
 Force = Annotated[bool, typer.Option("--force", help="Overwrite output files that exist.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the results here.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file for the results.")]
 
 
 def print_message(text: str) -> None:

@@ -67,7 +67,7 @@ def write_videos(
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UserError(f"{path.parent}: cannot be created: {error.strerror}") from error
+            raise UserError(f"cannot create {path.parent}: {error.strerror}") from error
         samples = sentence.sentence.clip.samples
         film.render_video(
             make(sentence), path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples

@@ -46,7 +46,7 @@ def serve(
     folder: Folder,
     port: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, help="Port, instead of gateway.port; 0: any free."),
+        typer.Option(min=0, max=65535, help="Port, instead of gateway.port; 0: any free port."),
     ] = None,
     config: ConfigFile = None,
     assignments: Assignments = None,

@@ -91,7 +91,7 @@ class ListeningTest:
     def _judge(self, request: web.Request) -> int:
         judge = self._store.judges.get(request.query.get("judge", ""))
         if judge is None:
-            raise web.HTTPNotFound(text="this judge is unknown\n")
+            raise web.HTTPNotFound(text="unknown judge; open the study's address again\n")
         return judge
 
     def _next_place(self, judge: int) -> int | None:

@@ -48,7 +48,7 @@ def run_steps(
         code = code_hash(step)
         if not commands or missing:
             reason = f"give --{missing[0]}" if missing else "it is not part of a quick report"
-            print_message(f"{name}: left out ({reason})")
+            print_message(f"{name}: skipped ({reason})")
         elif not is_fresh and path.exists() and json.loads(path.read_text())["code"] == code:
             print_message(f"{name}: up to date")
         else:

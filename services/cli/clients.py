@@ -61,7 +61,7 @@ def speak(
             " 'monitor': the sound that this machine plays.",
         ),
     ],
-    session: Annotated[str, typer.Option(help="Name of the session.")] = "",
+    session: Annotated[str, typer.Option(help="Name of the session. Default: generated.")] = "",
     record: Annotated[
         bool, typer.Option("--record", help="Record the face: the driver writes <session>.mp4.")
     ] = False,
@@ -171,7 +171,7 @@ def listen(
         typer.Option(
             "--as",
             help="Values of the frames. Shapes are printed as JSON lines, and the drawn mouths of"
-            " rhubarb when they change. Default: the first of the format.",
+            " rhubarb when they change. Default: the first that the format supports.",
         ),
     ] = None,
     alphabet: PhoneAlphabet = None,
@@ -227,7 +227,7 @@ def express(
     ] = None,
     control: Control = "",
 ) -> None:
-    """Show expressions on a face. Without expressions, end those it shows."""
+    """Show expressions on a face. Without expressions, end the current ones."""
     from kouxing.shared.control_client import connect
 
     words = list(arguments or ())

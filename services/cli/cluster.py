@@ -11,12 +11,12 @@ from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.terminal import print_table
 
-Number = Annotated[int | None, typer.Option(min=0, max=1000, help="Number of workers to run.")]
+NumWorkers = Annotated[int | None, typer.Option(min=0, max=1000, help="Number to run.")]
 
 
 def cluster(
-    recognizers: Number = None,
-    synthesizers: Number = None,
+    recognizers: NumWorkers = None,
+    synthesizers: NumWorkers = None,
     address: Annotated[
         str, typer.Option(help="Address of the Ray cluster. 'auto': the cluster of this host.")
     ] = "auto",

@@ -39,7 +39,7 @@ Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standar
 Acoustic = Annotated[
     str | None,
     typer.Option(
-        help="Acoustic model: blocks, light, gmm, universal, or a model file. Default: the one of"
+        help="Acoustic model: blocks, light, gmm, universal, or a model file. Default: the model of"
         " the language."
     ),
 ]

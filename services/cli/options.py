@@ -28,7 +28,9 @@ HeadName = Annotated[
 ]
 AudioTrack = Annotated[
     int | None,
-    typer.Option("--track", metavar="N", help="Audio track of the file. Default: the first."),
+    typer.Option(
+        "--track", metavar="N", help="Audio track of the file. Default: the file's default track."
+    ),
 ]
 Language = Annotated[
     str | None,

@@ -55,17 +55,21 @@ def _parser() -> argparse.ArgumentParser:
     add("--version", action="version", version=program)
     add("input", help="audio or video file")
     add("-f", "--exportFormat", choices=("tsv", "xml", "json", "dat"), default="tsv")
-    add("-o", "--output", type=Path, help="file to write, which may exist")
+    add("-o", "--output", type=Path, help="file to write; an existing file is overwritten")
     add("-d", "--dialogFile", type=Path, help="file with the spoken text")
-    add("--language", default=AUTO, help="of the speech, such as en or zh; not in Rhubarb")
-    add("--extendedShapes", default="GHX", help="which of the mouths G, H and X are drawn")
+    add("--language", default=AUTO, help="language of the speech, such as en or zh; not in Rhubarb")
+    add("--extendedShapes", default="GHX", help="mouths of G, H and X that are drawn")
     add("--datFrameRate", type=float, default=24.0, help="10 to 100 images per second")
-    add("--datUsePrestonBlair", action="store_true", help="other names of the mouths in dat")
+    add(
+        "--datUsePrestonBlair",
+        action="store_true",
+        help="use Preston Blair's names of the mouths in dat",
+    )
     add("-q", "--quiet", action="store_true", help="print only errors")
     add("--machineReadable", action="store_true", help="print the status as JSON")
-    add("--logFile", type=Path, help="file for an error")
+    add("--logFile", type=Path, help="file to write errors to")
     for names in (("-r", "--recognizer"), ("--consoleLevel",), ("--logLevel",), ("--threads",)):
-        add(*names, help="is ignored")
+        add(*names, help="ignored; accepted for compatibility")
     return parser
 
 

@@ -147,7 +147,7 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{out}: cannot be created: {error.strerror}; set driver.out") from None
+        raise UserError(f"cannot create {out}: {error.strerror}; set driver.out") from None
     export_glb(load_head(name), page_head)
     return environment | {variable("gateway", "head"): str(page_head)}
 

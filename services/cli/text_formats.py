@@ -140,19 +140,19 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
     text = text.lstrip("\ufeff \t\r\n").replace("\r\n", "\n").replace("\r", "\n")
     for beginning, name in _TEXTUAL.items():
         if text.startswith(beginning):
-            raise UserError(f"this is {name}; give the spoken text alone")
+            raise UserError(f"this is {name}; give only the spoken text")
     for form, pattern, extract in _FORMATS:
         if (is_markdown and form == "Markdown") or pattern.search(text):
             try:
                 spoken = extract(text)
             except ValueError:
-                raise UserError(f"this is not valid {form}; give the spoken text alone") from None
+                raise UserError(f"this is not valid {form}; give only the spoken text") from None
             break
     else:
         spoken = without_columns(text)
         form = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
-        raise UserError("the text has times of an unknown format; give the spoken text alone")
+        raise UserError("the text has times of an unknown format; give only the spoken text")
     return SpokenText(spoken, form)
 
 
@@ -295,7 +295,7 @@ def _json_text(value: object) -> str:
         for name in ("text", "content", "segments", "body", "syllables"):
             if name in value:
                 return _json_text(value[name])
-    raise UserError("this is JSON without the text of a transcript; give the spoken text alone")
+    raise UserError("this is JSON without the text of a transcript; give only the spoken text")
 
 
 def _read_markdown(text: str) -> str:
@@ -349,7 +349,7 @@ def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> N
 def _reject_xml(text: str) -> str:
     root = re.search(r"<([A-Za-z][\w:.-]*)", text)
     name = f" with the root element {root[1]!r}" if root else ""
-    raise UserError(f"this is XML{name}; give the spoken text alone")
+    raise UserError(f"this is XML{name}; give only the spoken text")
 
 
 _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (

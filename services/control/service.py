@@ -368,7 +368,7 @@ class ControlService(Service):
             if self._sessions.get(start.session) is not None:
                 continue
             record = self._sessions.restore(start, time.monotonic())
-            LOG.info("session taken over", extra={"session": record.name})
+            LOG.info("session restored", extra={"session": record.name})
             uninformed = self._takeover.uninformed_observers(record.name)
             self._lifecycle.send_start(record, record.waiting_for | uninformed)
             if record.lost:

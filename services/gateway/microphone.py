@@ -62,7 +62,7 @@ class Microphones:
             first = await browser.receive(HELLO_TIMEOUT_S)
         except TimeoutError:
             raise UserError(
-                f"no description of the audio came in {HELLO_TIMEOUT_S:g} s; send it first"
+                f"no description of the audio arrived within {HELLO_TIMEOUT_S:g} s; send it first"
             ) from None
         if first.type is not WSMsgType.TEXT:
             raise UserError("the first message must be a JSON object that describes the audio")

@@ -40,7 +40,7 @@ def test_a_session_continues_while_control_is_killed_and_started_again(tmp_path:
         session.close()
         assert not client.status().sessions
         system.assert_all_alive()
-        assert "taken over" in system.log("control")
+        assert "session restored" in system.log("control")
 
     frames = {(frame.epoch, frame.sequence): frame for frame in sent.frames}
     newest = max(place for place in frames if place[0] == 1)  # of the killed synthesizer

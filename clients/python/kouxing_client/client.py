@@ -145,7 +145,7 @@ class Session(BaseSession):
         for pcm, num_frames in self._chunks(audio):
             if not self._signal.wait(self._can_push, timeout_s):
                 raise KouxingError(
-                    f"the recognizer has taken no audio for {timeout_s:g} s; is it running?"
+                    f"the recognizer has accepted no audio for {timeout_s:g} s; check that it runs"
                 )
             if not self._has_room():
                 self._check()

@@ -61,7 +61,9 @@ def read_key(path: str | Path) -> Key:
             "another machine, run 'kouxing keys add NAME --role client' there and copy the file"
         ) from None
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise KouxingError(f"{path} is not a key file") from None
+        raise KouxingError(
+            f"{path} is not a key file; copy it again from control's machine"
+        ) from None
     if not all(isinstance(part, str) and len(part) == 40 for part in vars(key).values()):
-        raise KouxingError(f"{path} is not a key file")
+        raise KouxingError(f"{path} is not a key file; copy it again from control's machine")
     return key

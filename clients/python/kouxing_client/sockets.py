@@ -185,7 +185,7 @@ class Sockets:
         try:
             if bool(server) != (self._key is not None):
                 raise KouxingError(
-                    f"{address}: one end has 'insecure = true', the other encrypts; set it at both"
+                    f"{address}: only one end has 'insecure = true'; set it for both or neither"
                 )
             if self._key is not None:
                 raw.setsockopt_string(zmq.CURVE_SERVERKEY, server)
