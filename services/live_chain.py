@@ -1,7 +1,8 @@
 """The whole chain in one process, without sockets: audio in, FAP frames out.
 
-The services run the same two halves, ``SpeechStream`` and ``Face``, and exchange messages between
-them. Offline rendering and evaluation use this chain. Its frames are identical, bit for bit.
+The services run the same two halves, ``SpeechStream`` and ``FaceAnimator``, and exchange messages
+between them. Offline rendering and evaluation use this chain. Its frames are identical, bit for
+bit.
 """
 
 import numpy as np

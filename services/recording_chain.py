@@ -4,10 +4,11 @@
           -> lip frames with the longest delay
           -> face
 
-The face is the one of the live chain (``Face``), with the same lip models and modifiers. It has the
-longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes blend all
-visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small to see. With learnt
-lips, phones also decide where the lips do not close. In the live chain, they arrive too late.
+The face is that of the live chain (``FaceAnimator``), with the same lip models and modifiers. It
+has the longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes
+blend all visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small to see.
+With learnt lips, phones also decide where the lips do not close. In the live chain, they arrive too
+late.
 """
 
 from collections.abc import Iterable, Sequence

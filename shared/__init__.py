@@ -1,1 +1,1 @@
-"""What more than one service uses: messages, codec, bus, service loop, phones, FAPs."""
+"""Code that the services share: messages, codec, bus, service loop, phones, FAPs."""

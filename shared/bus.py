@@ -35,7 +35,7 @@ HANDSHAKE_MS = 2000
 
 
 class Reach(Enum):
-    """How a connection to an endpoint ends."""
+    """Result of an attempt to connect to an endpoint."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"  # the service rejects this key, or has another key itself

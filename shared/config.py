@@ -127,7 +127,7 @@ class ServiceConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     safe_alternative: ClassVar[str] = "bind a loopback address"
-    """What to do instead of binding an unencrypted address that other machines can reach."""
+    """Alternative to an unencrypted address that other machines can reach, for errors."""
 
     control: Endpoint = "tcp://127.0.0.1:5550"
     """Address at which control accepts commands."""

@@ -110,7 +110,7 @@ class Connection:
 
     @property
     def owner(self) -> str:
-        """Who is responsible: the peer's key or, without keys, its address."""
+        """Owner of the connection: the peer's key or, without keys, its address."""
         return self.key or self.address
 
     @property

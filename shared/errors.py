@@ -1,4 +1,4 @@
-"""Errors that say what is wrong and what to do."""
+"""Errors of the user, whose text names the cause and the remedy."""
 
 import contextlib
 import importlib.util

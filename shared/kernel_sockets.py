@@ -1,4 +1,4 @@
-"""What the kernel reports about one of libzmq's sockets, given its file descriptor."""
+"""The kernel's view of libzmq's sockets: addresses and byte counts, by file descriptor."""
 
 import contextlib
 import fcntl

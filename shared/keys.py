@@ -122,7 +122,7 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     """Check the keys of a system on this machine against each other, and create missing ones.
 
     ``kinds`` has the roles of each kind of service. Raises ``UserError`` with the command that
-    mends the key, or as ``load_key``.
+    fixes the key, or as ``load_key``.
     """
     import zmq  # noqa: PLC0415 (slow to import)
 

@@ -355,7 +355,7 @@ class _GuardedFile:
 
 
 def pcm_of_wav(begin: bytes) -> WavPcm | None:
-    """Return where the samples of a WAV stream are, if they are 16-bit integers or 32-bit floats.
+    """Find the samples of a WAV stream, if they are 16-bit integers or 32-bit floats.
 
     None for other encodings, more than two channels, and rates that need resampling.
     """
@@ -384,7 +384,7 @@ def pcm_of_wav(begin: bytes) -> WavPcm | None:
 
 
 def _describe(stream: Any) -> str:
-    """Return what a user needs to recognize a track."""
+    """Describe a track, so that a user recognizes it."""
     title = stream.metadata.get("title") or stream.metadata.get("handler_name") or ""
     parts = [f"'{title}'" if title not in ("", "SoundHandler", "Core Media Audio") else ""]
     parts.append(language if (language := stream.metadata.get("language")) != "und" else "")

@@ -39,7 +39,7 @@ class MessageLoop:
     def register(
         self, socket: Socket, handlers: dict[type[Message], Handler], *, is_quiet: bool = False
     ) -> None:
-        """Handle the messages of a socket, by type; those of a quiet one at the next occasion."""
+        """Handle the messages of a socket, by type. A quiet socket does not wake the loop."""
         self._handlers[socket] = handlers
         self._poller.add(socket, is_quiet=is_quiet)
 

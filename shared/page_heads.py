@@ -1,4 +1,4 @@
-"""Where the page's heads are, if the package has no GLB files of them."""
+"""The cache folder of the page's heads, for a package without their GLB files."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-// Where the face of an avatar is: the region that its shapes move.
+// The region of an avatar's face: the vertices that its shapes move.
 
 import * as THREE from "three";
 

@@ -68,7 +68,7 @@ _BLOCK_FRAMES = 250  # number of contours to compute at once
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Mouth:
-    """The motion of a mouth, and what the drawing says about it."""
+    """The motion of a mouth, and its labels in the drawing."""
 
     samples: NDArray[np.float32]  # 16 kHz mono, shape (n,)
     phones: Sequence[Phone]

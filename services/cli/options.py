@@ -88,7 +88,7 @@ class ListenOutput(StrEnum):
 
 
 class CaptionKind(StrEnum):
-    """What the captions of a video show."""
+    """Content of a video's captions."""
 
     PINYIN = "pinyin"
     CHARACTERS = "characters"

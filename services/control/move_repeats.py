@@ -1,4 +1,4 @@
-"""Moves that clients are told again, because their connection may have broken."""
+"""Repeats move messages to clients, because their connection may have broken."""
 
 import heapq
 import math

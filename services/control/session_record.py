@@ -36,7 +36,7 @@ class SessionRecord:
     lost: set[str] = field(default_factory=set)  # lost workers
     epoch: int = 1
     announced: bool = False  # the client has its endpoints
-    moved: bool = False  # it was placed again, and the client does not know yet
+    moved: bool = False  # it was placed again, and the client is not notified yet
     restored: bool = False  # an earlier control opened it
     speaking: bool = False
     speech_time: int = 0  # media time at which the newest speech started
@@ -63,7 +63,7 @@ class SessionRecord:
 
     @property
     def _audio(self) -> str:
-        """Where its client sends audio."""
+        """Endpoint that receives its client's audio."""
         live = self.endpoints["audio"]
         return live if self.opening.paced else self.endpoints.get(UNPACED_AUDIO, live)
 

@@ -49,7 +49,7 @@ class AudioSession:
         await self._session.flush()
 
     async def set_lip_model(self, lip_model: str) -> None:
-        """Let another lip model move the mouth."""
+        """Change the lip model."""
         await self._session.set_face(lip_model=lip_model)
 
     def errors(self) -> list[Refused]:

@@ -15,7 +15,7 @@ from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, local_a
 
 @dataclass(frozen=True, slots=True)
 class PageEndpoint:
-    """Where and to whom the page is served."""
+    """Address and access policy of the page."""
 
     url: str
     """The page's URL, with the token if one is required."""

@@ -94,7 +94,7 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProfileGain:
-    """What a profile improves on held-out speech."""
+    """Improvement by a profile on held-out speech."""
 
     speech_s: float
     delay_s: float

@@ -45,5 +45,5 @@ class RecognizerConfig(ServiceConfig):
 
     @property
     def output_rule(self) -> OutputRuleConfig:
-        """When a phone is emitted."""
+        """The output rule: decides when a phone is emitted."""
         return OutputRuleConfig(self.num_stable_frames, self.min_confidence)

@@ -60,7 +60,7 @@ class Voice(IntEnum):
 
 
 class EarPosition(NamedTuple):
-    """What the ear computes at a position; shapes as above."""
+    """The ear's outputs at a position; shapes as above."""
 
     frames: Floats  # x as (2, 80)
     features: Floats

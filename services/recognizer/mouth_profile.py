@@ -2,8 +2,8 @@
 
     y' = s y + b + r [h, u]
 
-y are the FAPs that the lip model predicts (``lips.py``), h and u its hidden values. A profile fits
-only the model that it was learned with.
+y are the FAPs that the lip model predicts (``lip_predictor.py``), h and u its hidden values. A
+profile fits only the model that it was learned with.
 
 ======== ====================================================== =================== ===========
 symbol   meaning                                                shape               unit

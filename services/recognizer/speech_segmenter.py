@@ -104,7 +104,7 @@ class SpeechSegmenter:
 
     @property
     def traits(self) -> VoiceTraits:
-        """What the voice shows at the end of the audio."""
+        """Traits of the voice at the end of the audio."""
         return self._traits.newest
 
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:

@@ -47,7 +47,7 @@ _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and st
 
 
 class VoiceTraits(NamedTuple):
-    """What the voice shows; the fields are those of ``Progress``."""
+    """Traits of a voice; the fields are those of ``Progress``."""
 
     arousal: float = 0.0
     valence: float = 0.0

@@ -1,4 +1,4 @@
-"""Where and how a face is sent: ``PROTOCOL://HOST:PORT?OPTION=VALUE``."""
+"""Addresses of programs that receive the face: ``PROTOCOL://HOST:PORT?OPTION=VALUE``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

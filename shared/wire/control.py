@@ -103,7 +103,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True):
 
 
 class StartSession(Message, frozen=True, kw_only=True):
-    """Control tells a service to serve a session; again with a greater epoch after a move.
+    """Control asks a service to serve a session; again with a greater epoch after a move.
 
     Phones whose middle is before ``media_time`` are already known.
     """

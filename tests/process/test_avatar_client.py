@@ -1,4 +1,4 @@
-"""What the JavaScript client makes of avatars: which shapes move them, and where their face is."""
+"""Avatars in the JavaScript client: the shapes that move them, and the place of their face."""
 
 import json
 import shutil

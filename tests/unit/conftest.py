@@ -1,4 +1,4 @@
-"""What tests of single modules share."""
+"""Fixtures of the unit tests."""
 
 from collections.abc import Iterator
 

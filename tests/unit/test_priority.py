@@ -1,4 +1,4 @@
-"""What a process sets up: its priority, and the folder of compiled functions."""
+"""The setup of a process: its priority, and the folder of compiled functions."""
 
 import os
 from pathlib import Path

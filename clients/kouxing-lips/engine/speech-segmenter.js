@@ -51,7 +51,7 @@ export class SpeechSegmenter {
     this.#traits = new VoiceTraits(model);
   }
 
-  /** What the voice shows at the end of the audio: { arousal, valence, isLaughter, isBreath }. */
+  /** Traits of the voice at the end of the audio: { arousal, valence, isLaughter, isBreath }. */
   get traits() {
     return this.#traits.newest;
   }

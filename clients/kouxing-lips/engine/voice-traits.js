@@ -3,7 +3,7 @@
 import { clamp } from "./math.js";
 
 export class VoiceTraits {
-  /** What the voice shows at the newest position. */
+  /** Traits of the voice at the newest position. */
   newest = { arousal: 0, valence: 0, isLaughter: false, isBreath: false };
   #c; // constants
   #voices;

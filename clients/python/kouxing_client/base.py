@@ -1,4 +1,4 @@
-"""What ``Client`` and ``AsyncClient`` share: arguments, audio formats, and when to wait."""
+"""The common base of ``Client`` and ``AsyncClient``: arguments, audio formats and waiting."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What all clients do: requests to control, sessions, and events; no I/O of its own."""
+"""The core of all clients, without I/O: requests to control, sessions and events."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ class ServiceState:
 
 @dataclass(frozen=True, kw_only=True)
 class SessionFacts:
-    """What the workers of a session state about their results."""
+    """Facts that a session's workers state about their results."""
 
     language: str | None = None
     """language of the phones"""

@@ -36,7 +36,7 @@ Float64 = NDArray[np.float64]
 
 
 class BadGlbError(Exception):
-    """Says what is wrong with an undamaged file, and what to do."""
+    """An undamaged file cannot be used; the text names the problem and the remedy."""
 
 
 @contextlib.contextmanager

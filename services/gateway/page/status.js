@@ -9,7 +9,7 @@ import { TEXTS } from "./texts.js";
 const NEWS_MS = 8000; // for which news is shown
 const SHORT_MS = 1000; // a fault that is over within this time is not shown
 
-/** What the gateway reports: the connection, the session that is shown, missing services. */
+/** The state that the gateway reports: the connection, the session that is shown, missing services. */
 export class GatewayState {
   isConnected = false;
   wasConnected = false;

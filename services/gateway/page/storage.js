@@ -1,4 +1,4 @@
-// What the page stores for the user's next visit. The browser's localStorage is injected as a function; it
+// Stores the user's choices for the next visit. The browser's localStorage is injected as a function; it
 // throws if the browser forbids it.
 
 /** A value in the storage. It lasts until the page closes if nothing can be stored. */

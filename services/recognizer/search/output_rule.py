@@ -1,4 +1,4 @@
-"""When a phone is emitted.
+"""The output rule: decides when a phone is emitted.
 
 Source: Li et al. 2011, section 2.2, eq. 4 and fig. 3: the last phone of the best string so far is
 emitted when the last N feature frames agree on it and it differs from the phone emitted before.
