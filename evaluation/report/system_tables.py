@@ -35,14 +35,8 @@ def _chain(results: Results) -> Iterator[list[str]]:
         "operations of the networks / rate of the matrix product",
     ]
     for name, drawing in chain["page"]["drawings"].items():
-        rate = drawing.get("images_per_s") or drawing.get("rate")
-        if rate:
-            yield [
-                f"page in headless Chromium, {name}, pictures per s",
-                number(rate, 0),
-                "60",
-                "display",
-            ]
+        title = f"page in headless Chromium, {name}, pictures per s"
+        yield [title, number(drawing["pictures_per_s"], 0), "60", "display"]
 
 
 def _load(results: Results) -> Iterator[list[str]]:
@@ -89,20 +83,18 @@ def _browser(results: Results) -> Iterator[list[str]]:
         number(_LOOK_AHEAD_MS + _FRAME_MS / 2, 0),
         "look-ahead + half a frame; the display adds up to a tick of 17 ms",
     ]
-    yield [
-        "lips in the browser: share of a core, %",
-        percent(browser["processor_share"]),
-        "",
-        "",
-    ]
     models = results.get("sizes", {}).get("model_bytes", {})
     needed = sum(models.get(name, 0) for name in ("ear", "lips", "traits", "phone_lm")) / 1e6
-    yield [
-        "lips in the browser: download, MB",
-        number(browser["download_bytes"] / 1e6, 1),
-        number(needed, 1),
-        "weights of its models",
-    ]
+    for package in (browser, *browser["others"]):
+        is_ours = package is browser
+        yield [
+            f"{package['name']} in the browser: download, MB / share of a core, %",
+            joined(
+                [number(package["download_bytes"] / 1e6, 1), percent(package["processor_share"])]
+            ),
+            f"{number(needed, 1)} / -" if is_ours and needed else "",
+            "weights of its models" if is_ours and needed else "",
+        ]
 
 
 def _sizes(results: Results) -> Iterator[list[str]]:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,14 @@ from typer.testing import CliRunner
 
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
-from kouxing.evaluation.report import lip_tables, run
+from kouxing.evaluation.report import lip_tables, run, system_tables
 from kouxing.evaluation.report.markdown import markdown
 from kouxing.evaluation.report.page import TABLES, write_page
 from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.evaluation.system.latency import Latency
+from kouxing.evaluation.system.lips_page import LipsPage
+from kouxing.evaluation.system.page import Drawing
 from kouxing.shared.errors import UserError
 
 SCORES = {"r_opening": 0.5, "closure_f1": 0.6, "mtm_ms": 50.0, "slcc": 0.0}
@@ -138,3 +142,50 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
 
 def test_markdown_table() -> None:
     assert markdown((("a", "b"), [["1", "2"]])) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
+
+
+def test_the_system_table_reads_what_the_commands_write() -> None:
+    page = LipsPage(
+        name="kouxing-lips",
+        download_bytes=4_600_000,
+        loaded_ms=600.0,
+        first_movement_ms=1300.0,
+        delay_ms={"p50": 79.0, "p95": 90.0},
+        processor_share=0.08,
+    )
+    other = replace(page, name="HeadAudio", download_bytes=100_000, delay_ms=None)
+    drawing = Drawing(
+        **dict.fromkeys((field.name for field in fields(Drawing)), 1.0) | {"pictures_per_s": 20.0}
+    )
+    latency = Latency(
+        chunk_to_frame_ms={"p50": 4.9, "p95": 9.2},
+        sound_to_frame_ms={"p50": 65.0, "p95": 69.0},
+        delay_ms=60.0,
+        num_frames=100,
+        cpu_s_per_audio_s={"recognizer": 0.2, "synthesizer": 0.1},
+    )
+    results = {
+        "chain": asdict(latency) | {"page": {"drawings": {"microphone": asdict(drawing)}}},
+        "load": {"cores": 2, "summary": {"sessions": 15.0}},
+        "busy": {
+            "runs": [{"num_programs": 2}],
+            "summary": [{"worst_s": 0.04, "missing": 0.01}],
+        },
+        "browser": asdict(page) | {"others": [asdict(other)]},
+        "sizes": {
+            "model_bytes": {"ear": 2_400_000},
+            "frame_bytes": 369,
+            "floor_cores": {"hop 1": 0.1, "hop 4": 0.04},
+        },
+    }
+    rows = {row[0]: row[1:3] for row in system_tables.system(results)[1]}
+    assert rows["end of a chunk to its frame, p50 / p95, ms"] == ["4.9 / 9.2", "0"]
+    assert rows["processor time of all services, s per s of audio"] == ["0.30", "0.10"]
+    assert rows["page in headless Chromium, microphone, pictures per s"] == ["20", "60"]
+    assert rows["sessions on 2 cores, all speaking"] == ["15", "50"]
+    assert rows["2 busy programs: largest lateness, s / frames missing, %"] == ["0.04 / 1", "0"]
+    assert rows["kouxing-lips in the browser: download, MB / share of a core, %"] == [
+        "4.6 / 8",
+        "2.4 / -",
+    ]
+    assert "HeadAudio in the browser: download, MB / share of a core, %" in rows
