@@ -154,9 +154,8 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
         processor_share=0.08,
     )
     other = replace(page, name="HeadAudio", download_bytes=100_000, delay_ms=None)
-    drawing = Drawing(
-        **dict.fromkeys((field.name for field in fields(Drawing)), 1.0) | {"pictures_per_s": 20.0}
-    )
+    values: dict[str, Any] = dict.fromkeys((field.name for field in fields(Drawing)), 1.0)
+    drawing = Drawing(**values | {"pictures_per_s": 20.0})
     latency = Latency(
         chunk_to_frame_ms={"p50": 4.9, "p95": 9.2},
         sound_to_frame_ms={"p50": 65.0, "p95": 69.0},
