@@ -106,6 +106,7 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
     faces = "[...document.querySelectorAll('kouxing-face')]"
     with serve_folder(site) as origin:
         open_demo(browser, origin)
+        browser.resize(320, 480)  # three heads that are drawn without a GPU
         browser.click("compare")
         browser.wait_for(f"{faces}.length === 3 && {faces}.every(({{ set }}) => set === 'faps')")
         browser.evaluate(
@@ -114,7 +115,7 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
             " window.jaws[i] = Math.max(window.jaws[i], jaw); }), 20); 1"
         )
         browser.click("microphone")
-        browser.wait_for("window.jaws.every((jaw) => jaw > 50)")
+        browser.wait_for("window.jaws.every((jaw) => jaw > 10)")
         browser.click("compare")
         browser.wait_for(f"{faces}.length === 1")
     assert not [text for text in browser.complaints if "GL Driver" not in text]
