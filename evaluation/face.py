@@ -43,10 +43,10 @@ from kouxing.shared.terminal import CONSOLE, print_table
 Floats = NDArray[np.float32]
 Times = NDArray[np.float64]  # (n,) media times, seconds
 
-_PAUSE_S = 0.6  # between recordings
+_PAUSE_S = 0.6  # pause between recordings
 _CHUNK = MEDIA_RATE_HZ // 10
 _REST_S = 60.0
-_MATCH_S = (0.1, 0.3)  # from a stressed vowel to the peak of its movement
+_MATCH_S = (0.1, 0.3)  # range of the time from a stressed vowel to the peak of its movement
 _NOD_DEG, _BROW_UNITS = 0.5, 15.0  # prominence of peaks
 _CLOSED_LID = 450.0  # FAP units, half of a closed lid
 _STILL_DEG, _STILL_UNITS = 0.01, 0.5

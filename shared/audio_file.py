@@ -55,7 +55,7 @@ class AudioSource:
     blocks: Iterator[Samples]
     remarks: list[str] = field(default_factory=list)  # problems; complete after the last block
     is_live: bool = False  # it arrives in real time
-    notices: list[str] = field(default_factory=list)  # to print before reading
+    notices: list[str] = field(default_factory=list)  # messages to print before reading
 
 
 def open_audio(

@@ -29,7 +29,7 @@ AUDIO = Limits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100
 COMMANDS = Limits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
 PHONES = Limits(part_bytes=4 * KIB, queue_length=64)
 SUBSCRIPTIONS = Limits(part_bytes=512, queue_length=32, cost=1.0)  # most of it for the handshake
-RECONNECT_MS = (20, 50)  # between attempts to connect, initial and maximum
+RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
 CONNECT_MS = 300  # for one attempt; limits the round-trip time
 HANDSHAKE_MS = 2000
 

@@ -36,21 +36,21 @@ from kouxing.shared.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.waker import Waker
 
 KIB, MIB = 1024, 1024 * 1024
-CHECK_INTERVAL_S = 0.05  # between two checks of all connections, while data arrives
-MAX_INTERVAL_S = 1.0  # between two checks without new data
+CHECK_INTERVAL_S = 0.05  # interval between checks of all connections while data arrives
+MAX_INTERVAL_S = 1.0  # interval between checks without new data
 RECEIVE_BUFFER = 256 * KIB  # in the kernel, which doubles it
 MAX_UNDELIVERED = 24 * MIB  # limit for all connections together
 MAX_INCOMPLETE = MIB  # limit for all connections together: 16 audio messages on slow links
 SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
 MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
-STALLED_S = 1.0  # without reading, until a live subscriber is disconnected
+STALLED_S = 1.0  # a live subscriber that reads nothing for this time is disconnected
 NEW_LOOKS = 20  # checks in which a connection is new; a flood is disconnected earlier
 MAX_ENDED = 1024  # ended connections that a service has not handled yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
-PENALTY_S = 1.0  # in which a disconnected peer cannot connect again
+PENALTY_S = 1.0  # a disconnected peer cannot connect again for this time
 LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms

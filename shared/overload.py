@@ -23,7 +23,7 @@ SLOWDOWN_FRACTION = 0.5  # fraction of the limit above which the block network r
 LIGHT_FROM = 0.75  # fraction of the limit above which a session uses the light model
 LIGHT_FOR_S = 2.0  # time for which a session that is on time still uses it
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
-REPORT_INTERVAL_S = 1.0  # between reports about one session
+REPORT_INTERVAL_S = 1.0  # interval between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
 ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is just as late
 
@@ -31,7 +31,7 @@ MAX_HOP = 4  # longest time between runs of the block network, in multiples of t
 MAX_LOAD = 0.6  # cores of a recognizer; above it, the network runs less often
 RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
 RESTORE_AFTER_S = 5.0  # time for which the expected load must be that low
-PACE_PERIOD_S = 0.5  # over which the load is measured
+PACE_PERIOD_S = 0.5  # the load is measured over this time
 
 
 @dataclass(frozen=True, slots=True)

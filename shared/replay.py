@@ -9,7 +9,7 @@ from collections import deque
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 
-REPLAY_S = 10.0  # after a worker starts a session; connecting is slow on a busy machine
+REPLAY_S = 10.0  # from the start of a session; connecting is slow on a busy machine
 MAX_REPLAYED = 2000  # messages
 
 

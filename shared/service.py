@@ -51,12 +51,12 @@ if TYPE_CHECKING:
 
 TICK_S = 0.01  # minimum time between ticks
 FOLLOW_UP_S = 0.03  # time between two ticks if a message arrived within ``TICK_S``
-HEARTBEAT_S = 0.25  # between heartbeats with sessions
-IDLE_HEARTBEAT_S = 1.0  # after a heartbeat without sessions
+HEARTBEAT_S = 0.25  # interval between heartbeats with sessions
+IDLE_HEARTBEAT_S = 1.0  # interval after a heartbeat without sessions
 SESSIONS_PER_HEARTBEAT = 16  # limit for a worker, so that a heartbeat's cost does not grow
-RESYNC_AFTER_S = 0.55  # after a heartbeat was due; control may have moved the sessions
+RESYNC_AFTER_S = 0.55  # delay of a heartbeat after which control may have moved the sessions
 REPLY_TIMEOUT_S = 0.5
-NO_REPLY_S = 10.0  # without a reply from control, until the service looks for the reason
+NO_REPLY_S = 10.0  # after this time without a reply from control, the service finds the reason
 FIRST_REPLY_S = 3.0  # limit at startup
 LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0

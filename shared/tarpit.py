@@ -12,7 +12,7 @@ from kouxing.shared import kernel_sockets
 
 MAX_HELD = 1600
 HOLD_S = 2.0  # minimum time
-GAP_S = 0.005  # between two resets; peers that are reset together would reconnect together
+GAP_S = 0.005  # interval between resets; peers that are reset together reconnect together
 
 
 class Tarpit:

@@ -13,7 +13,7 @@ from kouxing.shared.face.faps import FAPS
 
 MIN_STEP = 1.0  # FAP units; a smaller step is invisible
 LATE_S = 0.06  # a frame is late if it arrives more than this after its audio
-CALM_S = 1.0  # without late frames; after that, frames are on time again
+CALM_S = 1.0  # frames are on time again after this time without late frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

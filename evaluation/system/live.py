@@ -12,7 +12,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
-END_LIMIT_S = 15.0  # from the last sample to the last frame
+END_LIMIT_S = 15.0  # limit from the last sample to the last frame
 MAX_UNPACED_FACTOR = 5.0  # longest time for unpaced audio, relative to its length
 NUM_TRIES = 3
 

@@ -124,6 +124,6 @@ class ExportOptions:
     pitch_deg: float = 0.0
     rate_hz: float | None = None  # images per second; None: the default of the motion
     at_s: float | None = None  # time of a single picture
-    sound: Path | None = None  # to add to a .fap file
+    sound: Path | None = None  # sound to add to curves
     captions: CaptionKind | None = None
     speed: float = 1.0

@@ -14,9 +14,9 @@ from kouxing.shared.clock import StallDetector
 from kouxing.shared.parent_process import IDLE_PULSE, PARENT_VARIABLE, PULSE_VARIABLE
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 
-POLL_S = 0.5  # between two checks of a process
-SILENT_S = 1.0  # without a heartbeat; a loop that is silent for longer may hang
-HANG_S = 5.0  # without a heartbeat; a loop that is silent for longer hangs
+POLL_S = 0.5  # interval between checks of a process
+SILENT_S = 1.0  # a loop without a heartbeat for longer may hang
+HANG_S = 5.0  # a loop without a heartbeat for longer hangs
 
 
 class ServiceProcess(subprocess.Popen[bytes]):

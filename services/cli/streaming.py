@@ -17,7 +17,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import plural
 
 PUSH_TIMEOUT_S = 30.0
-STATUS_S = 1.0  # between status requests
+STATUS_S = 1.0  # interval between status requests
 DRIVER_TIMEOUT_S = 20.0  # for a lost driver to restart, on a busy machine
 PIPE_PAUSE_S = 0.2  # a pipe that is silent for longer has paused; its next audio is not late
 PIPE_CLOCK = 0.999  # so that a pipe from a device with a fast clock does not fill

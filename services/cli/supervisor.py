@@ -22,7 +22,7 @@ from kouxing.shared.control_client import connect
 from kouxing.shared.errors import USER_ERROR, UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 
-MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
+MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # delays before restarting a service that crashed twice
 START_LIMIT_S = 120.0
 STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded

@@ -24,7 +24,7 @@ MAX_SERVICES = 2000
 MAX_SERVICES_PER_KEY = 1500
 MAX_REMEMBERED = 1000  # lost services that are recognized when they return
 MAX_LATE_S = 5.0  # a service that is back by then was late, not lost
-TIMEOUT_RESET_S = 60.0  # without a late service, after which the usual timeout applies again
+TIMEOUT_RESET_S = 60.0  # the usual timeout applies again after this time without a late service
 
 
 @dataclass(slots=True)

@@ -25,7 +25,7 @@ from kouxing.shared.logs import LOG, configure
 
 MAX_QUEUED_FRAMES = 180_000  # per video: an hour at 50 frames per second, 75 MB
 MAX_COMMANDS = 500  # commands handled before the next image
-ALIVE_S = 1.0  # between two reports that the process runs
+ALIVE_S = 1.0  # interval between reports that the process runs
 
 
 class Recorder:

@@ -16,9 +16,9 @@ from kouxing.services.driver.video.writer import remove_unfinished
 from kouxing.shared.keys import MAX_KEY_SHARE
 
 MAX_QUEUED = 100_000  # unread commands
-IDLE_S = 10.0  # without a video, after which the process ends and frees its memory
+IDLE_S = 10.0  # after this time without a video, the process ends and frees its memory
 REPORT_S = 0.02  # interval of reading the reports of the process
-HANG_S = 600.0  # without a report; completing a long video may take minutes
+HANG_S = 600.0  # limit without a report; completing a long video may take minutes
 MAX_TICK_S = 0.1  # anything longer is the driver's own delay
 CLOSE_LIMIT_S = 3.0
 KILL_LIMIT_S = 1.0

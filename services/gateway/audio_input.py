@@ -14,7 +14,7 @@ from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
 CHUNK_S = 0.04  # duration of the pieces in which queued audio is passed on
-KEEP_ALIVE_S = 20.0  # without audio, until a piece of silence keeps the session open
+KEEP_ALIVE_S = 20.0  # after this time without audio, a piece of silence keeps the session open
 _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR}
 
 

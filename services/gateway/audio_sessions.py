@@ -14,7 +14,7 @@ from kouxing_client.keys import Key
 from kouxing.services.gateway import wire
 from kouxing.shared.errors import UserError
 
-LAST_FRAME_TIMEOUT_S = 1.5  # after the end of the audio
+LAST_FRAME_TIMEOUT_S = 1.5  # from the end of the audio
 LAST_PHONES_S = 0.2  # the last phones take another way than the last frame
 CONTROL_TIMEOUT_S = 3.0
 
@@ -26,7 +26,7 @@ class AudioSession:
 
     def __init__(self, session: AsyncSession, warn: Warn) -> None:
         self.name = session.name
-        self.is_closed = False  # by control
+        self.is_closed = False  # control has closed it
         self._session = session
         self._warn = warn
         self._frames_ended = asyncio.Event()

@@ -48,10 +48,10 @@ from kouxing.shared.wire.message import Message, replace
 from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Acoustic, Phone, Speech
 
-STATUS_INTERVAL_S = 1.0  # between status requests
-STATUS_TIMEOUT_S = 3.0  # between status requests without an answer, or without viewers
-MISSING_S = 3.0  # until a missing service is reported; after a restart control waits for services
-CONTROL_MISSING_S = 8.0  # until control is reported as missing; a restart takes less
+STATUS_INTERVAL_S = 1.0  # interval between status requests
+STATUS_TIMEOUT_S = 3.0  # interval between status requests without an answer, or without viewers
+MISSING_S = 3.0  # delay of reporting a missing service; a restarted control waits for services
+CONTROL_MISSING_S = 8.0  # delay of reporting that control is missing; a restart takes less
 
 
 @dataclass(slots=True)
@@ -124,7 +124,7 @@ class GatewayService(Service):
         self._resting_face = RestingFace(config.idle_motion_seed)
         self._rest_due_s = 0.0
         self._report_s = -math.inf
-        self._incomplete_since_s = math.inf  # since when reports lack a service
+        self._incomplete_since_s = math.inf  # time of the first report that lacks a service
         self._request_s = 0.0
 
     # --- the loop --------------------------------------------------------------------------------

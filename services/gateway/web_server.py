@@ -21,17 +21,17 @@ from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
 
 MAX_CONNECTIONS = 256
-IDLE_TIMEOUT_S = 10.0  # until a request arrives, and until the next one
+IDLE_TIMEOUT_S = 10.0  # limit until the first or the next request arrives
 BODY_TIMEOUT_S = 70.0  # for the body on unlimited paths; an upload is answered before that
 MAX_HEAD_BYTES = 64 * 1024  # limit for the first line and the headers of a request
-ANSWER_TIMEOUT_S = 120.0  # to send a file; a head has 5 MB
+ANSWER_TIMEOUT_S = 120.0  # limit for sending a file; a head has 5 MB
 BACKLOG = 128
-KEEPALIVE_S = 20  # without data, until a client that has vanished is looked for
+KEEPALIVE_S = 20  # after this time without data, the system checks that the client exists
 _KEEPALIVE_PROBES, _PROBE_S = 3, 5
-LOG_PERIOD_S = 60.0  # between two log lines about errors at the same place
+LOG_PERIOD_S = 60.0  # interval between log lines about errors at the same place
 _CHECK_S = 1.0
-_SHUTDOWN_S = 0.5  # after which handlers are canceled
-_RETRY_S = 1.0  # when the system has no free descriptor
+_SHUTDOWN_S = 0.5  # handlers are canceled after this time
+_RETRY_S = 1.0  # delay when the system has no free descriptor
 # If a connection ends during the system call sendfile, asyncio logs an error.
 web_fileresponse.NOSENDFILE = True  # type: ignore[misc]
 _HEADERS = {  # sent with every answer

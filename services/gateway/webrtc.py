@@ -19,7 +19,7 @@ from av import AudioFrame
 
 from kouxing.shared.errors import UserError
 
-CONNECT_LIMIT_S = 20.0  # from the answer to the first sound
+CONNECT_LIMIT_S = 20.0  # limit from the answer to the first sound
 MAX_CONCEALED = 14_400  # lost samples that are replaced, so that speech continues
 MAX_GAP = 600 * 48_000  # samples; after a longer gap, timestamps start again
 _TIMESTAMP_RANGE = 2**32  # RTP timestamps wrap around at this value

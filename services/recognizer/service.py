@@ -46,9 +46,9 @@ from kouxing.shared.wire.speech import Acknowledge, Speech
 MAX_QUEUED_S = 60.0  # limit for live audio; further audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, and in total
 MAX_UNPACED_S = 0.06  # limit for unpaced audio that live audio may have to wait for
-FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
-SESSION_TICK_S = 0.04  # between ticks while a session is open
-STEP_S = 0.002  # between steps with several sessions, to process their audio together
+FREE_MEMORY_AFTER_S = 10.0  # from the end of a session, because many often end together
+SESSION_TICK_S = 0.04  # interval between ticks while a session is open
+STEP_S = 0.002  # interval between steps with several sessions, to process their audio together
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 

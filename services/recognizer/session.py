@@ -37,8 +37,8 @@ from kouxing.shared.wire.speech import (
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # limit for a paced client ahead of the clock; a delayed one may catch up as much
-ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
-STALLED_AFTER_S = 0.2  # without audio of a live client
+ACKNOWLEDGE_EVERY_S = 0.1  # interval between acknowledgements to a client that sends audio
+STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has stalled
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
 M = TypeVar("M", bound=Message)
 

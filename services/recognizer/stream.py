@@ -205,7 +205,7 @@ class _Segment:
         self, start: int, resampler: Resampler, scorer: SpeechScorer, decoder: LiveDecoder
     ) -> None:
         self.scorer = scorer
-        self.first_index: int | None = None  # in the session, of the segment's first phone
+        self.first_index: int | None = None  # index of the segment's first phone in the session
         self._start = start  # media time, samples at 16 kHz
         self._meter = SliceMeter(start)
         self._resampler = resampler

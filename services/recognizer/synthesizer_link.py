@@ -16,7 +16,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
 MAX_BACKLOG = 2000  # unacknowledged messages above which audio waits
-MAX_OVERDUE_S = 5.0  # after which new messages are dropped, so that other sessions continue
+MAX_OVERDUE_S = 5.0  # new messages are dropped after this time, so that other sessions continue
 KEPT = to_samples(3.0)  # media time of the messages that a new synthesizer gets, samples
 
 

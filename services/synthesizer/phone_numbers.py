@@ -16,7 +16,7 @@ class PhoneNumbers:
 
     def __init__(self) -> None:
         self._base = 0  # added to the recognizer's indices
-        self._next = 0  # after the greatest index
+        self._next = 0  # the greatest index plus one
         self._indices: dict[int, int] = {}  # indices of void phones that were found again
         self._open: dict[int, Phone] = {}  # phones that are not final, by index
         self._void: dict[int, Phone] = {}  # phones of lost recognizers that were not final

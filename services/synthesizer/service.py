@@ -60,7 +60,7 @@ from kouxing.shared.wire.speech import (
 
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
 MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
-DROP_INTERVAL_S = 1.0  # between searches for subscribers that stopped reading
+DROP_INTERVAL_S = 1.0  # interval between searches for subscribers that stopped reading
 MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
 EXPRESSIONS = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2

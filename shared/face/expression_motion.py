@@ -62,7 +62,7 @@ class ExpressionMotion:
     def __init__(self) -> None:
         self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
         self._shown = TwoPoleFilter(self._goal)
-        self._remaining_s = 0.0  # until the expressions fade
+        self._remaining_s = 0.0  # time until the expressions fade
         self._free = 1.0
         self._is_shown = False
 

@@ -66,7 +66,7 @@ class Progress:
     zero_crossing_rate: float = 0.0  # sign changes per sample in the newest 20 ms, 0 to 1
     pitch_hz: float = 0.0  # in the newest 20 ms; 0: unvoiced
     arousal: float = 0.0  # relative to the speaker's mean, -1 to 1
-    valence: float = 0.0  # likewise: below 0 is unpleasant
+    valence: float = 0.0  # relative to the speaker's mean, -1 to 1; below 0 is unpleasant
     is_laughter: bool = False  # laughter is not speech
     is_breath: bool = False  # audible breath, for example before speech
 

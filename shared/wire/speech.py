@@ -94,7 +94,7 @@ class Progress(Message, frozen=True, kw_only=True):
     zero_crossing_rate: Probability = 0.0  # sign changes per sample in the newest 20 ms
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
     arousal: Feeling = 0.0  # arousal in the voice, relative to the speaker's mean
-    valence: Feeling = 0.0  # likewise; below 0: unpleasant
+    valence: Feeling = 0.0  # valence, relative to the speaker's mean; below 0: unpleasant
     is_laughter: bool = False  # someone laughs, which is not speech
     is_breath: bool = False  # audible breath
     # Of the lost synthesizer: the new one continues after it. In the first message of an epoch

@@ -30,7 +30,7 @@ from kouxing_client.session_core import SILENT_S, Inbox, SessionCore, Signal, re
 if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
-RETRY_S = 1.0  # between attempts of a request that is not answered
+RETRY_S = 1.0  # interval between attempts of an unanswered request
 WATCHED = ("event", "session-moved")  # what control publishes about a session
 EVENTS = Decoders(Event)
 T = TypeVar("T")

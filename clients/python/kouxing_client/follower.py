@@ -7,9 +7,9 @@ from typing import Any, Protocol
 
 from kouxing_client.errors import KouxingError
 
-RETRY_S = 3.0  # until an unconfirmed subscription is made again
+RETRY_S = 3.0  # an unconfirmed subscription is made again after this time
 KEEP_S = 3.0  # how long a connection that may be dead stays open for what TCP still delivers
-CATCH_UP_S = 0.1  # after this process was suspended: time in which queued messages arrive
+CATCH_UP_S = 0.1  # queued messages arrive within this time after a suspension
 MAX_OLD = 8  # how many of these live frames are kept
 END = "end-of-faps"
 _PUBLISHER_OF = {"fap-frame": "faps", END: "faps"}  # endpoint; other kinds are at "phones"
@@ -106,8 +106,8 @@ class Follower:
         self._first_epoch = 0
         self._epochs: dict[str, int] = {}  # publisher: epoch of its newest message
         self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
-        self._newest_before: dict[str, _Number] = {}  # when it subscribed again
-        self._seen: set[tuple[str, _Number]] = set()  # since then
+        self._newest_before: dict[str, _Number] = {}  # newest when it subscribed again
+        self._seen: set[tuple[str, _Number]] = set()  # messages since it subscribed again
         self._last_frame = _NONE  # media time and sequence
         self._last_sequence: int | None = None
         self._held_frames: deque[Any] = deque(maxlen=MAX_OLD)

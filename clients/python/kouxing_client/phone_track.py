@@ -21,7 +21,7 @@ class PhoneTrack:
         self.num_missed = 0
         self._epoch = 0  # epoch of the newest phone
         self._base = 0  # added to the recognizer's indices
-        self._next = 0  # after the greatest index
+        self._next = 0  # the greatest index plus one
         self._open: dict[int, Phone] = {}  # phones that are not final, by index
         self._next_final: int | None = None  # the recognizer's index of its next final phone
         self._end = 0  # media time at which the last final phone ends

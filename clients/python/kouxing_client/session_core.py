@@ -34,7 +34,7 @@ MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may t
 END_LIMIT_S = 5.0  # maximum wait for the last phones after the last frame
 LAST_S = 0.5  # for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
-SILENT_S = 2.0  # without results, a followed session may have moved or ended unnoticed
+SILENT_S = 2.0  # without results for this time, a session may have moved or ended
 
 
 class Signal(Protocol):
@@ -215,7 +215,7 @@ class SessionCore:
         self.is_blocked = False  # the audio socket takes no more
         self._audio: Connection | None = None
         self._subscriptions: list[Subscription] = []
-        self._resubscribe_end_s = 0.0  # until then audio waits for subscriptions
+        self._resubscribe_end_s = 0.0  # audio waits for subscriptions until this time
         self._unknown: tuple[float, Refused] | None = None  # its recognizer does not know it
         self._closing: tuple[float, str] | None = None  # deadline and reason of control
 

@@ -17,7 +17,7 @@ from kouxing_client.messages import Decoders, Joined, Message, topic
 
 QUEUE = 20_000  # messages
 LIVE_BUFFER = 65_536  # bytes in the kernel: some seconds of FAP frames, over any distance
-RECONNECT_MS = (20, 50)  # first and longest pause between attempts to connect
+RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
 SUSPENDED_S = 0.5  # a wait that takes this much longer than requested: the process was suspended

@@ -12,7 +12,7 @@ from kouxing_client.session_core import SessionCore, Signal
 from kouxing_client.sockets import Sockets
 
 TICK_S = 0.05
-BUSY_TICK_S = 0.005  # while a socket takes no more audio
+BUSY_TICK_S = 0.005  # interval of ticks while a socket accepts no more audio
 T = TypeVar("T")
 
 

@@ -14,7 +14,7 @@ _TEXT_HEIGHT, _TEXT_WIDTH = 1 / 14, 1 / 20  # largest letters, as shares of the 
 _MIN_TEXT_PX = 12.0
 _BAND_HEIGHT, _MARGIN, _SPACE, _JOINT = 1.9, 0.8, 0.5, 0.15  # letter heights
 PAUSE_S = 0.6  # ends a line
-_EARLY_S = 0.4  # from the appearance of a line to its first syllable
+_EARLY_S = 0.4  # a line appears this long before its first syllable
 _BAND, _TEXT, _OUTLINE = "#14171c", "#d5d9df", "#000000"
 _CURRENT_BOX, _CURRENT_TEXT = "#ffd23f", "#14171c"
 
@@ -26,7 +26,7 @@ class Caption:
     start_s: float
     end_s: float
     text: str
-    is_joined: bool = False  # to the one before it, without a space
+    is_joined: bool = False  # no space separates it from the previous caption
 
 
 def band_height_px(size_px: tuple[int, int]) -> int:

@@ -110,7 +110,7 @@ class Decoder:
         self._shared: list[Segment] = []  # phones that no later frame can change; the latest
         self._last_shared = _NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
-        self._confidence = 0.0  # in the phone
+        self._confidence = 0.0  # confidence in the phone
         self._num_records = self._num_tokens = 0
 
     def copy_state(self, other: Decoder) -> None:

@@ -15,7 +15,7 @@ class KnownPhones:
         self._inventory = inventory
         self._phones: dict[int, Phone] = {}  # by index
         self.speech_ends_s: list[float] = []
-        self._next_index = 0  # after the greatest known index
+        self._next_index = 0  # the greatest known index plus one
         self._first_index = 0  # earlier phones were flushed
 
     def __len__(self) -> int:

@@ -78,7 +78,7 @@ class SpeechIdleMotion:
         self._idle = IdleMotion(seed)
         self._seed = seed
         self._prosody = ProsodyTracker()
-        self._silence_s = math.inf  # at the last frame
+        self._silence_s = math.inf  # silence before the last frame
         self._start_s = -math.inf  # start of the speech
         self._nod_s = self._brow_s = -math.inf  # times of the last movements
         self._is_still = self._is_listening = self._has_heard_pause = False

@@ -17,7 +17,7 @@ from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
 
-_HOLD_S = 0.2  # after the last frame of laughter or breath
+_HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _LAUGHTER_OPENING, _BREATH_OPENING = 0.55, 0.3  # share of an open vowel's opening
 _LAUGHTER_DEG, _BREATH_DEG = -4.0, -1.2  # the head's pitch; upwards
 _NOSTRILS = 60.0  # FAP units

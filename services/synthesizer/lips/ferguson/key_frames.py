@@ -19,9 +19,9 @@ from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 
-OPENING_TIME_S = 0.12  # from a closed mouth to the first phone
+OPENING_TIME_S = 0.12  # time from a closed mouth to the first phone
 PAUSE_S = 0.2  # the mouth stays open in shorter gaps between phones
-_MIN_STEP_S = 1e-3  # between key frames
+_MIN_STEP_S = 1e-3  # minimum time between key frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)

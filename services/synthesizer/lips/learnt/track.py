@@ -16,8 +16,8 @@ from kouxing.services.synthesizer.lips.trajectory import FapState, still
 Array = NDArray[np.float64]
 
 HOLD_S = 0.04  # tolerated lateness of a frame
-CLOSE_S = 0.1  # from the last frame to rest
-_OPEN_S = 0.06  # from rest to the first frame
+CLOSE_S = 0.1  # time from the last frame to rest
+_OPEN_S = 0.06  # time from rest to the first frame
 MAX_GAP_S = CLOSE_S + _OPEN_S  # maximum distance of two frames that are joined
 
 
