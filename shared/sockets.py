@@ -64,8 +64,8 @@ class Socket:
         self._on_joined = on_joined
         self._connection: Connection | None = None  # connection of the last message
         self._sender = NO_PEER  # sender of the last message
-        self._has_rest = False  # unread parts of the last message remain
-        self._rest_from: Connection | None = None  # connection of the unread parts
+        self._has_unread_parts = False  # unread parts of the last message remain
+        self._unread_parts_from: Connection | None = None  # connection of the unread parts
         self._name = secrets.token_hex(8)
         self._followed: set[bytes] = set()  # subscriptions, now or before
         self._prefixes: tuple[bytes, ...] = ()  # those that are not a whole topic
@@ -142,10 +142,10 @@ class Socket:
                 if self.raw.closed:  # by the handler of the last message
                     return
                 try:
-                    self._drop_rest()
+                    self._drop_unread_parts()
                     parts, key = self._take()
                 except zmq.Again:
-                    if not self._has_rest:
+                    if not self._has_unread_parts:
                         self.note_empty()
                     return
                 if self._connection is not None and self._connection.is_cut:
@@ -234,24 +234,24 @@ class Socket:
         while frame.more and len(parts) < MAX_PARTS:
             frame = self.raw.recv(zmq.DONTWAIT, copy=False)
             parts.append(frame.bytes)
-        self._has_rest = frame.more
+        self._has_unread_parts = frame.more
         key = "" if self._zap is None else _property(frame, "User-Id", "")
         if self._limited is not None:
             self._connection = self._limited.deliver(descriptor, key)
-            if self._has_rest and self._connection is not None:
-                self._rest_from = self._connection
+            if self._has_unread_parts and self._connection is not None:
+                self._unread_parts_from = self._connection
                 self._connection.disconnect("its message has too many parts", PENALTY_S)
         return parts, key
 
-    def _drop_rest(self) -> None:
+    def _drop_unread_parts(self) -> None:
         """Drop the rest of a message; raise ``zmq.Again`` if parts are left for the next call."""
         for _ in range(MAX_DROPPED):
-            if not self._has_rest:
+            if not self._has_unread_parts:
                 return
-            self._has_rest = self.raw.recv(zmq.DONTWAIT, False).more  # positional: faster
-        if self._has_rest:
-            if self._rest_from is not None:
-                self._rest_from.budget.block(LONG_PENALTY_S)
+            self._has_unread_parts = self.raw.recv(zmq.DONTWAIT, False).more  # positional: faster
+        if self._has_unread_parts:
+            if self._unread_parts_from is not None:
+                self._unread_parts_from.budget.block(LONG_PENALTY_S)
             raise zmq.Again
 
     def _on_subscription(self, parts: list[bytes], grant: Grant | None) -> None:

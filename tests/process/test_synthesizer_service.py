@@ -22,7 +22,7 @@ RATE_HZ = 50
 START = replace(cast(StartSession, SAMPLES["start-session"]), epoch=1, endpoints={})
 
 
-class Watched(SynthesizerService):
+class RecordingSynthesizer(SynthesizerService):
     """A synthesizer without control that stores published frames."""
 
     def __init__(self) -> None:
@@ -33,10 +33,10 @@ class Watched(SynthesizerService):
         )
         cast(Any, self._faps).send = self.sent.append
 
-    def take(self, session: str, sequence: int, time_s: float) -> None:
+    def receive_progress(self, session: str, sequence: int, time_s: float) -> None:
         """Receive a progress message up to a time."""
-        place: dict[str, Any] = {"session": session, "epoch": 1, "sequence": sequence}
-        self._on_input(Progress(**place, media_time=to_samples(time_s), level_db=-60.0), Peer())
+        header: dict[str, Any] = {"session": session, "epoch": 1, "sequence": sequence}
+        self._on_input(Progress(**header, media_time=to_samples(time_s), level_db=-60.0), Peer())
 
     def frames(self, session: str) -> list[FapFrame]:
         """Return the frames of a session so far."""
@@ -44,8 +44,8 @@ class Watched(SynthesizerService):
 
 
 @pytest.fixture
-def service() -> Iterator[Watched]:
-    service = Watched()
+def service() -> Iterator[RecordingSynthesizer]:
+    service = RecordingSynthesizer()
     for name in ("gap", "other"):
         service.start_session(replace(START, session=name, face=FaceSettings()))
     yield service
@@ -53,7 +53,7 @@ def service() -> Iterator[Watched]:
 
 
 def test_ignores_and_reports_unknown_face_settings(
-    service: Watched, monkeypatch: pytest.MonkeyPatch
+    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     events: list[tuple[str, ...]] = []
     monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
@@ -63,16 +63,16 @@ def test_ignores_and_reports_unknown_face_settings(
     service._on_set_face(SetFace(session="gap", face=face), Peer())
     text = "bad-face: ignored unknown face settings: clay, glee, muscles"
     assert events == [("error", "gap", text)]
-    service.take("gap", 1, 1.0)
+    service.receive_progress("gap", 1, 1.0)
     assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
 
 
-def test_a_gap_does_not_delay_other_sessions(service: Watched) -> None:
-    service.take("gap", 1, 9.9)
+def test_a_gap_does_not_delay_other_sessions(service: RecordingSynthesizer) -> None:
+    service.receive_progress("gap", 1, 9.9)
     assert len(service.frames("gap")) == round(MAX_BURST_S * RATE_HZ)
-    service.take("other", 1, 0.02 + SynthesizerConfig().delay_ms / 1e3)
+    service.receive_progress("other", 1, 0.02 + SynthesizerConfig().delay_ms / 1e3)
     assert len(service.frames("other")) == 2
-    service.take("gap", 2, 9.92)
+    service.receive_progress("gap", 2, 9.92)
     end = Progress(session="gap", epoch=1, sequence=3, media_time=158_720, state=AudioState.ENDED)
     service._on_input(end, Peer())
     num_ticks = 0
@@ -87,33 +87,35 @@ def test_a_gap_does_not_delay_other_sessions(service: Watched) -> None:
     assert num_ticks > 100
 
 
-def test_rejects_messages_beyond_the_queue(service: Watched) -> None:
+def test_rejects_messages_beyond_the_queue(service: RecordingSynthesizer) -> None:
     for sequence in range(1, MAX_QUEUED + 10):
-        service.take("gap", sequence, 5.0 + sequence * 0.02)
+        service.receive_progress("gap", sequence, 5.0 + sequence * 0.02)
     assert len(service._sessions["gap"].queue) == MAX_QUEUED
     for _ in range(300):
         service.on_tick(0.0)
     assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_QUEUED * 0.02 + 0.02)
-    service.take("gap", MAX_QUEUED + 1, 5.0 + (MAX_QUEUED + 1) * 0.02)
+    service.receive_progress("gap", MAX_QUEUED + 1, 5.0 + (MAX_QUEUED + 1) * 0.02)
     assert service.frames("gap")[-1].media_time == to_samples(
         5.0 + (MAX_QUEUED + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
     )
     assert not service._sessions["gap"].queue
 
 
-def test_a_slow_synthesizer_skips_frames(service: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_synthesizer_skips_frames(
+    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now_s = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
-    service.take("gap", 1, 0.08)
+    service.receive_progress("gap", 1, 0.08)
     now_s = 10.0  # it was stopped
     for sequence in range(2, 150):
-        service.take("gap", sequence, 0.1 * sequence)
+        service.receive_progress("gap", sequence, 0.1 * sequence)
     before = len(service.frames("gap"))
     skip = Progress(
         session="gap", epoch=1, sequence=150, media_time=320_000, state=AudioState.SKIPPED
     )
     service._on_input(skip, Peer())  # by the recognizer
-    service.take("gap", 151, 20.0)
+    service.receive_progress("gap", 151, 20.0)
     service.on_tick(now_s)
     assert not service._sessions["gap"].queue
     first, newest = service.frames("gap")[before], service.frames("gap")[-1]

@@ -25,12 +25,12 @@ def test_feature_points_move_as_defined(head: Head) -> None:
     shown = set()
     for fap in heads.DISPLACING:
         for value in (300.0, -120.0):
-            axis, wanted = heads.travel_m(head, fap, value)
+            axis, expected = heads.travel_m(head, fap, value)
             shift = head.deform(heads.only(fap.number, value)) - head.vertices
             for point in fap.feature_points:
                 shown.add(point)
-                came = shift[head.feature_points[point], axis]
-                assert came == pytest.approx(wanted, rel=0.05), (fap.name, point)
+                moved = shift[head.feature_points[point], axis]
+                assert moved == pytest.approx(expected, rel=0.05), (fap.name, point)
     assert len(shown) > 40
 
 

@@ -57,6 +57,6 @@ def test_a_stalled_face_fades_to_rest_and_returns() -> None:
     assert not poses.faps(3.0).any()
     for number in range(25):
         poses.update("a", faps(1), 3.0 + 0.02 * number)
-        came_back = poses.faps(3.0 + 0.02 * number)[0]
-        assert came_back == pytest.approx(min(0.02 * number / FADE_S, 1.0), abs=0.01)
+        shown = poses.faps(3.0 + 0.02 * number)[0]
+        assert shown == pytest.approx(min(0.02 * number / FADE_S, 1.0), abs=0.01)
     assert not poses.is_stalled(3.5)

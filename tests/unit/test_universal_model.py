@@ -75,13 +75,14 @@ def test_the_first_readout_and_the_caches_do_not_change() -> None:
         stream.append_frames(frames)
         other.append_frames(frames)
         while stream.is_due:
-            alone, of_both = (
-                of.session.run([one.block()]) for of, one in ((model, stream), (both, other))
+            outputs, both_outputs = (
+                network.session.run([scored.block()])
+                for network, scored in ((model, stream), (both, other))
             )
-            np.testing.assert_array_equal(alone[2], of_both[2])
-            assert not np.array_equal(alone[0], of_both[0])
-            for one, outputs in ((stream, alone), (other, of_both)):
-                one.append_outputs(*(output[0] for output in outputs))
+            np.testing.assert_array_equal(outputs[2], both_outputs[2])
+            assert not np.array_equal(outputs[0], both_outputs[0])
+            for scored, arrays in ((stream, outputs), (other, both_outputs)):
+                scored.append_outputs(*(array[0] for array in arrays))
 
 
 def test_features_for_training_are_those_of_the_network() -> None:

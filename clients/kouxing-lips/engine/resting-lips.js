@@ -16,7 +16,7 @@ export class RestingLips {
   #isPhone = false; // a phone closes the lips
   #timeS = Infinity;
   #goal = 0;
-  #way = wayTo(0, 0, 0, 1);
+  #transition = transitionTo(0, 0, 0, 1);
   #elapsedS = 0;
 
   constructor({ constants }) {
@@ -65,11 +65,11 @@ export class RestingLips {
   shareAt(timeS) {
     const c = this.#c;
     const nextS = this.#nextSoundS();
-    if (this.#hasEnded) this.#headFor(0, c.END_S);
-    else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#headFor(1, c.PART_S);
-    else if (this.#isPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#headFor(0, c.YIELD_S);
-    else if (timeS > this.#soundS + c.HOLD_S) this.#headFor(0, c.CLOSE_S);
-    else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#headFor(1, c.PART_S);
+    if (this.#hasEnded) this.#setGoal(0, c.END_S);
+    else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#setGoal(1, c.PART_S);
+    else if (this.#isPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
+    else if (timeS > this.#soundS + c.HOLD_S) this.#setGoal(0, c.CLOSE_S);
+    else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#setGoal(1, c.PART_S);
     this.#elapsedS += Math.max(timeS - this.#timeS, 0);
     this.#timeS = timeS;
     return this.#share();
@@ -83,17 +83,17 @@ export class RestingLips {
     return this.#levels.find(([, db]) => this.#isSound(db))?.[0] ?? Infinity;
   }
 
-  #headFor(goal, durationS) {
+  #setGoal(goal, durationS) {
     if (goal === this.#goal) return;
-    this.#way = wayTo(goal, this.#share(), this.#way.at(this.#elapsedS).velocity[0], durationS);
+    this.#transition = transitionTo(goal, this.#share(), this.#transition.at(this.#elapsedS).velocity[0], durationS);
     [this.#goal, this.#elapsedS] = [goal, 0];
   }
 
   #share() {
-    return this.#goal + this.#way.at(this.#elapsedS).value[0];
+    return this.#goal + this.#transition.at(this.#elapsedS).value[0];
   }
 }
 
-function wayTo(goal, share, velocity, durationS) {
+function transitionTo(goal, share, velocity, durationS) {
   return new Transition({ value: [share - goal], velocity: [velocity] }, durationS);
 }

@@ -11,7 +11,7 @@ from typing import Any
 from kouxing.services.driver.head.morphs import EMOTIONS
 from kouxing.shared.face.shapes import ARKIT, VRM
 
-Place = tuple[float, float, float]
+Position = tuple[float, float, float]
 Bindings = Mapping[str, Sequence[tuple[int, int]]]  # morph: pairs of node and target index
 
 _LOOK_DEGREES = {  # eye rotation of ARKit's shapes
@@ -21,7 +21,7 @@ _LOOK_DEGREES = {  # eye rotation of ARKit's shapes
     "rangeMapVerticalUp": 12.0,
 }
 
-_LIMBS: tuple[tuple[str, str, Place], ...] = (
+_LIMBS: tuple[tuple[str, str, Position], ...] = (
     ("UpperLeg", "hips", (0.09, -0.05, 0)),
     ("LowerLeg", "UpperLeg", (0, -0.4, 0)),
     ("Foot", "LowerLeg", (0, -0.4, 0)),
@@ -31,7 +31,7 @@ _LIMBS: tuple[tuple[str, str, Place], ...] = (
 )
 # Each bone with its parent and its position relative to the parent, m; parents first, the floor at
 # 0.
-BONES: tuple[tuple[str, str, Place], ...] = (
+BONES: tuple[tuple[str, str, Position], ...] = (
     ("hips", "", (0, 0.93, 0)),
     ("spine", "hips", (0, 0.12, 0)),
     ("body", "spine", (0, 0.45, 0)),  # the head's pivot; not a bone of the format
@@ -44,7 +44,7 @@ BONES: tuple[tuple[str, str, Place], ...] = (
 
 
 def extension(
-    name: str, nodes: Mapping[str, int], bindings: Bindings, eyes: Place, *, is_free: bool
+    name: str, nodes: Mapping[str, int], bindings: Bindings, eyes: Position, *, is_free: bool
 ) -> dict[str, Any]:
     """Return the contents of the extension for an avatar.
 

@@ -73,7 +73,7 @@ class RestingLips:
         self._is_phone = False  # a phone closes the lips
         self._time_s = math.inf  # time of the last frame
         self._goal = 0.0
-        self._way, self._elapsed_s = _way_to(0.0, 0.0, 0.0, 1.0), 0.0
+        self._transition, self._elapsed_s = _transition_to(0.0, 0.0, 0.0, 1.0), 0.0
 
     def add_event(self, event: SoundEvent) -> None:
         """Add a level, a change of voice activity, or the end of the audio."""
@@ -128,22 +128,22 @@ class RestingLips:
         next_s = self._next_sound_s()
         soon_s = time_s + LEAD_S
         if self._has_ended:
-            self._head_for(0.0, _END_S)
+            self._set_goal(0.0, _END_S)
         elif any(change.active and change.time_s <= soon_s for change in self._changes):
-            self._head_for(1.0, PART_S)
+            self._set_goal(1.0, PART_S)
         elif self._is_phone or self._stays_shut or next_s <= time_s + _YIELD_S:
-            self._head_for(0.0, _YIELD_S)
+            self._set_goal(0.0, _YIELD_S)
         elif time_s > self._sound_s + HOLD_S:
-            self._head_for(0.0, CLOSE_S)
+            self._set_goal(0.0, CLOSE_S)
         elif not self._is_voice or min(next_s, self._known_s) >= self._sound_s + _MIN_PAUSE_S:
-            self._head_for(1.0, PART_S)
+            self._set_goal(1.0, PART_S)
         self._elapsed_s += max(time_s - self._time_s, 0.0)
         self._time_s = time_s
         return self._share()
 
     def relax(self, step_s: float) -> float:
         """Return the share one step closer to rest while media time stands still."""
-        self._head_for(0.0, _RELAX_S)
+        self._set_goal(0.0, _RELAX_S)
         self._elapsed_s += step_s
         return self._share()
 
@@ -153,18 +153,18 @@ class RestingLips:
     def _next_sound_s(self) -> float:
         return next((time_s for time_s, db in self._levels if self._is_sound(db)), math.inf)
 
-    def _head_for(self, goal: float, duration_s: float) -> None:
+    def _set_goal(self, goal: float, duration_s: float) -> None:
         if goal != self._goal:
-            velocity = float(self._way.at(self._elapsed_s).velocity[0])
-            self._way = _way_to(goal, self._share(), velocity, duration_s)
+            velocity = float(self._transition.at(self._elapsed_s).velocity[0])
+            self._transition = _transition_to(goal, self._share(), velocity, duration_s)
             self._goal, self._elapsed_s = goal, 0.0
 
     def _share(self) -> float:
-        return self._goal + float(self._way.value_at(self._elapsed_s)[0])
+        return self._goal + float(self._transition.value_at(self._elapsed_s)[0])
 
 
-def _way_to(goal: float, share: float, velocity: float, duration_s: float) -> Transition:
-    """Return the way from a share and its velocity to a goal."""
+def _transition_to(goal: float, share: float, velocity: float, duration_s: float) -> Transition:
+    """Return the transition from a share and its velocity to a goal."""
     difference = FapState(np.array([share - goal]), np.array([velocity]))
     return Transition(difference, np.array([duration_s]))
 
