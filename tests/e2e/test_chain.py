@@ -250,7 +250,7 @@ def line(phone: events.Phone) -> str:
     return f"{phone.onset_s:9.3f} s  {phone.duration_s:6.3f} s  {phone.symbol}"
 
 
-def test_phones_and_render_return_them(
+def test_phones_and_render_return_the_phones_of_the_chain(
     recordings: list[Path], expected: dict[str, list[events.Phone]], tmp_path: Path
 ) -> None:
     assert kouxing("phones", *recordings, "-o", tmp_path, "--format", "csv").returncode == 0
@@ -273,7 +273,7 @@ def test_phones_and_render_return_them(
         ), rendered.stderr
 
 
-def test_speak_and_listen_return_them(
+def test_speak_and_listen_return_the_phones_of_the_chain(
     system: System,
     command: Command,
     recordings: list[Path],
@@ -297,7 +297,7 @@ def test_speak_and_listen_return_them(
         assert output.splitlines() == [line(phone) for phone in phones]
 
 
-def test_the_asyncio_client_returns_them_bit_for_bit(
+def test_the_asyncio_client_returns_the_phones_of_the_chain_bit_for_bit(
     system: System, recordings: list[Path], expected: dict[str, list[events.Phone]]
 ) -> None:
     async def recognized(client: AsyncClient, path: Path) -> list[Timed]:

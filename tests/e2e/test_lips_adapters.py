@@ -124,7 +124,7 @@ FINGERS = "Thumb Index Middle Ring Pinky".split()
 VISEMES = "aa PP SS TH DD FF kk nn RR CH sil".split()
 
 
-def test_talking_head(browser: Browser, site: Path) -> None:
+def test_moves_the_mouth_of_talking_head(browser: Browser, site: Path) -> None:
     talking_head_avatar(site / "avatar.glb")
     imported, *lines = recipe("mtAvatar").splitlines()
     body = """

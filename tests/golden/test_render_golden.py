@@ -34,7 +34,7 @@ PICTURES = [
 
 
 @pytest.mark.parametrize(("name", "shape"), PICTURES)
-def test_picture(name: str, shape: str) -> None:
+def test_draws_the_stored_picture(name: str, shape: str) -> None:
     renderer = Renderer(heads.load(name, "coarse"), 192, 144, samples=0)
     image = renderer.draw(SHAPES[shape])
     renderer.close()

@@ -152,7 +152,7 @@ def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
     session.close()  # does not wait for the thread, which has ended
 
 
-def test_asyncio_does_the_same(control: FakeControl) -> None:
+def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeControl) -> None:
     async def run() -> list[float]:
         async with AsyncClient(control.address, insecure=True) as client:
             assert [state.service for state in (await client.status()).services]

@@ -242,7 +242,9 @@ def test_plain_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> No
         ({"gateway_frame_ancestors": "https://a.example; script-src *"}, "https://example.org"),
     ],
 )
-def test_reports_wrong_settings(settings: dict[str, str], text: str) -> None:
+def test_a_wrong_setting_ends_the_gateway_with_a_message(
+    settings: dict[str, str], text: str
+) -> None:
     process = gateway_process(**settings)
     _, log = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2

@@ -146,7 +146,7 @@ def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [8_000, 48_000])
-def test_sound_at_other_rates(models: Path, rate_hz: int) -> None:
+def test_resamples_like_the_server(models: Path, rate_hz: int) -> None:
     samples = read(DEMO / "hello-female.wav")
     resampled = soxr.resample(samples, RATE_HZ, rate_hz)
     ours = package_faps(models, resampled, sampleRateHz=rate_hz)

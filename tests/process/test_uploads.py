@@ -100,7 +100,7 @@ async def test_answers_with_the_result_of_the_process() -> None:
     ],
 )
 @async_test
-async def test_answers_with_the_error(program: str, text: str) -> None:
+async def test_answers_with_the_error_of_the_learner(program: str, text: str) -> None:
     async with serve(learner(program)) as post:
         assert await post() == error(422, text)
         assert await post() == error(422, text)  # and accepts the next one

@@ -32,7 +32,7 @@ def display() -> Iterator[str]:
         server.wait()
 
 
-def test_on_a_display(display: str) -> None:
+def test_shows_heads_in_windows_on_a_display(display: str) -> None:
     environment = {**os.environ, **ONE_THREAD, "DISPLAY": display}
     environment.pop("WAYLAND_DISPLAY", None)
     result = subprocess.run(

@@ -79,7 +79,9 @@ def test_tables_have_the_phone_of_each_frame(tmp_path: Path) -> None:
         (["23:59:59:59.0", "00:00:00:00.0"], [0, 1 / 60]),
     ],
 )
-def test_time_codes(tmp_path: Path, codes: list[str], times_s: list[float]) -> None:
+def test_reads_time_codes_of_live_link_takes(
+    tmp_path: Path, codes: list[str], times_s: list[float]
+) -> None:
     path = tmp_path / "take.csv"
     rows = [f"{code},61,{number * 0.1}\n" for number, code in enumerate(codes)]
     path.write_text("Timecode,BlendShapeCount,JawOpen\n" + "".join(rows))

@@ -29,7 +29,7 @@ def test_clips_floats_above_one() -> None:
     np.testing.assert_array_equal(samples_of(pcm, "f32le", 1)[:, 0], [1.0, -1.0, 0.25])
 
 
-def test_level() -> None:
+def test_level_is_the_rms_in_decibels_of_full_scale() -> None:
     sine = np.sin(np.arange(16000) * 0.1).astype(np.float32)
     assert level_db(sine) == pytest.approx(-3.01, abs=0.01)
     assert level_db(np.zeros(10, np.float32)) == -120.0

@@ -46,7 +46,9 @@ def test_feature_points_move_as_defined(head: Head) -> None:
         ("head_roll", "11.4", 2, 0, -1),  # the top tilts to the subject's right
     ],
 )
-def test_rotations(head: Head, name: str, point: str, about: int, axis: int, sign: int) -> None:
+def test_rotates_eyes_and_head_in_the_direction_of_the_fap(
+    head: Head, name: str, point: str, about: int, axis: int, sign: int
+) -> None:
     vertices = head.deform(neutral_faps(**{name: 10_000.0}))  # 0.1 rad
     vertex = head.feature_points[point]
     eye = int(name.split("_")[1] == "r")

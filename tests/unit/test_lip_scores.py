@@ -52,7 +52,7 @@ def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
     assert "A: learnt, 0 ms, B: learnt, 60 ms" in result.output
 
 
-def test_groups_of_a_clip() -> None:
+def test_groups_clips_by_language_speaker_and_source() -> None:
     clip = clip_of(np.zeros(1), np.zeros((1, 28)))
     common = ["source made", "speaker nobody"]
     assert groups_of(clip, set()) == ["all", "zh", "zh new", *common]

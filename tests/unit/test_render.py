@@ -51,7 +51,7 @@ def test_framed_parts_are_in_the_picture(head: Head, framing: Framing) -> None:
         assert np.abs(seen(head, framing, point)).max() < 0.97
 
 
-def test_backgrounds() -> None:
+def test_parses_backgrounds_and_rejects_others() -> None:
     assert background("studio") == BACKGROUND
     assert background("transparent") is None
     assert background("#Ff8000") == ((1.0, 128 / 255, 0.0),) * 2

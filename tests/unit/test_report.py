@@ -140,7 +140,7 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert (tmp_path / "lookahead.png").stat().st_size > 1000
 
 
-def test_markdown_table() -> None:
+def test_writes_a_markdown_table() -> None:
     assert markdown((("a", "b"), [["1", "2"]])) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
 
 

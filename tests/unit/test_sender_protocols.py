@@ -131,7 +131,7 @@ def response(kind: str, **data: object) -> str:
     return json.dumps({"apiName": "VTubeStudioPublicAPI", "messageType": kind, "data": data})
 
 
-def test_vtube_studio_errors() -> None:
+def test_vtube_studio_errors_are_explained_or_ignored() -> None:
     dialogue = VTubeStudioProtocol("revoked", lambda _: None)
     assert json.loads(dialogue.first_message())["messageType"] == "AuthenticationRequest"
     request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=False)))

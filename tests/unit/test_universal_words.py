@@ -18,7 +18,7 @@ def words_of(**row: str) -> list[str]:
     return [" ".join(word) for word in universal_words({"utt_id": "a", "text": "", **row})]
 
 
-def test_columns_of_phones() -> None:
+def test_reads_phones_from_ipa_arpabet_and_pinyin_columns() -> None:
     assert words_of(ipa="t͡ʃaɪ niː", language="xx") == ["ch a ih", "n i"]
     assert words_of(arpabet="S T AY T AH N") == ["s", "t", "a", "ih", "tasp", "ax", "n"]
     assert words_of(pinyin="zhong1 guo2") == ["tr uh ng", "k w o"]
@@ -76,7 +76,7 @@ def test_each_row_of_a_corpus_has_its_language(tmp_path: Path) -> None:
     assert "language 'xx' has no tables" in errors.messages[0]
 
 
-def test_feature_errors() -> None:
+def test_feature_errors_are_the_share_of_wrong_features() -> None:
     known = features()
     voicing = sum(a != b for a, b in zip(known["p"], known["b"], strict=True)) / 24
     assert feature_errors("p a".split(), "b a".split()) == voicing == 1 / 24
