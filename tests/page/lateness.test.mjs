@@ -13,7 +13,7 @@ class Stream {
   #sentMs = 0;
 
   /** Run for a time; return isBehind at each update. The frames that are due arrive in order. */
-  run(forMs, lateMs = 0, { isLive = true, isPaused = false, imageMs = 0 } = {}) {
+  run(forMs, lateMs = 0, { isLive = true, isPaused = false, imageMs = null } = {}) {
     const states = [];
     for (const endMs = this.nowMs + forMs; this.nowMs < endMs; ) {
       this.nowMs += FRAME_MS;
@@ -21,7 +21,8 @@ class Stream {
       else this.#mediaMs += FRAME_MS;
       for (; this.#sentMs < this.#mediaMs - lateMs; this.#send()) this.#sentMs += FRAME_MS;
       if (this.nowMs % UPDATE_MS > 0) continue;
-      this.lateness.update(this.nowMs, isLive, imageMs);
+      if (imageMs !== null) this.lateness.imageVisible(this.nowMs - imageMs, this.nowMs);
+      this.lateness.update(this.nowMs, isLive);
       states.push(this.lateness.isBehind);
     }
     return states;
@@ -79,8 +80,9 @@ test("frames that do not arrive are late", () => {
 test("the page is behind while images are visible late, although frames arrive in time", () => {
   const stream = new Stream();
   assert.equal(stream.run(3000, 0, { imageMs: 150 }).at(-1), false);
-  assert.equal(stream.run(1200, 0, { imageMs: 1900 }).at(-1), true);
+  assert.equal(stream.run(3000, 0, { imageMs: 1900 }).at(-1), true);
   assert.ok(stream.lateness.recentMs >= 1900, `${stream.lateness.recentMs}`);
+  assert.equal(stream.run(6000).at(-1), false, "a face that does not move");
 });
 
 test("a pause of the audio and a session that has ended are not behind", () => {

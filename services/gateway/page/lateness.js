@@ -10,6 +10,7 @@ const MAX_SKIP_MS = 10000; // a longer gap is a pause of the client
 const SHOWN_AFTER_MS = 1000; // time with late frames
 const OVER_AFTER_MS = 2000; // time without late frames
 const RECENT_MS = 1000; // window of the displayed lateness
+const IMAGES_MS = 3000; // window of the delays of images
 
 /**
  * The lateness of the face: that of the newest frame, and the delay until its image is visible. A live client sends audio in real time. The arrival of a frame
@@ -21,6 +22,7 @@ export class Lateness {
   #newest = -1; // media time, samples
   #differences = new SlidingWindow(WINDOW_MS); // arrival - media time, ms
   #recent = new SlidingWindow(RECENT_MS); // lateness, ms
+  #imageDelays = new SlidingWindow(IMAGES_MS); // until images are visible, ms
   #agreedMs = null; // when the frames last agreed with isBehind
 
   /**
@@ -39,13 +41,14 @@ export class Lateness {
     this.#differences.add(nowMs, nowMs - mediaTime / SAMPLES_PER_MS);
   }
 
-  /**
-   * Update isBehind; call this regularly.
-   *
-   * @param isLive whether frames and sound arrive
-   * @param imageDelayMs from computing a face until its image is visible
-   */
-  update(nowMs, isLive, imageDelayMs = 0) {
+  /** Record that an image became visible. faceMs: when its face was computed. */
+  imageVisible(faceMs, visibleMs) {
+    this.#imageDelays.add(visibleMs, visibleMs - faceMs);
+  }
+
+  /** Update isBehind; call this regularly. isLive: whether frames and sound arrive. */
+  update(nowMs, isLive) {
+    const imageDelayMs = this.#imageDelays.medianAt(nowMs) ?? 0; // a face that does not move has no images
     const differenceMs = nowMs - this.#newest / SAMPLES_PER_MS;
     const lateMs = isLive ? imageDelayMs + Math.max(0, differenceMs - this.#differences.min) : 0;
     this.#recent.add(nowMs, lateMs);

@@ -168,7 +168,7 @@ function draw(nowMs) {
   const shown = { mediaTime: frameTime, faps: player.faps.slice() };
   // During a lesson the machine is needed to find the user's face.
   stage.draw(nowMs, hasChanged && lesson.step === "closed", (seenMs) => {
-    player.imageVisible(seenMs, frameTime);
+    player.imageVisible(nowMs, seenMs, frameTime);
     window.kouxing.onPicture?.({ seenMs, ...shown });
   });
   if (mediaTime !== null) {

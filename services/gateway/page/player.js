@@ -78,8 +78,9 @@ export class Player {
     return { mediaTime, frameTime, hasChanged: this.#mix(share) };
   }
 
-  /** Record that the image of a frame became visible. */
-  imageVisible(visibleMs, frameTime) {
+  /** Record that the image of a frame became visible. faceMs: when its face was computed. */
+  imageVisible(faceMs, visibleMs, frameTime) {
+    this.lateness.imageVisible(faceMs, visibleMs);
     if (frameTime !== null) this.#addVoiceAge(this.#imageDelays, visibleMs, frameTime);
   }
 

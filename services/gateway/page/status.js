@@ -167,7 +167,7 @@ export class StatusBar {
     const isMicrophoneInterrupted = speech.state === "interrupted";
     const isStalled = this.#wasLive && session !== null && session === speech.session;
     const isInterrupted = isMicrophoneInterrupted || isStalled;
-    player.lateness.update(nowMs, isLive && session !== null, player.playout.imageDelayMs);
+    player.lateness.update(nowMs, isLive && session !== null);
     const isBehind = isLive && player.lateness.isBehind;
     const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
     element("status").dataset.state = state;
