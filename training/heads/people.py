@@ -163,7 +163,7 @@ PEOPLE = {
         skin="young_lightskinned_male_diffuse3",
         hair="short02",
         brows="eyebrow012",
-        raised=0.012,
+        raised=0.008,
         tucked=0.0222,
     ),
     "rosa": Person(
