@@ -93,8 +93,8 @@ def feature_errors(reference: Sequence[str], recognized: Sequence[str]) -> float
     """
     known = features()
     costs = [
-        [sum(map(ne, known[wanted], known[found])) / len(known[found]) for found in recognized]
-        for wanted in reference
+        [sum(map(ne, known[expected], known[found])) / len(known[found]) for found in recognized]
+        for expected in reference
     ]
     row = np.arange(len(recognized) + 1.0)
     for i in range(len(reference)):

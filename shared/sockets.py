@@ -107,14 +107,14 @@ class Socket:
         """Return whether a topic may have a subscriber. Encoding for nobody takes time."""
         return label in self._followed or label.startswith(self._prefixes)
 
-    def _follow(self, wanted: bytes) -> None:
+    def _follow(self, subscription: bytes) -> None:
         """Record that a subscription, a topic or a prefix of topics, is in effect."""
         if len(self._followed) == MAX_FOLLOWED:
             self._prefixes = (b"",)
-        elif wanted not in self._followed:
-            self._followed.add(wanted)
-            if wanted.count(b"/") < 2:  # not a whole topic
-                self._prefixes += (wanted,)
+        elif subscription not in self._followed:
+            self._followed.add(subscription)
+            if subscription.count(b"/") < 2:  # not a whole topic
+                self._prefixes += (subscription,)
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
         """Subscribe to a kind of message, of one session or of all (None)."""
@@ -127,8 +127,8 @@ class Socket:
         Every publisher answers with one ``joined`` message when all of them are in effect:
         subscriptions keep their order, and the one to ``joined`` is the last.
         """
-        wanted: list[type[Message]] = [*kinds, Joined]
-        for kind in wanted:
+        subscribed: list[type[Message]] = [*kinds, Joined]
+        for kind in subscribed:
             self.subscribe(kind, session)
 
     def receive(self) -> Iterator[Received]:
@@ -257,26 +257,26 @@ class Socket:
     def _on_subscription(self, parts: list[bytes], grant: Grant | None) -> None:
         if len(parts) != 1:  # not a subscription
             return
-        verb, wanted = parts[0][:1], parts[0][1:]
+        verb, subscription = parts[0][:1], parts[0][1:]
         if self._connection is not None and self._limited is not None:
             if verb == b"\x01":
-                self._limited.subscribe(self._connection, wanted)
+                self._limited.subscribe(self._connection, subscription)
             else:
-                self._connection.topics.discard(wanted)
+                self._connection.topics.discard(subscription)
             if self._connection.is_cut:
                 return
-        may = grant is None or may_follow(grant, wanted)  # everyone may without keys
+        may = grant is None or may_follow(grant, subscription)  # everyone may without keys
         if verb == b"\x00":
-            self.raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
+            self.raw.setsockopt(zmq.UNSUBSCRIBE, subscription)
         elif verb == b"\x01" and may:
-            self.raw.setsockopt(zmq.SUBSCRIBE, wanted)
-            self._follow(wanted)
-            self._confirm_subscription(wanted)
+            self.raw.setsockopt(zmq.SUBSCRIBE, subscription)
+            self._follow(subscription)
+            self._confirm_subscription(subscription)
 
-    def _confirm_subscription(self, wanted: bytes) -> None:
+    def _confirm_subscription(self, subscription: bytes) -> None:
         prefix = f"{Joined.kind}/".encode()
-        session = wanted.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
-        if wanted.startswith(prefix) and is_name(session):
+        session = subscription.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
+        if subscription.startswith(prefix) and is_name(session):
             self.send(Joined(session=session, publisher=self._name))
             self._on_joined(session)
 

@@ -48,22 +48,22 @@ class Stage:
             service.send(beat(kind))
             self.buses.append(bus)
             self.services.append(service)
-        self.strangers: list[zmq.Socket[bytes]] = []
+        self.clients: list[zmq.Socket[bytes]] = []
         self.sockets = zmq.Context()
         while not all(service.wait(0.0) for service in self.services):  # they are registered
             self.control.step(0.01)
 
     def close(self) -> None:
-        for raw in self.strangers:
+        for raw in self.clients:
             raw.close(linger=0)
         self.sockets.term()
         for bus in (*self.buses, self.control.bus):
             bus.close()
 
-    def stranger(self, key: Key | None, address: str = "") -> zmq.Socket[bytes]:
+    def connect_client(self, key: Key | None, address: str = "") -> zmq.Socket[bytes]:
         """Return a socket with the same routing id each time; ``address`` may be a forwarder."""
         raw = self.sockets.socket(zmq.DEALER)
-        self.strangers.append(raw)
+        self.clients.append(raw)
         raw.setsockopt(zmq.ROUTING_ID, b"the same")
         endpoint = self.control.endpoints["commands"]
         if address:

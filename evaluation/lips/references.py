@@ -57,7 +57,7 @@ class Reference:
         """Whether somebody speaks at the given times.
 
         Voice activity is on, and a loud sound is within 0.1 s. Voice activity alone spans pauses of
-        half a second; the level alone mistakes noise for speech.
+        half a second, and the level mistakes noise for speech.
         """
         after = np.searchsorted([change.time_s for change in self.voice], time_s, side="right")
         is_active = np.array([False, *(change.active for change in self.voice)])[after]

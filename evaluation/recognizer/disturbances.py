@@ -102,8 +102,8 @@ def add_echoes(samples: Samples) -> Samples:
     num_samples = round(_REVERBERATION_S * SAMPLE_RATE_HZ)
     decay = 10 ** (-3 * np.arange(num_samples) / num_samples)  # by 60 dB
     echoes = np.random.default_rng(5).normal(size=num_samples) * decay
-    heard = fftconvolve(samples, echoes / np.sqrt(np.sum(echoes**2)))[: len(samples)]
-    return as_samples((samples + heard) / np.sqrt(2))
+    reverberated = fftconvolve(samples, echoes / np.sqrt(np.sum(echoes**2)))[: len(samples)]
+    return as_samples((samples + reverberated) / np.sqrt(2))
 
 
 def limit_to_telephone_band(samples: Samples) -> Samples:

@@ -42,10 +42,10 @@ def compare(seen: Seen, undisturbed: Seen, delay_s: float, *, fault_s: float) ->
     newest = np.maximum.accumulate(np.concatenate([[-1], times]))[:-1]  # before each frame
     is_new = times > newest
     is_rest = np.diff(times, prepend=-1) == 0
-    said, heard = (
+    reference, recognized = (
         [phone.symbol for phone in record.spoken_phones()] for record in (undisturbed, seen)
     )
-    errors = count_errors(said, heard)
+    errors = count_errors(reference, recognized)
     due_s = seen.start_s + delay_s + times / MEDIA_RATE_HZ
     is_live = is_new & (arrived_s < seen.live_until_s)
     late_s = (arrived_s - due_s)[is_live]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 _LINE = re.compile(  # up to the first Chinese character, and after the last one
-    "(?P<before>[^\u3400-\u9fff]*)(?P<said>[\u3400-\u9fff]|[\u3400-\u9fff].*[^\0-\x7f])"
+    "(?P<before>[^\u3400-\u9fff]*)(?P<spoken>[\u3400-\u9fff]|[\u3400-\u9fff].*[^\0-\x7f])"
     "(?P<after>[\0-\x7f]*)"
 )
 _TIME = re.compile(r"(?<![\w.])\d+(?:[:'′]\d+)*(?:\.\d+)?")
@@ -29,7 +29,7 @@ def without_columns(text: str) -> str:
         before = [""] * len(parts)
     if _are_times(after) or _are_names(after, _NAME_AFTER):
         after = [""] * len(parts)
-    rows = zip(before, (match["said"] for match in parts), after, strict=True)
+    rows = zip(before, (match["spoken"] for match in parts), after, strict=True)
     kept = ["".join(row) for row in rows]
     return text if kept == lines else "\n".join(kept)
 

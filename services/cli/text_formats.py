@@ -218,11 +218,11 @@ def _read_events(text: str) -> str:
             fields = [name.strip().lower() for name in rest.split(",")]
         if kind.strip() == "Dialogue":
             values = dict(zip(fields, rest.strip().split(",", len(fields) - 1), strict=False))
-            said = values.get("text", "")
-            if not re.search(r"\{[^}]*\\p[1-9]", said):  # a drawing
+            spoken = values.get("text", "")
+            if not re.search(r"\{[^}]*\\p[1-9]", spoken):  # a drawing
                 start = [float(part) for part in values.get("start", "0").split(":")]
-                events.append((start, re.sub(r"\\[Nnh]", "\n", _BRACES.sub("", said))))
-    return "\n".join(said for _, said in sorted(events, key=lambda event: event[0]))
+                events.append((start, re.sub(r"\\[Nnh]", "\n", _BRACES.sub("", spoken))))
+    return "\n".join(spoken for _, spoken in sorted(events, key=lambda event: event[0]))
 
 
 def _read_labels(text: str) -> str:
@@ -270,8 +270,8 @@ def _read_text_grid(text: str) -> str:
     if len(chosen) > 1 and chosen is tiers:
         names = ", ".join(repr(tier[0]) for tier in tiers if tier)
         raise UserError(
-            f"this TextGrid has the tiers {names}, none with Chinese characters; give the spoken"
-            " text alone"
+            f"this TextGrid has the tiers {names}, none with Chinese characters; give only"
+            " the spoken text"
         )
     labels = chosen[0][1:] if chosen else []
     return "\n".join(label for label in labels if label.lower() not in _UNSPOKEN_LABELS)

@@ -16,27 +16,27 @@ _INSTALL = (
 def transcribe_phrases(phrases: Sequence[Sequence[str]], voice: str) -> list[list[str]]:
     """Return the IPA of each word of each phrase; phones of more than one letter are tied.
 
-    A word is read within its phrase, or alone if espeak-ng joins words of the phrase. A silent word
-    has an empty text. ``voice`` is an espeak-ng voice.
+    A word is read within its phrase, or on its own if espeak-ng joins words of the phrase. A
+    silent word has an empty text. ``voice`` is an espeak-ng voice.
 
     Raises ``UserError`` if espeak-ng is missing or fails.
     """
     together = _lines_of([" ".join(phrase) for phrase in phrases], voice)
     spoken = [line.split() for line in together]
-    alone = [
+    single_words = [
         [line] if len(phrase) == 1 else words if len(words) == len(phrase) else None
         for line, words, phrase in zip(together, spoken, phrases, strict=True)
     ]
     missing = [
         word
-        for words, phrase in zip(alone, phrases, strict=True)
+        for words, phrase in zip(single_words, phrases, strict=True)
         if words is None
         for word in phrase
     ]
     rest = iter(_lines_of(missing, voice))
     return [
         [next(rest) for _ in phrase] if words is None else words
-        for words, phrase in zip(alone, phrases, strict=True)
+        for words, phrase in zip(single_words, phrases, strict=True)
     ]
 
 

@@ -28,7 +28,7 @@ def stage(request: pytest.FixtureRequest, new_keys: None) -> Iterator[Stage]:
 
 
 def test_a_repeated_request_gets_the_same_answer(stage: Stage) -> None:
-    client = stage.stranger(stage.control.key and user_key())
+    client = stage.connect_client(stage.control.key and user_key())
     first = stage.open(client, "mine")
     assert isinstance(first, SessionOpened)
     assert stage.open(client, "mine") == first
@@ -37,7 +37,7 @@ def test_a_repeated_request_gets_the_same_answer(stage: Stage) -> None:
 @pytest.mark.parametrize("stage", [False], indirect=True)
 def test_sessions_end_when_their_key_is_revoked(stage: Stage, tmp_path: Path) -> None:
     add_key("laptop", ["client"], tmp_path / "laptop.key")
-    laptop = stage.stranger(read_key(tmp_path / "laptop.key"))
+    laptop = stage.connect_client(read_key(tmp_path / "laptop.key"))
     assert isinstance(stage.open(laptop, "revoked"), SessionOpened)
     with Bus(user_key()) as bus:
         client = bus.connect_dealer(stage.control.endpoints["commands"])
@@ -49,7 +49,7 @@ def test_sessions_end_when_their_key_is_revoked(stage: Stage, tmp_path: Path) ->
 
 
 def test_a_service_can_refuse_a_session(stage: Stage) -> None:
-    client = stage.stranger(stage.control.key and user_key())
+    client = stage.connect_client(stage.control.key and user_key())
     stage.refusal = Error(code="busy", text="too many videos", retry_after_s=5.0)
     refused = stage.open(client, "mine")
     assert isinstance(refused, Error)
@@ -116,7 +116,7 @@ def link(stage: Stage) -> Iterator[ControlProxy]:
 def disconnect_before_the_answer(stage: Stage, link: ControlProxy) -> tuple[zmq.Socket[bytes], str]:
     """Return a client that misses the answer to its request, and the token in that answer."""
     address = f"tcp://127.0.0.1:{link.listener.getsockname()[1]}"
-    client = stage.stranger(stage.control.key and user_key(), address)
+    client = stage.connect_client(stage.control.key and user_key(), address)
     client.send_multipart(encode(OpenSession(request="1", session="mine")))
     stage.step_until(lambda: stage.control._sessions.get("mine"))
     link.is_open.clear()
@@ -153,14 +153,14 @@ def test_a_session_with_audio_is_not_opened_again(stage: Stage, link: ControlPro
 
 def test_a_connection_with_a_stolen_routing_id_gets_no_old_answer(stage: Stage) -> None:
     key = stage.control.key and user_key()
-    assert isinstance(stage.open(stage.stranger(key), "mine"), SessionOpened)
-    stolen = stage.open(stage.stranger(key), "mine")
+    assert isinstance(stage.open(stage.connect_client(key), "mine"), SessionOpened)
+    stolen = stage.open(stage.connect_client(key), "mine")
     assert getattr(stolen, "code", "") == "session-exists"
 
 
 @pytest.mark.parametrize("stage", [True], indirect=True)
 def test_a_face_learns_when_the_session_that_it_listens_to_speaks(stage: Stage) -> None:
-    client = stage.stranger(stage.control.key and user_key())
+    client = stage.connect_client(stage.control.key and user_key())
     stage.open(client, "speaker")
     stage.open(client, "listener", "2")
     client.send_multipart(
@@ -170,9 +170,9 @@ def test_a_face_learns_when_the_session_that_it_listens_to_speaks(stage: Stage) 
     recognizer, synthesizer = stage.services
     for active in (True, False):
         recognizer.send(Speech(session="speaker", epoch=1, sequence=1, active=active))
-    heard: list[bool] = []
-    while len(heard) < 2:
+    listening: list[bool] = []
+    while len(listening) < 2:
         messages = stage.receive(synthesizer)
         faces = [message.face for message in messages if isinstance(message, SetFace)]
-        heard += [face.listening for face in faces if face.listening is not None]
-    assert heard == [True, False]
+        listening += [face.listening for face in faces if face.listening is not None]
+    assert listening == [True, False]

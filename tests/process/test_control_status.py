@@ -26,7 +26,7 @@ def ask(stage: Stage, client: Socket, **fields: object) -> StatusReport | Error:
 
 def open_sessions(stage: Stage, number: int) -> list[str]:
     names = [f"s{item}" for item in range(number)]
-    raw = stage.stranger(None)
+    raw = stage.connect_client(None)
     for name in names:
         stage.open(raw, name, request=name)
     return names

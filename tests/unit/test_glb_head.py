@@ -147,7 +147,7 @@ MANY = [{"attributes": {"POSITION": 0}}] * 2001
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (change("accessors", 0, count=10**9), "more than 300000 vertices"),
         (change("accessors", 1, count=10**9), "an accessor has 1000000000 elements"),
@@ -170,17 +170,17 @@ MANY = [{"attributes": {"POSITION": 0}}] * 2001
     ],
 )
 def test_rejects_bad_descriptions(
-    small: Path, damage: Callable[[dict[str, Any]], None], said: str
+    small: Path, damage: Callable[[dict[str, Any]], None], message: str
 ) -> None:
     document, binary = read_chunks(small)
     damage(document)
     write_chunks(small, document, binary)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         read_glb(small)
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (b"", "not a binary glTF"),
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
@@ -189,9 +189,9 @@ def test_rejects_bad_descriptions(
         (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "file is damaged"),
     ],
 )
-def test_rejects_bad_bytes(tmp_path: Path, data: bytes, said: str) -> None:
+def test_rejects_bad_bytes(tmp_path: Path, data: bytes, message: str) -> None:
     (tmp_path / "my.glb").write_bytes(data)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         read_glb(tmp_path / "my.glb")
 
 
@@ -213,15 +213,15 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.mark.parametrize(
-    ("texture", "said"),
+    ("texture", "message"),
     [
         (b"#EXTM3U\n/etc/hostname\n", "not PNG, JPEG or WebP"),
         (PNG + bytes(50), "damaged"),
         (PNG + b"\0\0\0\rIHDR" + struct.pack(">IIB", 30_000, 30_000, 8), "million pixels"),
     ],
 )
-def test_rejects_bad_textures(tmp_path: Path, texture: bytes, said: str) -> None:
+def test_rejects_bad_textures(tmp_path: Path, texture: bytes, message: str) -> None:
     parts = meshes(SHAPES)
     parts[0].texture = texture
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         read_glb(write_glb(tmp_path / "my.glb", parts))

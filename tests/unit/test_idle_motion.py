@@ -72,15 +72,15 @@ def test_the_head_nods_at_the_end_of_a_phrase_and_tilts_after_a_question() -> No
     sound = levels((2.0, QUIET_DB), (0.6, SILENT_DB))
     flat = [200.0] * 100 + [0.0] * 30
     rising = [200.0] * 85 + [200.0 * 2 ** (k / 15) for k in range(1, 16)] + [0.0] * 30
-    said, asked = (
+    statement, question = (
         show(make_face(idle_motion_seed=3), sound, pitches_hz=pitches) for pitches in (flat, rising)
     )
-    difference = asked - said
+    difference = question - statement
     assert np.abs(difference[:105, ROLL]).max() < 1.0
     assert np.abs(difference[105:, ROLL]).max() > 1.5 * DEGREE
     assert difference[105:, BROW].max() > 30.0
     even = show(make_face(idle_motion_seed=3), [QUIET_DB] * len(sound))
-    assert (said - even)[100:, PITCH].max() > DEGREE / 2
+    assert (statement - even)[100:, PITCH].max() > DEGREE / 2
 
 
 def test_the_head_holds_still_in_pauses() -> None:
@@ -123,9 +123,9 @@ def test_a_listener_looks_at_the_viewer_and_nods_and_blinks_slowly_in_pauses() -
     for seed in SEEDS:
         face = make_face(idle_motion_seed=seed)
         face.set_behavior(Behavior(listening=True))
-        heard = face.relax(500)
+        relaxed = face.relax(500)
         face.set_behavior(Behavior(listening=False))
-        faps.append(np.array([values for _, values in heard + face.relax(50)]))
+        faps.append(np.array([values for _, values in relaxed + face.relax(50)]))
     away = np.abs([gaze_deg(run[:500]) for run in faps]) > 1.5
     assert away.mean() < 0.15
     for run in faps:

@@ -65,11 +65,11 @@ def test_parts_textures_and_units(imported: Head) -> None:
 
 def test_feature_points_move_as_defined(imported: Head) -> None:
     for fap, value in product(heads.DISPLACING, (300.0, -120.0)):
-        axis, wanted = heads.travel_m(imported, fap, value)
+        axis, expected = heads.travel_m(imported, fap, value)
         shift = moved(imported, heads.only(fap.number, value))
         for point in imported.feature_points.keys() & fap.feature_points:
-            came = shift[imported.feature_points[point], axis]
-            assert came == pytest.approx(wanted, rel=0.05), (fap.name, point)
+            travel = shift[imported.feature_points[point], axis]
+            assert travel == pytest.approx(expected, rel=0.05), (fap.name, point)
 
 
 def test_jaw_eyes_head_and_shoulders(imported: Head) -> None:
@@ -137,7 +137,7 @@ def face(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "no feature points"),
         ("2.1 0 0", "line 1: expected 'point x y z' or 'point vertex'"),
@@ -152,14 +152,14 @@ def face(tmp_path: Path) -> Path:
         ("<xfdp><fdp name='2.1' affects='skin'/></xfdp>", "index is missing"),
     ],
 )
-def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
+def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "points.tsv").write_text(text, encoding="utf-8")
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda rows: rows.replace("\n8.1\t", "\n8.1 1 0 0 #"), "too far from the mesh.*: 8.1 by"),
         (lambda rows: exchange(rows, "8.3", "8.4"), "MW is not positive"),
@@ -167,10 +167,10 @@ def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, said: str) ->
     ],
 )
 def test_rejects_points_that_are_not_a_face(
-    face: Path, tmp_path: Path, change: Callable[[str], str], said: str
+    face: Path, tmp_path: Path, change: Callable[[str], str], message: str
 ) -> None:
     (tmp_path / "points.tsv").write_text(change(lines(ORIGINAL, lambda p: p)), encoding="utf-8")
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
     assert not (tmp_path / "out.npz").exists()
 
@@ -194,7 +194,7 @@ LARGE = "".join(f"v {n} {n % 2} 0\n" for n in range(65_538)) + "".join(
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("no_faces.obj", TRIANGLE, "has no faces"),
         ("garbage.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", "damaged or is not a mesh"),
@@ -208,12 +208,12 @@ LARGE = "".join(f"v {n} {n % 2} 0\n" for n in range(65_538)) + "".join(
         ("", "", "no such file"),
     ],
 )
-def test_rejects_bad_meshes(tmp_path: Path, name: str, text: str, said: str) -> None:
+def test_rejects_bad_meshes(tmp_path: Path, name: str, text: str, message: str) -> None:
     mesh = tmp_path / (name or "absent.obj")
     if name:
         mesh.write_text(text)
     (tmp_path / "points.tsv").write_text("2.1 0\n")
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         import_head(mesh, tmp_path / "points.tsv", tmp_path / "out.npz")
 
 

@@ -54,13 +54,13 @@ def test_a_step_matches_the_formulas() -> None:
 
 
 def test_each_delay_has_separate_outputs_and_times() -> None:
-    frames, heard = np.ones((2, 80), np.float32), np.ones(NUM_FEATURES - 160, np.float32)
-    both = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, heard)
-    alone = MODEL.create_stream([0.155]).process_position(1.0, frames, heard)
-    assert [(lip.time_s, lip.delay_s) for lip in both] == [(1.005, -0.005), (0.845, 0.155)]
-    np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
-    outputs = MODEL.create_stream([0.155]).step(features_at(frames, heard))
-    assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
+    frames, features = np.ones((2, 80), np.float32), np.ones(NUM_FEATURES - 160, np.float32)
+    pair = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, features)
+    single = MODEL.create_stream([0.155]).process_position(1.0, frames, features)
+    assert [(lip.time_s, lip.delay_s) for lip in pair] == [(1.005, -0.005), (0.845, 0.155)]
+    np.testing.assert_allclose(pair[1].faps, single[0].faps, rtol=1e-5)
+    outputs = MODEL.create_stream([0.155]).step(features_at(frames, features))
+    assert single[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
     with pytest.raises(UserError, match="no delay of 70 ms; choose -5, 55, 155"):
         MODEL.create_stream([0.07])
 

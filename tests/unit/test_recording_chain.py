@@ -23,14 +23,14 @@ STILL = SynthesizerConfig(idle_motion_seed=0, expressiveness=1.0, feeling=0.0)
 
 def test_dynamic_visemes_are_the_full_model() -> None:
     samples = read_audio(VOWELS_FILE)[0][:, 0]
-    heard = analyze_recording(
+    analyzed = analyze_recording(
         samples, recognize(load_model(), samples, 16_000), is_text_known=False
     )
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
-    made = np.array([faps for _, faps in animate_recording(heard, lips, STILL)])
-    num_frames = int(heard.duration_s * 50) + 1
-    full = synthesize(lips, heard.phones, num_frames, 50.0, level_track(samples))
+    made = np.array([faps for _, faps in animate_recording(analyzed, lips, STILL)])
+    num_frames = int(analyzed.duration_s * 50) + 1
+    full = synthesize(lips, analyzed.phones, num_frames, 50.0, level_track(samples))
     assert np.ptp(full[:, 2]) > 100
     np.testing.assert_allclose(made[:num_frames], full, atol=1e-3)
     assert len(made) == num_frames + 15, "and the way to rest"
@@ -40,15 +40,15 @@ def test_of_a_known_text_every_closing_lip_shuts_and_vowels_are_open() -> None:
     samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
     model = load_model()
     aligned = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
-    heard = analyze_recording(samples[:, 0], aligned, load_lip_predictor())
-    frames = animate_recording(heard, load_lip_model(name="learnt"), STILL)
+    analyzed = analyze_recording(samples[:, 0], aligned, load_lip_predictor())
+    frames = animate_recording(analyzed, load_lip_model(name="learnt"), STILL)
     times_s = np.array([time_s for time_s, _ in frames])
     opening = np.array([-faps[3] - faps[4] for _, faps in frames])  # of the inner lips
-    closing = [phone for phone in heard.phones if phone.symbol in ("b", "p", "m")]
+    closing = [phone for phone in analyzed.phones if phone.symbol in ("b", "p", "m")]
     assert len(closing) == 16
     for phone in closing:
         assert opening[np.abs(times_s - phone.onset_s - 0.04) < 0.021].min() < 10, phone
-    for phone in heard.phones:
+    for phone in analyzed.phones:
         if phone.symbol in ("a", "ai", "ao", "an", "ing"):
             during = (times_s >= phone.onset_s) & (times_s < phone.onset_s + phone.duration_s)
             assert opening[during].max() > 100, phone

@@ -62,8 +62,9 @@ def test_parses_backgrounds_and_rejects_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")]
+    ("name", "message"),
+    [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
 )
-def test_error_of_an_unknown_head(name: str, said: str) -> None:
-    with pytest.raises(UserError, match=said):
+def test_error_of_an_unknown_head(name: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
         load_head(name)

@@ -195,8 +195,8 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
     for kind in (LipPositions, Progress, SpeechChange):
         same = [messages_of(of_kind(kind, results)) for results in (outputs, expected)]
         assert same[0] == same[1]
-    said = [
+    symbols = [
         [phone.symbol for phone in of_kind(Phone, results) if phone.final and phone.is_spoken]
         for results in (outputs, expected)
     ]
-    assert said[0] == said[1]
+    assert symbols[0] == symbols[1]

@@ -35,12 +35,12 @@ def test_pictures_and_sound_are_in_sync(tmp_path: Path) -> None:
         assert codecs == ["h264", "aac"]
         assert sum(1 for _ in container.decode(video=0)) == 25
         container.seek(0)
-        heard = [
+        decoded = [
             float((frame.pts or 0) * (frame.time_base or 0)) + float(index) / 16_000
             for frame in container.decode(audio=0)
             for index in np.flatnonzero(np.abs(frame.to_ndarray().ravel()) > 0.3)
         ]
-    assert min(heard) == pytest.approx(0.5, abs=0.01)
+    assert min(decoded) == pytest.approx(0.5, abs=0.01)
 
 
 # --- formats ---
@@ -128,7 +128,7 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) 
 
 
 @pytest.mark.parametrize(
-    ("name", "settings", "said"),
+    ("name", "settings", "message"),
     [
         ("out.avi", {}, "ends in"),
         ("out.png", {}, "number"),
@@ -140,10 +140,10 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) 
     ],
 )
 def test_rejects_invalid_settings(
-    tmp_path: Path, name: str, settings: dict[str, Any], said: str
+    tmp_path: Path, name: str, settings: dict[str, Any], message: str
 ) -> None:
     used: dict[str, Any] = {"size": (64, 48), "frame_rate_hz": 25.0, "sample_rate_hz": 16_000}
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         open_writer(tmp_path / name, **(used | settings))
     assert not list(tmp_path.iterdir())
 
@@ -213,7 +213,7 @@ def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_pa
     recording.step()
     recording.close()
     with av.open(str(tmp_path / "a.mp4")) as film:
-        heard = np.concatenate([f.to_ndarray()[0] for f in film.decode(audio=0)])
-    assert len(heard) == pytest.approx(20000, abs=2100)
-    assert np.abs(heard[:6000]).max() < 0.1
-    assert np.abs(heard[10000:18000]).mean() > 0.3
+        decoded = np.concatenate([f.to_ndarray()[0] for f in film.decode(audio=0)])
+    assert len(decoded) == pytest.approx(20000, abs=2100)
+    assert np.abs(decoded[:6000]).max() < 0.1
+    assert np.abs(decoded[10000:18000]).mean() > 0.3

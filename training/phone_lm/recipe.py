@@ -77,9 +77,9 @@ def estimate_phone_lm(
         raise UserError(f"order {order} is too high for {num_phones} phones; give a lower one")
     silence = inventory.index[inventory.silence]
     grams, counts = _count(np.concatenate(streams), order, silence, num_phones)
-    alone = np.full(num_phones, _UNSEEN_COUNT)
-    alone[grams[1]] += counts[1]
-    probs: _Probs = {1: alone / alone.sum()}
+    unigram_counts = np.full(num_phones, _UNSEEN_COUNT)
+    unigram_counts[grams[1]] += counts[1]
+    probs: _Probs = {1: unigram_counts / unigram_counts.sum()}
     grams[1] = np.arange(num_phones)
     gains: dict[int, NDArray[np.float64]] = {}
     for n in range(2, order + 1):

@@ -8,7 +8,7 @@ are no evidence against a closure, so a p recognized as t cannot open closed lip
 own cannot close lips that are predicted to be wide open. In a complete recording phones are more
 reliable: other phones open the lips, also in the middle of a vowel between two closing phones.
 
-Phones alone decide about lower lip to upper teeth (f), which the lip predictor does not predict
+Only phones decide about lower lip to upper teeth (f), which the lip predictor does not predict
 well.
 """
 
