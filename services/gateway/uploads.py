@@ -1,6 +1,7 @@
 """Uploads that a separate process handles, so that no file can harm or delay the gateway."""
 
 import asyncio
+import contextlib
 import os
 from abc import ABC, abstractmethod
 from asyncio import subprocess
@@ -78,7 +79,8 @@ class Uploads(ABC):
             env={**os.environ, **_ONE_THREAD},
             start_new_session=True,  # Ctrl-C in the terminal must reach only the gateway
         )
-        os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+        with contextlib.suppress(ProcessLookupError):  # it has ended already
+            os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
         exchange = asyncio.create_task(process.communicate(content))
         end_s = asyncio.get_running_loop().time() + limit_s
         try:

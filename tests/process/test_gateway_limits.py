@@ -113,6 +113,8 @@ async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterat
         await server.stop()
         for writer in served.writers:
             writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
 
 
 async def read_to_end(reader: asyncio.StreamReader) -> bytes:

@@ -54,15 +54,17 @@ async def serve(uploads: Uploads) -> AsyncIterator[Post]:
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     address = f"http://127.0.0.1:{runner.addresses[0][1]}/upload"
-    async with aiohttp.ClientSession() as http, asyncio.timeout(100):
+    async with aiohttp.ClientSession() as http, asyncio.timeout(200):
 
         async def post(data: bytes = b"abc", name: str = "") -> Answer:
             async with http.post(address, params={"name": name}, data=io.BytesIO(data)) as answer:
                 remarks = unquote(answer.headers.get(REMARKS_HEADER, ""))
                 return answer.status, await answer.read(), remarks
 
-        yield post
-    await runner.cleanup()
+        try:
+            yield post
+        finally:
+            await runner.cleanup()
 
 
 def learner(program: str) -> MouthLearner:
