@@ -54,10 +54,13 @@ async def speak(face, text):
     """Send an answer to the face and wait until it is spoken."""
     start_s = asyncio.get_running_loop().time()
     sent_s = 0.0
-    async for pcm in synthesize(text):
-        for begin in range(0, len(pcm), MESSAGE_BYTES):  # a whole sentence can be a large piece
-            await face.send_bytes(pcm[begin : begin + MESSAGE_BYTES])
-        sent_s += len(pcm) / 2 / RATE_HZ
+    try:
+        async for pcm in synthesize(text):
+            for begin in range(0, len(pcm), MESSAGE_BYTES):  # a whole sentence can be a large piece
+                await face.send_bytes(pcm[begin : begin + MESSAGE_BYTES])
+            sent_s += len(pcm) / 2 / RATE_HZ
+    except (OSError, aiohttp.ClientError) as error:
+        print("cannot speak the answer:", error, flush=True)
     await asyncio.sleep(start_s + sent_s - asyncio.get_running_loop().time())
 
 
