@@ -282,9 +282,12 @@ def test_survives_random_bytes_at_every_port(system: System, witness: Session) -
     system.assert_all_alive()
 
 
-# The last test, because these services never answer, and every new session waits for them.
-def test_very_many_false_services_leave_the_status_readable(system: System, client: Client) -> None:
-    with Bus(load_key("lamp", ("service:lamp",))) as bus:
+def test_very_many_false_services_leave_the_status_readable(tmp_path: Path) -> None:
+    with (
+        System(["control"], tmp_path) as system,
+        Client(system.control) as client,
+        Bus(load_key("lamp", ("service:lamp",))) as bus,
+    ):
         stranger = bus.connect_dealer(system.control)
         metrics = {f"{number:0128}": 0.0 for number in range(64)}
         heartbeat = replace(HEARTBEAT, service="lamp", metrics=metrics)
