@@ -26,6 +26,18 @@ test("a slow processor draws fewer pixels until it draws 20 images a second", ()
   assert.equal(drawRate.ratio, 1, "it has the time again");
 });
 
+test("very slow images get far fewer pixels at once, but not because of one stall", () => {
+  const drawRate = new DrawRate(1, 1, true);
+  const record = (tookMs) => drawRate.recordDrawn(0, tookMs);
+  for (const tookMs of [900, 20, 900]) record(tookMs); // such as the first image of a page
+  assert.equal(drawRate.ratio, 1);
+  for (let number = 0; number < 7; number++) record(20);
+  assert.ok(drawRate.ratio >= 0.85, `${drawRate.ratio}`);
+  const verySlow = new DrawRate(1, 1, true);
+  for (let number = 0; number < 3; number++) verySlow.recordDrawn(0, 400);
+  assert.equal(verySlow.ratio, 0.35);
+});
+
 test("a processor pauses as long as it drew, or less to draw 20 images a second", () => {
   const drawRate = new DrawRate(0.35, 1, true);
   for (const [tookMs, restMs] of [[10, 10], [24, 24], [35, 15], [100, 10]]) {

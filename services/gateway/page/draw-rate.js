@@ -6,7 +6,7 @@ import { SlidingWindow } from "./sliding-window.js";
 const STEP = 0.85; // factor of the pixel ratio; the number of pixels changes by its square
 const MIN_RATIO = 0.35;
 const MIN_IMAGES = 10; // before their mean time is used
-const FEW_IMAGES = 3; // the same if they take very long
+const FEW_IMAGES = 3; // the same if all of them take very long
 const SMOOTHING = 0.2;
 const MAX_SHOWN_MS = 200; // an image that is shown for longer belongs to a face that does not move
 const WINDOW_MS = 2000; // over which delays are measured
@@ -29,6 +29,7 @@ export class DrawRate {
   #startMs = -Infinity; // start of the last image
   #tookMs = 0;
   #numImages = 0;
+  #fastestMs = 0; // image since the ratio changed
   #visibleMs = -Infinity; // when the last image became visible
   #minPeriodMs = 0; // time between two images that the user has chosen
   #shownMs = 0; // for how long an image is visible
@@ -78,9 +79,10 @@ export class DrawRate {
     this.#tookMs = doneMs - startMs;
     this.#numImages++;
     this.imageMs += Math.max(SMOOTHING, 1 / this.#numImages) * (this.#tookMs - this.imageMs);
-    if (this.#numImages < (this.imageMs > VERY_SLOW_MS ? FEW_IMAGES : MIN_IMAGES)) return;
+    this.#fastestMs = this.#numImages === 1 ? this.#tookMs : Math.min(this.#fastestMs, this.#tookMs);
+    if (this.#numImages < (this.#fastestMs > VERY_SLOW_MS ? FEW_IMAGES : MIN_IMAGES)) return;
     const ratio = this.ratio;
-    const step = Math.min(STEP, Math.sqrt(SLOW_MS / this.imageMs));
+    const step = Math.min(STEP, Math.sqrt(SLOW_MS / this.#fastestMs));
     if (this.imageMs > SLOW_MS) this.ratio = Math.max(MIN_RATIO, step * ratio);
     if (this.imageMs < FAST_MS) this.ratio = Math.min(this.#maxRatio, ratio / STEP);
     if (this.ratio !== ratio) this.#numImages = 0;
