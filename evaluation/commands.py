@@ -241,7 +241,7 @@ def pack_clips(
     clips: Clips,
     force: Force = False,
 ) -> None:
-    """Pack the clips whose licenses allow sharing, with their parts and licenses."""
+    """Archive the clips whose licenses allow sharing, with their parts and licenses."""
     from kouxing.corpora.clip_archive import write_clip_archive
 
     check_output(archive, force=force)
@@ -252,14 +252,14 @@ def pack_clips(
 @app.command()
 def rivals(
     output: Annotated[
-        Path, typer.Argument(help="Folder for PROGRAM/CLIP.csv; existing ones stay.")
+        Path, typer.Argument(help="Folder for PROGRAM/CLIP.csv; existing files are kept.")
     ],
     clips: Clips,
     program: Annotated[
         list[str] | None, typer.Option(help="Name of a program; repeatable. Default: all.")
     ] = None,
 ) -> None:
-    """Run other lip sync on the clips, and write its curves for ``lips --from-csv``.
+    """Run other lip-sync programs on the clips, and write curves for ``lips --from-csv``.
 
     Programs: headaudio, wlipsync, wawa, live2d, pylipsync, openfacefx, loudness, and rhubarb if it
     is on the path.
@@ -275,7 +275,9 @@ def report(
     lips: Annotated[Path | None, typer.Option(help="Folder of clips with tracked lips.")] = None,
     corpus: Annotated[Path | None, typer.Option(help="Corpus of read speech.")] = None,
     natural: Annotated[Path | None, typer.Option(help="Folder of conversation.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Parts of the data; ten minutes.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Use parts of the data; ten minutes.")
+    ] = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Also run steps that are up to date.")
     ] = False,
@@ -525,7 +527,7 @@ def lips_page(
 
 @bench_app.command()
 def sizes(json_file: JsonFile = None, force: Force = False) -> None:
-    """Measure sizes of the models, and the least processor time of their networks here."""
+    """Measure model sizes, and the minimum processor time of the networks on this machine."""
     from kouxing.evaluation.system.sizes import measure, show
 
     check_output(json_file, force=force)

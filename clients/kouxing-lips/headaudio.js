@@ -2,7 +2,7 @@
 
 import { LipSync } from "./index.js";
 
-/** An audio node that reports Oculus visemes. Its face is that of the sound 0.1 s ago. */
+/** An audio node that reports Oculus visemes. Its face is for the sound of 0.1 s ago. */
 export class HeadAudio extends GainNode {
   /** Called with (name, weight) when the weight of a viseme changes. */
   onvalue = null;
@@ -11,7 +11,7 @@ export class HeadAudio extends GainNode {
   /** Called when speech ends. */
   onended = null;
   #lips = null;
-  #weights = []; // the last ones
+  #weights = []; // last reported weights
 
   /** @param context audio context of the sound */
   constructor(context) {
@@ -29,7 +29,7 @@ export class HeadAudio extends GainNode {
     await this.start();
   }
 
-  /** Report the weights that have changed. Call it for each image. */
+  /** Report the weights that have changed. Call this method for each image. */
   update() {
     const weights = this.#lips?.current?.oculus ?? [];
     weights.forEach((weight, i) => {
@@ -49,5 +49,5 @@ export class HeadAudio extends GainNode {
   }
 }
 
-// HeadAudio never reports the first one, and some avatars lack it.
+// "sil" is not reported: HeadAudio never reports it, and some avatars lack it.
 const VISEMES = ["sil", "PP", "FF", "TH", "DD", "kk", "CH", "SS", "nn", "RR", "aa", "E", "I", "O", "U"];

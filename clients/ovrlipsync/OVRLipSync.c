@@ -9,7 +9,7 @@
 enum { MAX_CONTEXTS = 256, MIN_RATE_HZ = 8000, MAX_RATE_HZ = 192000, PIECE = 1024 };
 
 typedef struct {
-  Lips *lips; /* NULL if the place is free */
+  Lips *lips; /* NULL if the slot is free */
   bool has_laughter;
   int num_calls;
 } Context;
@@ -60,7 +60,7 @@ ovrLipSyncResult ovrLipSync_CreateContextEx(ovrLipSyncContext *pContext, ovrLipS
   (void)enableAcceleration;
   const int rate_hz = sampleRate ? sampleRate : default_rate_hz;
   if (!pContext) return ovrLipSyncError_InvalidParam;
-  if (!default_rate_hz) return ovrLipSyncError_CannotCreateContext; /* Initialize comes first */
+  if (!default_rate_hz) return ovrLipSyncError_CannotCreateContext; /* Initialize was not called */
   if (!is_rate(rate_hz)) return ovrLipSyncError_BadSampleRate;
   for (int place = 0; place < MAX_CONTEXTS; place++) {
     if (contexts[place].lips) continue;

@@ -1,6 +1,6 @@
-/* Lip sync of kouxing with the interface of OVRLipSync 1.61; docs/clients/ovrlipsync.md has the differences.
+/* kouxing lip sync with the API of OVRLipSync 1.61; docs/clients/ovrlipsync.md lists the differences.
  *
- * Contexts are independent: threads may process different contexts at the same time. Create and
+ * Contexts are independent. Different threads may process different contexts at the same time. Create and
  * destroy contexts, initialize and shut down in one thread. */
 #ifndef OVR_LipSync_H
 #define OVR_LipSync_H
@@ -79,7 +79,7 @@ typedef enum {
 
 typedef struct {
   int frameNumber;             /* calls for this context so far */
-  int frameDelay;              /* how long before the end of the audio the face is, ms */
+  int frameDelay;              /* time from the face to the end of the audio, ms */
   float *visemes;              /* the caller's array; weights 0 to 1 are written to it */
   unsigned int visemesLength;  /* its length, at least ovrLipSyncViseme_Count */
   float laughterScore;         /* 0 to 1, for ovrLipSyncContextProvider_EnhancedWithLaughter */
@@ -91,7 +91,7 @@ typedef unsigned int ovrLipSyncContext; /* 0 is invalid */
 
 /* Set the sample rate, 8000 to 192000 Hz, and the samples of each channel in a buffer of ProcessFrame. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_Initialize(int sampleRate, int bufferSize);
-/* The same. The model is part of the library, so the path is ignored. */
+/* Like ovrLipSync_Initialize. The path is ignored, because the model is part of the library. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_InitializeEx(int sampleRate, int bufferSize, const char *path);
 /* Destroy all contexts. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_Shutdown(void);
@@ -99,25 +99,25 @@ OVR_LIPSYNC_API const char *ovrLipSync_GetVersion(int *major, int *minor, int *p
 
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_CreateContext(ovrLipSyncContext *pContext,
                                                           ovrLipSyncContextProvider provider);
-/* A sample rate of 0 is that of Initialize. */
+/* If the sample rate is 0, the rate of ovrLipSync_Initialize is used. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_CreateContextEx(ovrLipSyncContext *pContext,
                                                             ovrLipSyncContextProvider provider,
                                                             int sampleRate, bool enableAcceleration);
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_DestroyContext(ovrLipSyncContext context);
 /* Forget the audio so far, for example before another speaker. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_ResetContext(ovrLipSyncContext context);
-/* VisemeSmoothing (1 to 100) is accepted and has no effect. Other signals are undefined functions. */
+/* VisemeSmoothing (1 to 100) is accepted and has no effect. Other signals return ovrLipSyncError_UndefinedFunction. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_SendSignal(ovrLipSyncContext context, ovrLipSyncSignals signal,
                                                        int arg1, int arg2);
 
-/* Take a mono buffer of the size of Initialize; return the newest face. */
+/* Process a mono buffer of the size given to ovrLipSync_Initialize, and write the newest face to pFrame. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_ProcessFrame(ovrLipSyncContext context, const float *audioBuffer,
                                                          ovrLipSyncFrame *pFrame);
-/* The same, for interleaved stereo. */
+/* Like ovrLipSync_ProcessFrame, for interleaved stereo. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_ProcessFrameInterleaved(ovrLipSyncContext context,
                                                                     const float *audioBuffer,
                                                                     ovrLipSyncFrame *pFrame);
-/* The same, for sampleCount samples of each channel. */
+/* Like ovrLipSync_ProcessFrame, for sampleCount samples of each channel. */
 OVR_LIPSYNC_API ovrLipSyncResult ovrLipSync_ProcessFrameEx(ovrLipSyncContext context, const void *audioBuffer,
                                                            int sampleCount, ovrLipSyncAudioDataType dataType,
                                                            ovrLipSyncFrame *pFrame);

@@ -1,4 +1,4 @@
-/* What the small ear finds in 20 ms of sound; services/recognizer has the formulas. */
+/* The small ear: features, voice and laughter of 20 ms of sound. services/recognizer has the formulas. */
 #ifndef EAR_H
 #define EAR_H
 

@@ -53,14 +53,14 @@ static void track_append(Track *track, double time_s, const double *faps) {
 }
 
 /* Return the number of knots up to a time. */
-static int num_until(const Track *track, double time_s) {
+static int num_knots_until(const Track *track, double time_s) {
   int number = 0;
   while (number < track->num_knots && track->knots[number].time_s <= time_s) number++;
   return number;
 }
 
 static void track_forget_before(Track *track, double time_s) {
-  const int number = num_until(track, time_s) - 1;
+  const int number = num_knots_until(track, time_s) - 1;
   if (number > 0) drop_knots(track, number);
 }
 
@@ -82,7 +82,7 @@ static Mouth track_at(const Track *track, double time_s) {
   if (!track->num_knots || time_s < track->knots[0].time_s) return AT_REST;
   const Knot *last = &track->knots[track->num_knots - 1];
   if (time_s < last->time_s) {
-    const int after = num_until(track, time_s);
+    const int after = num_knots_until(track, time_s);
     return interpolate(&track->knots[after - 1], &track->knots[after], time_s);
   }
   const Knot rest = {last->time_s + track->hold_s + TRACK_CLOSE_S, AT_REST};
@@ -111,7 +111,7 @@ static double ajar_share(const Rest *rest) {
   return rest->goal + remaining(rest->start, rest->velocity, u, rest->duration_s);
 }
 
-static void head_for(Rest *rest, double goal, double duration_s) {
+static void set_goal(Rest *rest, double goal, double duration_s) {
   if (goal == rest->goal) return;
   const double u = fmin(rest->elapsed_s / rest->duration_s, 1.0);
   const double share = ajar_share(rest);
@@ -123,7 +123,7 @@ static void head_for(Rest *rest, double goal, double duration_s) {
 }
 
 /* Process the events up to the time of a frame. */
-static void follow_voice(Rest *rest, double time_s) {
+static void update_rest(Rest *rest, double time_s) {
   int number = 0;
   for (; number < rest->num_changes && rest->changes[number].time_s <= time_s; number++) {
     const SpeechChange change = rest->changes[number];
@@ -165,10 +165,10 @@ static double ajar_share_at(Rest *rest, double time_s) {
   for (int i = 0; i < rest->num_changes; i++) {
     starts_soon |= rest->changes[i].is_active && rest->changes[i].time_s <= time_s + REST_LEAD_S;
   }
-  if (starts_soon) head_for(rest, 1.0, REST_PART_S);
-  else if (rest->stays_shut || next_s <= time_s + REST_YIELD_S) head_for(rest, 0.0, REST_YIELD_S);
-  else if (time_s > rest->sound_s + REST_HOLD_S) head_for(rest, 0.0, REST_CLOSE_S);
-  else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) head_for(rest, 1.0, REST_PART_S);
+  if (starts_soon) set_goal(rest, 1.0, REST_PART_S);
+  else if (rest->stays_shut || next_s <= time_s + REST_YIELD_S) set_goal(rest, 0.0, REST_YIELD_S);
+  else if (time_s > rest->sound_s + REST_HOLD_S) set_goal(rest, 0.0, REST_CLOSE_S);
+  else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) set_goal(rest, 1.0, REST_PART_S);
   rest->elapsed_s += fmax(time_s - rest->time_s, 0.0);
   rest->time_s = time_s;
   return ajar_share(rest);
@@ -313,7 +313,7 @@ static void solve(double matrix[][NUM_SHAPES], double *right, int size) {
   }
 }
 
-static double lean(const double *right, const double *weights, int shape) {
+static double negative_gradient(const double *right, const double *weights, int shape) {
   double sum = right[shape];
   for (int i = 0; i < NUM_SHAPES; i++) sum -= SHAPES_OCULUS_GRAM[shape * NUM_SHAPES + i] * weights[i];
   return sum;
@@ -329,13 +329,13 @@ static void solve_weights(Face *face, const double *right, double *weights) {
       if (face->free[i]) inner[num_inner++] = i;
     }
     for (int i = 0; i < num_inner; i++) {
-      solution[i] = lean(right, weights, inner[i]);
+      solution[i] = negative_gradient(right, weights, inner[i]);
       for (int j = 0; j < num_inner; j++) matrix[i][j] = SHAPES_OCULUS_GRAM[inner[i] * NUM_SHAPES + inner[j]];
     }
     solve(matrix, solution, num_inner);
     for (int i = 0; i < num_inner; i++) weights[inner[i]] = solution[i];
     for (int i = 0; i < NUM_SHAPES; i++) {
-      const double x = face->free[i] ? 0.0 : lean(right, weights, i);
+      const double x = face->free[i] ? 0.0 : negative_gradient(right, weights, i);
       const bool is_outside = weights[i] < -SHAPES_ROUNDING || weights[i] > 1.0 + SHAPES_ROUNDING;
       if (face->free[i] ? is_outside : (face->at_one[i] ? -x : x) > SHAPES_ROUNDING) wrong[num_wrong++] = i;
     }
@@ -356,7 +356,7 @@ static void solve_weights(Face *face, const double *right, double *weights) {
 
 void face_visemes(Face *face, double time_s, float *weights) {
   double faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
-  follow_voice(&face->rest, time_s);
+  update_rest(&face->rest, time_s);
   if (face->has_lip_frames) follow_track(face, time_s);
   const double ajar = ajar_share_at(&face->rest, time_s);
   face->time_s = time_s;

@@ -58,7 +58,7 @@ void face_init(Face *face);
 void face_add_lips(Face *face, const LipFrame *frame);
 void face_change_speech(Face *face, double time_s, bool is_active);
 void face_add_level(Face *face, double time_s, double level_db);
-/* Write the weights of the visemes (NUM_SHAPES,) at a media time, seconds; times rise. */
+/* Write the weights of the visemes (NUM_SHAPES,) at a media time, seconds. Times must increase. */
 void face_visemes(Face *face, double time_s, float *weights);
 
 #endif

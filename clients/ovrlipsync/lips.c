@@ -41,7 +41,7 @@ struct Lips {
   float weights[LIPS_NUM_VISEMES];
 };
 
-static int greatest_divisor(int a, int b) { return b ? greatest_divisor(b, a % b) : a; }
+static int gcd(int a, int b) { return b ? gcd(b, a % b) : a; }
 
 static double sinc(double x) { return x == 0.0 ? 1.0 : sin(PI * x) / (PI * x); }
 
@@ -56,7 +56,7 @@ static double bessel(double x) {
 }
 
 static bool resampler_init(Resampler *r, int rate_hz) {
-  const int common = greatest_divisor(RESAMPLE_SAMPLE_RATE_HZ, rate_hz);
+  const int common = gcd(RESAMPLE_SAMPLE_RATE_HZ, rate_hz);
   const double lower = fmin(1.0, (double)RESAMPLE_SAMPLE_RATE_HZ / rate_hz);
   r->up = RESAMPLE_SAMPLE_RATE_HZ / common;
   r->down = rate_hz / common;

@@ -1,6 +1,6 @@
-"""Tables of curves that another program made for clips.
+"""Tables of the curves that another lip-sync program produces for clips.
 
-The column ``t`` is the length of the audio that the program had received when it made the row,
+The column ``t`` is the duration of the audio that the program had received when it made the row,
 seconds. The other columns are ARKit's shapes (``jawOpen``), Oculus' visemes (``aa`` or
 ``viseme_aa``) or ``opening``. Further columns are only inputs of the linear map.
 """
@@ -25,7 +25,7 @@ TIME, OPENING = "t", "opening"
 _MAX_BYTES = 64 << 20
 _LOW, _HIGH = 1.0, 99.0  # percentiles
 _MAX_OPENING = 400.0  # FAP units, 12 mm on a face
-_READY_PLAYER_ME = {"I": "ih", "O": "oh", "U": "ou"}  # its names of Oculus' visemes
+_READY_PLAYER_ME = {"I": "ih", "O": "oh", "U": "ou"}  # names of Oculus visemes in Ready Player Me
 _LOWER_LIP = FAP_NUMBER["raise_b_midlip"] - 1
 
 
@@ -96,11 +96,11 @@ def read_table(path: Path) -> CurveTable:
 
 
 def shipped_mouth(folder: Path, tables: Collection[CurveTable]) -> ShippedMouth:
-    """Return how the curves of a folder move a face.
+    """Return the conversion of a folder's curves to FAPs.
 
-    Shapes have the FAPs of this package's tables. An opening has no unit: over all tables, its
-    first percentile becomes 0 and its 99th 400 FAP units. Raises UserError if no column has a known
-    name.
+    Shapes have the FAPs of this package's tables. An opening has no unit. Over all tables, its
+    first percentile is mapped to 0, and its 99th to 400 FAP units. Raises UserError if no column
+    has a known name.
     """
     names = next(iter(tables)).names
     basis, offset = np.zeros((len(names), NUM_FAPS)), np.zeros(NUM_FAPS)

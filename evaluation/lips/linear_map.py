@@ -11,8 +11,9 @@ m        opening, width and jaw of the mouth                              FAP un
 W        weights, by ridge regression (Hoerl and Kennard 1970)            (10, num_curves, 3)
 ======== ================================================================ ==================
 
-The means of each clip are removed for W, as for scoring. A ridge shrinks uncertain curves, so the
-opening is scaled to the deviation of the real one. Its constant gives the best F1 of closures.
+W is fitted after each clip's means are subtracted, as in scoring. Ridge regularization reduces the
+range of the opening, so the opening is scaled to the standard deviation of the real opening. The
+constant of the opening maximizes the F1 of closures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +32,7 @@ from kouxing.shared.face.faps import NUM_FAPS
 Array = NDArray[np.float64]
 
 _HISTORY_S = 0.02 * np.arange(10)
-_RIDGE = 1000.0  # weight of zero, frames
+_RIDGE = 1000.0  # strength of the regularization, frames
 _TOLERANCE = 0.005  # tolerance of the correlation
 _SHUT_SHARES = range(0, 65, 5)  # percentages of the frames that the constant may close
 _JAW, _LOWER_LIP, _CORNERS = 2, 4, (5, 6)  # columns of FAPs
@@ -64,7 +65,7 @@ def fit_map(
 ) -> LinearMap:
     """Fit the map on training clips.
 
-    The shortest delay is used whose openings correlate there within 0.005 of the best.
+    Uses the shortest delay whose correlation of the opening is within 0.005 of the best.
     """
     maps = [_fit(clips, tables, delay_s) for delay_s in sorted(delays_s)]
     best = max(linear.correlation for linear in maps)

@@ -1,8 +1,8 @@
 """The mouths of other programs: as shipped and through a linear map, each at its best delay.
 
 A frame for time t of a face with delay d uses the rows of a table up to t + d. The correlation of
-the opening on the training clips decides the delay. Without tables of training clips,
-there is no linear map, and the delay is 0.
+the opening on the training clips selects the delay. Without tables of training clips, there is no
+linear map, and the delay is 0.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ _TAIL_S = 0.5  # frames after the end of a clip's audio
 def load_programs(
     folders: Sequence[Path], held: Sequence[LipClip], training: Sequence[LipClip]
 ) -> dict[str, MouthOf]:
-    """Load the mouths of the programs whose tables are in folders, by title.
+    """Load the mouths of other programs from folders of tables; return them by title.
 
     Raises UserError if a table is missing or cannot be used (see ``read_tables``).
     """

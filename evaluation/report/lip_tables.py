@@ -3,14 +3,20 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from kouxing.evaluation.report.markdown import Results, Table, joined, number, percent
+from kouxing.evaluation.report.markdown import (
+    Results,
+    Table,
+    format_number,
+    format_percent,
+    join_values,
+)
 
 _REAL, _CLEAN, _BABBLE, _MUSIC = "real", "clean", "babble 10 dB", "music 10 dB"
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
 _ALL = "all"
 _COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", _ALL: "all clips"}
 _OWN = "learnt"
-_COMPARED = {  # measures of the comparison, and whether a higher figure is better
+_COMPARED = {  # compared measures, and whether higher is better
     "r_opening": ("correlation of the opening", True),
     "r_width": ("correlation of the width", True),
     "r_jaw": ("correlation of the jaw", True),
@@ -23,7 +29,7 @@ _COMPARED = {  # measures of the comparison, and whether a higher figure is bett
     "precision_pause": ("precision of closures in pauses", True),
     "mtm_ms": ("MTM", False),
 }
-_LIKE_REAL = {  # measures of which real lips have the best figure
+_LIKE_REAL = {  # measures that are best when they equal those of real lips
     "slcc": "SLCC",
     "effort_correlation": "effort",
     "rest_opening": "opening at rest",
@@ -60,7 +66,9 @@ def agreement(results: Results) -> Table:
         [
             title_of(face),
             *(
-                joined(number(faces[face].get(group, {}).get(f"r_{name}")) for name in _CURVES)
+                join_values(
+                    format_number(faces[face].get(group, {}).get(f"r_{name}")) for name in _CURVES
+                )
                 for group in _GROUPS
             ),
         ]
@@ -72,7 +80,7 @@ _CURVES = ("opening", "width", "jaw")
 
 
 def better_programs(results: Results) -> list[str]:
-    """Return a sentence for each figure in which another program is better than the own lips."""
+    """Return a sentence for each measure in which another program is better than ``_OWN``."""
     faces = results.get("rivals", {})
     scores = _clean_scores(faces)
     own = next((face for face in scores if face.startswith(f"{_OWN}, ")), None)
@@ -93,25 +101,25 @@ def better_programs(results: Results) -> list[str]:
             }
             best = min(losses, key=lambda face: losses[face], default=own)
             if own in losses and losses[best] < losses[own]:
-                shown = [_short(measure, values[face]) for face in (best, own)]
+                shown = [_format_measure(measure, values[face]) for face in (best, own)]
                 if measure in _LIKE_REAL:
-                    shown.append(f"real lips {_short(measure, real[measure])}")
+                    shown.append(f"real lips {_format_measure(measure, real[measure])}")
                 sentence = f"{group_title}, {name}: {title_of(best)} ({shown[0]})"
                 sentences.append(f"{sentence}; {own} ({', '.join(shown[1:])})")
     return sentences
 
 
 def _loss(measure: str, value: float, real: float | None) -> float:
-    """Return how bad a figure is: lower is better."""
+    """Return a figure's loss; lower is better."""
     if measure in _LIKE_REAL:
         return abs(value - (real or 0.0))
     return -value if _COMPARED[measure][1] else value
 
 
-def _short(measure: str, value: float | None) -> str:
+def _format_measure(measure: str, value: float | None) -> str:
     if measure.endswith("_ms"):
-        return f"{number(value, 0)} ms"
-    return number(value, 0 if measure in ("rest_opening", "phone_spread") else 2)
+        return f"{format_number(value, 0)} ms"
+    return format_number(value, 0 if measure in ("rest_opening", "phone_spread") else 2)
 
 
 def closures(results: Results) -> Table:
@@ -137,7 +145,7 @@ def closures(results: Results) -> Table:
         "share_shut",
     )
     return columns, [
-        [title, *(percent(scores.get(measure)) for measure in measures)]
+        [title, *(format_percent(scores.get(measure)) for measure in measures)]
         for title, scores in _all_faces(results)
     ]
 
@@ -166,18 +174,19 @@ def motion(results: Results) -> Table:
         "turns_per_s": 1,
     }
     return columns, [
-        [title, *(number(scores.get(measure), places) for measure, places in digits.items())]
+        [title, *(format_number(scores.get(measure), places) for measure, places in digits.items())]
         for title, scores in _all_faces(results)
     ]
 
 
 def disturbed_lips(results: Results) -> list[str]:
-    """Return a sentence for each lip model with its figures with babble and music."""
+    """Return a sentence for each lip model: its scores in clean audio, babble and music."""
     sentences = []
     for face, scores in results.get("lips", {}).items():
         conditions = [name for name in (_CLEAN, _BABBLE, _MUSIC) if name in scores]
+        measures = ("r_opening", "closure_f1")
         figures = (
-            f"{name} {joined(number(scores[name][_ALL][m]) for m in ('r_opening', 'closure_f1'))}"
+            f"{name} {join_values(format_number(scores[name][_ALL][m]) for m in measures)}"
             for name in conditions
         )
         if face != _REAL and len(conditions) > 1:
@@ -186,13 +195,13 @@ def disturbed_lips(results: Results) -> list[str]:
 
 
 def lookahead(results: Results) -> Table:
-    """Return the opening's correlation and the closures' F1 by lip model and look-ahead."""
+    """Return the correlation of the opening and the F1 of closures by look-ahead."""
     curves = lookahead_curves(results)
     delays = sorted({delay for points in curves.values() for delay in points})
     rows = []
     for lips, points in curves.items():
         for measure, name in (("r_opening", "r"), ("closure_f1", "F1")):
-            values = (number(points.get(delay, {}).get(measure)) for delay in delays)
+            values = (format_number(points.get(delay, {}).get(measure)) for delay in delays)
             rows.append([f"{lips}, {name}", *values])
     return ("lip model", *(f"{delay} ms" for delay in delays)), rows
 
@@ -224,10 +233,10 @@ def schemes(results: Results) -> Table:
             score["lips"],
             str(score["scheme"]),
             score["recognizer"] or "(text)",
-            joined(number(value) for value in like["correlation"].values()),
-            number(like["lag_ms"], 0),
-            number(like["closure_f1"]),
-            joined(number(score[f"phone_delay_{p}_ms"], 0) for p in ("p50", "p95")),
+            join_values(format_number(value) for value in like["correlation"].values()),
+            format_number(like["lag_ms"], 0),
+            format_number(like["closure_f1"]),
+            join_values(format_number(score[f"phone_delay_{p}_ms"], 0) for p in ("p50", "p95")),
             paper[score["scheme"]],
         ]
         for step in ("schemes", "schemes-paper-rule")
@@ -246,7 +255,9 @@ def viseme_fit(results: Results) -> Table:
         of_viseme = {error["measure"]: error for error in errors if error["viseme"] == viseme}
         frames = max(error["num_frames"] for error in of_viseme.values())
         cells = (
-            joined(number(of_viseme[measure][key], 0) for key in ("learnt", "guessed", "extent"))
+            join_values(
+                format_number(of_viseme[measure][key], 0) for key in ("learnt", "guessed", "extent")
+            )
             if measure in of_viseme
             else "-"
             for measure in measures
@@ -264,7 +275,9 @@ def ferguson(results: Results) -> Table:
         [
             method,
             *(
-                joined(percent(score[kind][method]) for kind in ("of_frames", "of_phones"))
+                join_values(
+                    format_percent(score[kind][method]) for kind in ("of_frames", "of_phones")
+                )
                 for score in scores
             ),
         ]

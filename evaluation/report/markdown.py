@@ -21,16 +21,16 @@ def bullets(sentences: Iterable[str]) -> str:
     return "".join(f"- {sentence}\n" for sentence in sentences)
 
 
-def number(value: float | None, digits: int = 2) -> str:
+def format_number(value: float | None, digits: int = 2) -> str:
     """Format a number; None is a dash."""
     return UNKNOWN if value is None else f"{value:.{digits}f}"
 
 
-def percent(rate: float | None, digits: int = 0) -> str:
+def format_percent(rate: float | None, digits: int = 0) -> str:
     """Format a rate as a percentage without its sign; None is a dash."""
     return UNKNOWN if rate is None else f"{100 * rate:.{digits}f}"
 
 
-def joined(values: Iterable[str]) -> str:
+def join_values(values: Iterable[str]) -> str:
     """Join several values in one cell."""
     return " / ".join(values)

@@ -1,4 +1,4 @@
-"""Writes the page of the report, docs/results.md, and its picture from the results of the steps.
+"""Writes the report page, docs/results.md, and its picture from the results of the steps.
 
 ``template.md`` has the text, with a line ``[[NAME]]`` for each table.
 """
@@ -43,7 +43,7 @@ TABLES = {
 
 
 def read_results(folder: Path) -> dict[str, Any]:
-    """Read the files of all steps that have been measured."""
+    """Read the results of all measured steps."""
     paths = {name: folder / f"{name}.json" for name in STEPS}
     return {n: json.loads(path.read_text("utf-8")) for n, path in paths.items() if path.exists()}
 
@@ -67,13 +67,13 @@ def _part(name: str, steps: Results, results: Results) -> str:
     measured = [step for step in part.steps if step in steps]
     if not measured:
         return f'Not measured yet: `make report STEPS="{" ".join(part.steps)}"`.\n'
-    notes = [_about(steps[step]) for step in measured]
+    notes = [_describe_measurement(steps[step]) for step in measured]
     if name == "agreement" and "lips" in steps:
-        notes += [*lip_tables.disturbed_lips(results), _about(steps["lips"])]
+        notes += [*lip_tables.disturbed_lips(results), _describe_measurement(steps["lips"])]
     return f"{markdown(part.table(results))}\n{bullets(notes)}"
 
 
-def _about(step: Results) -> str:
+def _describe_measurement(step: Results) -> str:
     commands = "`, `".join(step["commands"])
     measured = f"{step['machine']}, {step['date']}, commit {step['commit']}"
     return f"`{commands}`: {measured}, {step['seconds']} s, load {step['load']:.1f}"

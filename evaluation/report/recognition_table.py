@@ -1,6 +1,12 @@
 """The table of phones: errors and delays of the acoustic models."""
 
-from kouxing.evaluation.report.markdown import Results, Table, joined, number, percent
+from kouxing.evaluation.report.markdown import (
+    Results,
+    Table,
+    format_number,
+    format_percent,
+    join_values,
+)
 
 _SPEECH = {"read": "read", "conversation": "conversation"}
 _CLEAN = "clean"
@@ -41,14 +47,15 @@ def recognition(results: Results) -> Table:
 def _cells(score: Results) -> list[str]:
     delay = score.get("delay_ms", {})
     errors = {
-        hypothesis: joined(
-            percent(score[hypothesis][f"{unit}_error_rate"], 1) for unit in ("phone", "viseme")
+        hypothesis: join_values(
+            format_percent(score[hypothesis][f"{unit}_error_rate"], 1)
+            for unit in ("phone", "viseme")
         )
         for hypothesis in ("final", "first")
     }
     return [
         str(score["final"]["phone_errors"]["reference"]),
         *errors.values(),
-        joined(number(delay.get(key), 0) for key in ("p50", "p95")),
-        joined(percent(rate) for rate in score["final"]["labials"].values()),
+        join_values(format_number(delay.get(key), 0) for key in ("p50", "p95")),
+        join_values(format_percent(rate) for rate in score["final"]["labials"].values()),
     ]

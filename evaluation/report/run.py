@@ -1,7 +1,7 @@
 """Runs the steps of the report that are out of date, and stores their results.
 
-A result is a JSON file with the command, machine, date, commit and load. It is out of date if the
-code or the models that its step depends on have another hash.
+A result is a JSON file with the commands, machine, date, commit and load. It is out of date if the
+hash of the code and models that its step depends on has changed.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ def run_steps(
 ) -> list[str]:
     """Run steps and return those that failed.
 
-    ``folders`` are the data that the commands name. A step without its data is left out.
+    ``folders`` are the data folders that the commands use. A step without its data is skipped.
     """
     failed = []
     for name in names:
@@ -53,7 +53,7 @@ def run_steps(
             print_message(f"{name}: up to date")
         else:
             print_message(f"{name}: kouxing {_without_braces(commands[-1])}")
-            measured = about()
+            measured = describe_run()
             figures = _run(commands, folders)
             if figures is None:
                 failed.append(name)
@@ -77,7 +77,7 @@ def code_hash(step: Step) -> str:
     return digest.hexdigest()[:16]
 
 
-def about() -> dict[str, Any]:
+def describe_run() -> dict[str, Any]:
     """Return machine, date and commit."""
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
@@ -97,9 +97,9 @@ def about() -> dict[str, Any]:
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result without figures by speaker and by frame, and with five digits."""
+    """Write a result rounded to five digits, without figures by speaker and by frame."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(_reduced(result), indent=1, ensure_ascii=False)
+    text = json.dumps(_trim_figures(result), indent=1, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")
 
 
@@ -123,13 +123,13 @@ def _without_braces(command: str) -> str:
     return command.replace("{", "").replace("}", "")
 
 
-def _reduced(value: Any) -> Any:
+def _trim_figures(value: Any) -> Any:
     if isinstance(value, dict):
         return {
-            key: _reduced(item)
+            key: _trim_figures(item)
             for key, item in value.items()
             if key not in _DROPPED and not key.startswith(_DROPPED_GROUPS)
         }
     if isinstance(value, list | tuple):
-        return [_reduced(item) for item in value]
+        return [_trim_figures(item) for item in value]
     return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value

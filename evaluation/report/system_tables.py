@@ -1,8 +1,14 @@
-"""The tables of the running system: time, load, size and faults, next to their physical floor."""
+"""The tables of the running system: time, load, size and faults, with their physical floors."""
 
 from collections.abc import Iterator
 
-from kouxing.evaluation.report.markdown import Results, Table, joined, number, percent
+from kouxing.evaluation.report.markdown import (
+    Results,
+    Table,
+    format_number,
+    format_percent,
+    join_values,
+)
 
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20
 _FRAME_BYTES, _FRAMES_PER_S = 68 * 4, 50
@@ -10,7 +16,7 @@ _FRAME_BYTES, _FRAMES_PER_S = 68 * 4, 50
 
 def system(results: Results) -> Table:
     """Return each figure of the running system with its physical floor."""
-    return ("figure", "value", "floor", "why this floor"), [
+    return ("figure", "value", "floor", "source of the floor"), [
         row for rows in (_chain, _load, _busy, _browser, _sizes) for row in rows(results)
     ]
 
@@ -30,13 +36,13 @@ def _chain(results: Results) -> Iterator[list[str]]:
     ]
     yield [
         "processor time of all services, s per s of audio",
-        number(sum(chain["cpu_s_per_audio_s"].values())),
-        number(floor_cores),
+        format_number(sum(chain["cpu_s_per_audio_s"].values())),
+        format_number(floor_cores),
         "operations of the networks / rate of the matrix product",
     ]
     for name, drawing in chain["page"]["drawings"].items():
         title = f"page in headless Chromium, {name}, pictures per s"
-        yield [title, number(drawing["pictures_per_s"], 0), "60", "display"]
+        yield [title, format_number(drawing["pictures_per_s"], 0), "60", "display"]
 
 
 def _load(results: Results) -> Iterator[list[str]]:
@@ -48,15 +54,15 @@ def _load(results: Results) -> Iterator[list[str]]:
     floor = load["cores"] / floor_cores if floor_cores else None
     yield [
         f"sessions on {load['cores']} cores, all speaking",
-        number(summary["sessions"], 0),
-        number(floor, 0),
+        format_number(summary["sessions"], 0),
+        format_number(floor, 0),
         "cores / floor of the processor time; under load, the block network runs every 160 ms",
     ]
     if "recognizer_mb_per_session" in summary:
         memory = (summary[f"{name}_mb_per_session"] for name in ("recognizer", "synthesizer"))
         yield [
             "memory of a session, recognizer / synthesizer, MB",
-            joined(number(value, 1) for value in memory),
+            join_values(format_number(value, 1) for value in memory),
             "1.5",
             "keys and values of the block network, 2.5 s",
         ]
@@ -67,7 +73,7 @@ def _busy(results: Results) -> Iterator[list[str]]:
     for run, summary in zip(busy["runs"], busy["summary"], strict=True) if busy else ():
         yield [
             f"{run['num_programs']} busy programs: largest lateness, s / frames missing, %",
-            joined([number(summary["worst_s"]), percent(summary["missing"])]),
+            join_values([format_number(summary["worst_s"]), format_percent(summary["missing"])]),
             "0",
             "",
         ]
@@ -80,7 +86,7 @@ def _browser(results: Results) -> Iterator[list[str]]:
     yield [
         "lips in the browser: sound to weights, p50 / p95, ms",
         _percentiles(browser["delay_ms"]),
-        number(_LOOK_AHEAD_MS + _FRAME_MS / 2, 0),
+        format_number(_LOOK_AHEAD_MS + _FRAME_MS / 2, 0),
         "look-ahead + half a frame; the display adds up to a tick of 17 ms",
     ]
     models = results.get("sizes", {}).get("model_bytes", {})
@@ -89,10 +95,13 @@ def _browser(results: Results) -> Iterator[list[str]]:
         is_ours = package is browser
         yield [
             f"{package['name']} in the browser: download, MB / share of a core, %",
-            joined(
-                [number(package["download_bytes"] / 1e6, 1), percent(package["processor_share"])]
+            join_values(
+                [
+                    format_number(package["download_bytes"] / 1e6, 1),
+                    format_percent(package["processor_share"]),
+                ]
             ),
-            f"{number(needed, 1)} / -" if is_ours and needed else "",
+            f"{format_number(needed, 1)} / -" if is_ours and needed else "",
             "weights of its models" if is_ours and needed else "",
         ]
 
@@ -102,21 +111,21 @@ def _sizes(results: Results) -> Iterator[list[str]]:
     if not sizes:
         return
     total = sum(sizes["model_bytes"].values()) / 1e6
-    yield ["all models of the recognizer, MB", number(total, 1), "", ""]
+    yield ["all models of the recognizer, MB", format_number(total, 1), "", ""]
     yield [
         "FAP frames to a subscriber, kB/s",
-        number(sizes["frame_bytes"] * _FRAMES_PER_S / 1e3, 1),
-        number(_FRAME_BYTES * _FRAMES_PER_S / 1e3, 1),
+        format_number(sizes["frame_bytes"] * _FRAMES_PER_S / 1e3, 1),
+        format_number(_FRAME_BYTES * _FRAMES_PER_S / 1e3, 1),
         "68 floats, 50 times a second",
     ]
 
 
 def _percentiles(values: Results) -> str:
-    return joined(number(values.get(key), 1) for key in ("p50", "p95"))
+    return join_values(format_number(values.get(key), 1) for key in ("p50", "p95"))
 
 
 def faults(results: Results) -> Table:
-    """Return what a viewer sees of each fault."""
+    """Return the effects of each fault on a viewer."""
     columns = (
         "fault",
         "no new frame for, s",
@@ -124,18 +133,18 @@ def faults(results: Results) -> Table:
         "frames lost",
         "phones lost / doubled / changed",
         "largest step",
-        "refused sessions",
+        "rejected sessions",
     )
     rows = []
     for outcome in results.get("faults", []):
         face = outcome["face"]
         cells = (
             [
-                number(face["stood_s"]),
-                number(face["late_s"]),
+                format_number(face["stood_s"]),
+                format_number(face["late_s"]),
                 str(face["frames_lost"]),
-                joined(str(face[f"phones_{kind}"]) for kind in ("lost", "doubled", "changed")),
-                number(face["largest_step"], 1),
+                join_values(str(face[f"phones_{kind}"]) for kind in ("lost", "doubled", "changed")),
+                format_number(face["largest_step"], 1),
             ]
             if face
             else [outcome["failure"], "-", "-", "-", "-"]

@@ -1,4 +1,4 @@
-"""``python run.py PROGRAM SOUNDS TABLES``: the curves of Python packages, like ``run.js``."""
+"""``python run.py PROGRAM SOUNDS TABLES``: writes curves of Python packages, like ``run.js``."""
 
 import csv
 import subprocess
@@ -20,7 +20,7 @@ _OPENFACEFX_CURVES = ("sil", "aa", "E", "O")  # without text
 
 
 def pylipsync_rows(samples: Samples) -> Iterator[Row]:
-    """Yield the vowels of pylipsync, whose window of 64 ms is centered at its frame."""
+    """Yield the vowels of pylipsync, whose window of 64 ms is centered on its frame."""
     from pylipsync import PhonemeAnalyzer  # type: ignore[import-not-found] # noqa: PLC0415
 
     visemes = {"aa": "aa", "ee": "E", "ih": "ih", "oh": "oh", "ou": "ou", "silence": "sil"}
@@ -69,7 +69,7 @@ def rhubarb_rows(samples: Samples) -> Iterator[Row]:
 
 
 def write_wav(path: Path, samples: Samples) -> None:
-    """Write mono samples of 16 bit."""
+    """Write 16-bit mono samples."""
     with wave.open(str(path), "wb") as file:
         file.setparams((1, 2, RATE_HZ, 0, "NONE", ""))
         file.writeframes((np.clip(samples, -1.0, 1.0) * 32767.0).astype("<i2").tobytes())

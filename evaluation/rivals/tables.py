@@ -1,9 +1,9 @@
-"""Writes the curves of other lip sync for clips: tables for ``kouxing evaluate lips --from-csv``.
+"""Runs other lip-sync programs on clips, and writes tables for ``evaluate lips --from-csv``.
 
 HeadAudio, wLipSync and live2d-motionsync run in Node as in a browser's audio thread, at 48 kHz in
 blocks of 128 samples. wawa-lipsync reads an analyser node 60 times a second. pylipsync (uLipSync in
-Python), OpenFaceFX and Rhubarb (if it is on the path) process whole recordings. All have their
-default settings. ``make report`` installs them.
+Python), OpenFaceFX and Rhubarb (if it is on the path) process whole recordings. All programs have
+their default settings. ``make report`` installs them, except Rhubarb.
 
 wLipSync needs a profile, which its users make from their own voice. Here it is the mean cepstrum of
 each viseme in a quarter of the training clips. Loudness is the level of the last 20 ms, from 40 dB
@@ -68,7 +68,7 @@ _PROFILE = {
 def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
     """Write ``output/PROGRAM/CLIP.csv`` for the held-out and the training clips of a folder.
 
-    Existing tables stay. Raises UserError if a program is unknown, not installed, or fails.
+    Existing tables are kept. Raises UserError if a program is unknown, not installed, or fails.
     """
     unknown = {*programs} - {*PROGRAMS}
     if unknown:
@@ -111,20 +111,20 @@ def _node() -> str:
     beside = Path(sys.executable).parent / "node"
     node = str(beside) if beside.exists() else shutil.which("node")
     if node is None:
-        raise UserError("other lip sync needs Node; install it with 'make setup'")
+        raise UserError("this program needs Node; install it with 'make setup'")
     return node
 
 
 def _installed(name: str) -> Path:
     if not (FOLDER / name).exists():
-        raise UserError("other lip sync is not installed; run 'make report'")
+        raise UserError("this program is not installed; run 'make report' to install it")
     return FOLDER / name
 
 
 def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:
     """Return a profile with the mean cepstrum of each viseme, in the middles of its phones."""
     model = load_model()
-    # wLipSync computes as many coefficients as the profile has phonemes
+    # wLipSync computes N coefficients for a profile with N phonemes
     blank = _profile({str(k): np.zeros(_NUM_CEPSTRA) for k in range(_NUM_CEPSTRA)})
     windows: dict[str, list[Array]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as name:

@@ -9,14 +9,14 @@ _LINE = re.compile(  # up to the first Chinese character, and after the last one
     "(?P<after>[\0-\x7f]*)"
 )
 _TIME = re.compile(r"(?<![\w.])\d+(?:[:'′]\d+)*(?:\.\d+)?")
-_LIKE_A_TIME = re.compile(r"\d[:'′.]\d|\ds\b")
+_TIME_LIKE = re.compile(r"\d[:'′.]\d|\ds\b")
 _SEPARATOR = re.compile(r"[(\[{<【（|;,=:~\t\"]|^\s*s\b")
 _NAME_BEFORE = re.compile(r"[\w./-]*\d[\w./-]*[|\t]|[A-Za-z][\w./-]*\d[\w./-]* +")
 _NAME_AFTER = re.compile(r"[ \t]*\([A-Za-z][\w./-]*\d\)[ \t]*")
 
 
-def without_columns(text: str) -> str:
-    """Return a text without the columns of times, or of names with a number, of its lines.
+def remove_columns(text: str) -> str:
+    """Remove columns of times, or of names with a number, from the lines of a text.
 
     Times increase from line to line. A text of a single line has no columns.
     """
@@ -37,7 +37,7 @@ def without_columns(text: str) -> str:
 def _are_times(cells: Sequence[str]) -> bool:
     rows = [[_seconds(time) for time in _TIME.findall(cell)][-2:] for cell in cells]
     are_single = all(
-        len(row) == 1 and _LIKE_A_TIME.search(cell) and _SEPARATOR.search(_TIME.sub("", cell))
+        len(row) == 1 and _TIME_LIKE.search(cell) and _SEPARATOR.search(_TIME.sub("", cell))
         for row, cell in zip(rows, cells, strict=True)
     )
     return (

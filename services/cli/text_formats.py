@@ -12,7 +12,7 @@ from collections.abc import Callable
 from itertools import groupby, pairwise
 from typing import NamedTuple
 
-from kouxing.services.cli.text_columns import without_columns
+from kouxing.services.cli.text_columns import remove_columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import parse_json
 
@@ -149,7 +149,7 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
                 raise UserError(f"this is not valid {form}; give only the spoken text") from None
             break
     else:
-        spoken = without_columns(text)
+        spoken = remove_columns(text)
         form = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
         raise UserError("the text has times of an unknown format; give only the spoken text")
@@ -278,7 +278,7 @@ def _read_text_grid(text: str) -> str:
 
 
 def _read_commands(text: str) -> str:
-    return without_columns(_COMMAND.sub("", text))
+    return remove_columns(_COMMAND.sub("", text))
 
 
 def _read_json(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Joins the sound of a session to longer messages, because every message costs the same."""
+"""Joins a session's audio into longer messages, because each message has a fixed cost."""
 
 from collections.abc import Iterator
 
@@ -9,11 +9,11 @@ from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.phones.events import EndOfSound, SoundEvent, Waveform
 from kouxing.shared.wire.audio import Sound
 
-PACKET_S = 0.04  # of sound that subscribers get at a time; less if the face follows sooner
+PACKET_S = 0.04  # duration of a message; less if the face has a shorter delay
 
 
 class SoundPackets:
-    """Sound waits for more, but no longer than its face, which is ``face_delay_s`` later."""
+    """Buffers audio up to the length of a packet, but no longer than ``face_delay_s``."""
 
     def __init__(self, face_delay_s: float) -> None:
         self._num_joined = round(min(PACKET_S, face_delay_s) * MEDIA_RATE_HZ)  # samples

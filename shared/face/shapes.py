@@ -121,9 +121,9 @@ class ShapeSet:
             inner = np.flatnonzero(free)
             rows = self._gram[inner]
             weights[inner] = np.linalg.solve(rows[:, inner], right[inner] - rows @ weights)
-            lean = right - self._gram @ weights  # negative gradient
+            negative_gradient = right - self._gram @ weights
             below, above = free & (weights < -_ROUNDING), free & (weights > 1.0 + _ROUNDING)
-            released = ~free & (np.where(at_one, -lean, lean) > _ROUNDING)
+            released = ~free & (np.where(at_one, -negative_gradient, negative_gradient) > _ROUNDING)
             wrong = np.flatnonzero(below | above | released)
             if len(wrong) == 0:
                 return np.clip(weights, 0.0, 1.0)

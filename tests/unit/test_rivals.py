@@ -1,4 +1,4 @@
-"""Tables of other lip sync: loudness needs no package, and a missing one is an error."""
+"""Tables of other lip-sync programs: loudness needs no package; a missing package is an error."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-// Other lip sync from npm, with its default settings. Each function returns a promise of { node: input for the
+// Other lip-sync packages from npm, with their default settings. Each function returns a promise of { node: input for the
 // sound, faps(): the current face }. Weights of visemes become FAPs by the table that kouxing's visemes have.
 
 const NUM_FAPS = 68;

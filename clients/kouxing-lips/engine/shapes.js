@@ -58,8 +58,8 @@ export class ShapeSet {
       inner.forEach((i, row) => (weights[i] = solved[row]));
       const moves = all.map((i) => {
         if (free[i]) return { i, isFree: false, isOne: weights[i] > 1 + this.#c.ROUNDING, isWrong: !isWithin(weights[i], this.#c.ROUNDING) };
-        const lean = right[i] - dot(this.#gram[i], weights);
-        return { i, isFree: true, isOne: false, isWrong: (atOne[i] ? -lean : lean) > this.#c.ROUNDING };
+        const negativeGradient = right[i] - dot(this.#gram[i], weights);
+        return { i, isFree: true, isOne: false, isWrong: (atOne[i] ? -negativeGradient : negativeGradient) > this.#c.ROUNDING };
       });
       let wrong = moves.filter(({ isWrong }) => isWrong);
       if (wrong.length === 0) return weights.map((weight) => clamp(weight, 0, 1));

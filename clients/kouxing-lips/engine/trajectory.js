@@ -68,14 +68,14 @@ export class LipTrack {
   }
 
   forgetBefore(timeS) {
-    this.#knots.splice(0, Math.max(0, numUntil(this.#knots, timeS) - 1));
+    this.#knots.splice(0, Math.max(0, numKnotsUntil(this.#knots, timeS) - 1));
   }
 
   at(timeS) {
     let knots = this.#knots;
     if (!knots.length || timeS < knots[0].timeS) return this.#rest;
     if (timeS >= knots.at(-1).timeS) knots = [knots.at(-1), ...this.#returnToRest()];
-    const after = numUntil(knots, timeS);
+    const after = numKnotsUntil(knots, timeS);
     return after === knots.length ? this.#rest : interpolate(knots[after - 1], knots[after], timeS);
   }
 
@@ -87,7 +87,7 @@ export class LipTrack {
 }
 
 /** Return the number of knots up to a time. */
-function numUntil(knots, timeS) {
+function numKnotsUntil(knots, timeS) {
   const after = knots.findIndex((knot) => knot.timeS > timeS);
   return after < 0 ? knots.length : after;
 }

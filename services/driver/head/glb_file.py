@@ -40,8 +40,8 @@ class BadGlbError(Exception):
 
 
 @contextlib.contextmanager
-def naming_glb(path: Path) -> Iterator[None]:
-    """Raise ``UserError``, which names the file, for every error of the enclosed code."""
+def check_glb(path: Path) -> Iterator[None]:
+    """Raise ``UserError`` with the path of the GLB for every error of the enclosed code."""
     with check_content(path, "a GLB file; export it again"):
         try:
             yield
@@ -73,7 +73,7 @@ class Glb:
     """A file with its buffers.
 
     Raises ``UserError`` if the file cannot be read, ``BadGlbError`` if it requires an unsupported
-    extension, and any exception if it is damaged (``naming_glb``).
+    extension, and any exception if it is damaged (``check_glb``).
     """
 
     def __init__(self, path: Path) -> None:

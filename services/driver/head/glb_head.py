@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb, naming_glb
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb, check_glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
 from kouxing.services.driver.head.head import Head, assemble
 from kouxing.services.driver.head.morphs import units_per_weight
@@ -67,7 +67,7 @@ def read_glb(path: Path) -> Head:
 
     Raises ``UserError`` if the file is not such a GLB; the text says what is missing.
     """
-    with naming_glb(path), np.errstate(invalid="ignore", over="ignore"):  # the results are checked
+    with check_glb(path), np.errstate(invalid="ignore", over="ignore"):  # the results are checked
         glb = Glb(path)
         pieces = read_pieces(glb)
         return _head(path.stem, glb, pieces, _recognize(pieces))

@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import Float64, Glb, naming_glb
+from kouxing.services.driver.head.glb_file import Float64, Glb, check_glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
 from kouxing.services.driver.head.pieces import Primitive
 from kouxing.shared.errors import UserError
@@ -33,7 +33,7 @@ def read_mesh(path: Path) -> list[Primitive]:
     if suffix not in MESH_SUFFIXES:
         raise UserError(f"{path}: give a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
     if suffix == ".glb":
-        with naming_glb(path):
+        with check_glb(path):
             pieces = read_pieces(Glb(path))
     else:
         with check_content(path, "a mesh; export it again"):
