@@ -123,7 +123,7 @@ static void set_goal(Rest *rest, double goal, double duration_s) {
 }
 
 /* Process the events up to the time of a frame. */
-static void update_rest(Rest *rest, double time_s) {
+static void follow_voice(Rest *rest, double time_s) {
   int number = 0;
   for (; number < rest->num_changes && rest->changes[number].time_s <= time_s; number++) {
     const SpeechChange change = rest->changes[number];
@@ -356,7 +356,7 @@ static void solve_weights(Face *face, const double *right, double *weights) {
 
 void face_visemes(Face *face, double time_s, float *weights) {
   double faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
-  update_rest(&face->rest, time_s);
+  follow_voice(&face->rest, time_s);
   if (face->has_lip_frames) follow_track(face, time_s);
   const double ajar = ajar_share_at(&face->rest, time_s);
   face->time_s = time_s;
