@@ -6,7 +6,7 @@ from pathlib import Path
 from kouxing.corpora.lip_clips import read_clips
 from kouxing.corpora.speech_corpus import may_ship
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import write_error
+from kouxing.shared.output_file import write_error
 
 _SUFFIXES = (".flac", ".csv", ".json")
 _COLUMNS = ("clip", "part", "language", "speaker", "license")

@@ -17,6 +17,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.output_file import open_output, write_error
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -162,19 +163,8 @@ def write_text(path: Path, text: str) -> None:
 
     Raises ``UserError`` if the file cannot be written.
     """
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise write_error(path, error) from None
-
-
-def write_error(path: Path, error: OSError) -> UserError:
-    """Return the error for a file that cannot be written."""
-    if isinstance(error, FileNotFoundError):
-        return UserError(
-            f"cannot write {path}: the folder does not exist; run: mkdir -p {path.parent}"
-        )
-    return UserError(f"cannot write {path}: {error.strerror}")
+    with open_output(path) as file:
+        file.write(text.encode())
 
 
 def _to_python(value: object) -> object:

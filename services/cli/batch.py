@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_message, write_error
+from kouxing.shared.output_file import write_error
+from kouxing.shared.terminal import print_message
 
 T = TypeVar("T", Path, Path | None)
 

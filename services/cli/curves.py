@@ -28,8 +28,8 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.output_file import write_error
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.terminal import write_error
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import Motion

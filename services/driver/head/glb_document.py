@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.errors import UserError
+from kouxing.shared.output_file import open_output
 
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 MAX_SHORT_VERTICES = 65535  # more vertices need 4-byte indices; 65535 itself is not a valid index
@@ -110,10 +110,7 @@ class GlbDocument:
         text += b" " * (-len(text) % 4)
         binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
         length = 12 + 8 + len(text) + 8 + len(binary)
-        try:
-            with path.open("wb") as file:
-                file.write(struct.pack("<4sII", b"glTF", 2, length))
-                file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-                file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
-        except OSError as error:
-            raise UserError(f"cannot write {path} ({error.strerror}); give another path") from error
+        with open_output(path) as file:
+            file.write(struct.pack("<4sII", b"glTF", 2, length))
+            file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)

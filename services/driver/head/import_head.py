@@ -30,6 +30,7 @@ from kouxing.services.driver.head.points_file import Points, read_points
 from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.output_file import open_output
 
 MAX_VERTICES = 65_535  # limit of 16-bit indices in the page's GLB
 NEEDED = ("2.1", *sorted(INNER), "2.10", *sorted(OUTER))
@@ -57,13 +58,8 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     given = read_points(points)
     places = _places(mesh, points, pieces, given)
     arrays, remarks = _Import(mesh, points, pieces, places, given).run()
-    try:
-        with output.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-    except OSError as error:
-        if output.is_file():  # incomplete
-            output.unlink()
-        raise UserError(f"cannot write {output}: {error.strerror}") from error
+    with open_output(output) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
     return remarks
 
 

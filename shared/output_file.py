@@ -1,0 +1,36 @@
+"""Writes the files that a user asked for, completely or not at all."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from kouxing.shared.errors import UserError
+
+
+@contextlib.contextmanager
+def open_output(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for writing. If an error or Ctrl-C interrupts the writing, the file is deleted.
+
+    Raises ``UserError`` if the file cannot be written.
+    """
+    try:
+        with path.open("wb") as file:
+            try:
+                yield file
+                file.flush()
+            except BaseException:
+                if path.is_file():  # not a device
+                    path.unlink()
+                raise
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+def write_error(path: Path, error: OSError) -> UserError:
+    """Return the error for a file that cannot be written."""
+    if isinstance(error, FileNotFoundError):
+        return UserError(
+            f"cannot write {path}: the folder does not exist; run: mkdir -p {path.parent}"
+        )
+    return UserError(f"cannot write {path}: {error.strerror}")
