@@ -143,7 +143,7 @@ class SpeechScorer:
         self._ear_queue.append(event)
 
     def next_position(self) -> Position | None:
-        """Return the next position for the ear; None if there is none."""
+        """Return the next position for the ear, or None if the queue has no position."""
         while self._ear_queue:
             item = self._ear_queue[0]
             if isinstance(item, Position):

@@ -224,7 +224,7 @@ class FaceAnimator:
         self._feeling.amount = amount
 
     def set_behavior(self, change: Behavior) -> None:
-        """Change the behavior of the face; fields that are None stay as they are."""
+        """Change the idle motion of the face. A field that is None changes nothing."""
         if self._idle_motion is not None:
             self._idle_motion.set_behavior(change)
 

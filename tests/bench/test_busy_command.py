@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from kouxing.evaluation.commands import bench_app
 from kouxing.evaluation.system import busy
 from kouxing.evaluation.system.busy import STEP_S, Run
+from kouxing.evaluation.system.commands import app
 from tests.system import VOWELS_FILE
 
 
@@ -35,7 +35,7 @@ def test_prints_writes_and_plots_the_same_figures(
     figures, picture = tmp_path / "busy.json", tmp_path / "busy.png"
     arguments = ["busy", str(VOWELS_FILE), "--programs", "1", "--seconds", "1", "--after", "1"]
     result = CliRunner().invoke(
-        bench_app, [*arguments, "--json", str(figures), "--picture", str(picture)]
+        app, [*arguments, "--json", str(figures), "--picture", str(picture)]
     )
     assert result.exit_code == 0, result.output
     written = json.loads(figures.read_text(encoding="utf-8"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from kouxing.evaluation.commands import bench_app
+from kouxing.evaluation.system.commands import app
 from tests.system import VOWELS_FILE
 
 
@@ -20,7 +20,7 @@ def test_prints_and_writes_the_same_figures(
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 1.0)
     figures = tmp_path / "latency.json"
     arguments = [str(VOWELS_FILE), "--repeats", "1", "--json", str(figures)]
-    result = CliRunner().invoke(bench_app, arguments)
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     latency = json.loads(figures.read_text(encoding="utf-8"))
     assert latency["num_frames"] > 50

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from kouxing.evaluation.commands import bench_app
+from kouxing.evaluation.system.commands import app
 from kouxing.services.kinds import KINDS
 from tests.system import VOWELS_FILE
 
@@ -18,7 +18,7 @@ def test_prints_writes_and_plots_the_same_figures(
     figures, picture = tmp_path / "load.json", tmp_path / "load.png"
     arguments = ["load", str(VOWELS_FILE), "--sessions", "2", "--seconds", "1"]
     result = CliRunner().invoke(
-        bench_app, [*arguments, "--json", str(figures), "--picture", str(picture)]
+        app, [*arguments, "--json", str(figures), "--picture", str(picture)]
     )
     assert result.exit_code == 0, result.output
     load = json.loads(figures.read_text(encoding="utf-8"))

@@ -3,8 +3,6 @@
 No head is drawn, because a headless Firefox without a GPU has no WebGL.
 """
 
-import base64
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +11,12 @@ import pytest
 
 from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
+from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
 from tests.firefox import Firefox
 from tests.process.test_lips_package import package_faps, read
-from tests.process.test_sound_server import SERVER
-from tests.system import DEMO, ROOT, wait_until
+from tests.sound_server import sound_server
+from tests.system import DEMO
 
-PACKAGE = ROOT / "clients" / "kouxing-lips"
 CODE = "index.js", "worker.js", "worklet.js", "frame-track.js", "engine"
 PAGE = """<!doctype html><link rel="icon" href="data:,">
 <button id="microphone">Microphone</button><button id="sample">Sample</button><p id="note"></p>
@@ -29,13 +27,11 @@ const [microphone, sample, note] =
 const lips = window.lips = await LipSync.create();
 window.delays = [];
 window.opened = 0;
-window.frames_ = [];
 lips.addEventListener("notice", ({ detail }) => (note.textContent = detail));
 lips.addEventListener("frames", ({ detail: { frames, startS } }) => {
   for (const { timeS, faps } of frames) {
     window.delays.push(lips.context.currentTime - startS - timeS);
     window.opened = Math.max(window.opened, -faps[3] - faps[4]);
-    window.frames_.push([...faps]);
   }
 });
 const act = (action) => async () => {
@@ -48,7 +44,6 @@ sample.onclick = act(async () => {
 });
 window.isReady = true;
 </script>"""
-NOTE = "document.getElementById('note').textContent"
 
 
 @pytest.fixture(scope="module")
@@ -67,18 +62,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True, scope="module")
 def _sound_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Start a sound server, without which Firefox plays no sound."""
-    folder, quiet = tmp_path_factory.mktemp("sound"), subprocess.DEVNULL
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HOME", str(folder))
-        patch.setenv("XDG_RUNTIME_DIR", str(folder))
-        server = subprocess.Popen(SERVER, stderr=quiet)
-        try:
-            info = ["pactl", "info"]
-            wait_until(lambda: subprocess.call(info, stdout=quiet, stderr=quiet) == 0)
-            yield
-        finally:
-            server.terminate()
-            server.wait(30)
+    with sound_server(tmp_path_factory.mktemp("sound")):
+        yield
 
 
 @pytest.fixture
@@ -105,23 +90,12 @@ def test_the_microphone_sends_sound(browser: Firefox) -> None:
 
 def test_frames_equal_those_of_node(browser: Firefox, site: Path) -> None:
     samples = read(DEMO / "lake-male.wav")
-    sound = base64.b64encode(samples.astype("<f4").tobytes()).decode()
-    faps = browser.evaluate(
-        "(async () => {"
-        f"const bytes = Uint8Array.from(atob('{sound}'), (c) => c.charCodeAt(0));"
-        "await window.lips.open(16000); window.lips.push(new Float32Array(bytes.buffer));"
-        "await window.lips.finish(); return window.frames_; })()"
-    )
-    np.testing.assert_allclose(np.array(faps), package_faps(site / "models", samples), atol=1e-3)
+    faps = frames_of(browser, samples)
+    np.testing.assert_allclose(faps, package_faps(site / "models", samples), atol=1e-3)
 
 
 def test_sound_before_a_click_gives_a_notice(browser: Firefox) -> None:
-    play = "window.lips.listenTo(new AudioBuffer({ length: 48000, sampleRate: 48000 }))"
-    browser.evaluate(f"{play}.then(() => 1)")
-    assert "click on the page" in browser.evaluate(NOTE)
-    browser.click("note")
-    browser.wait_for("window.lips.context.state === 'running'")
-    browser.wait_for(f"{NOTE} === ''")
+    check_sound_waits_for_a_click(browser)
 
 
 def test_a_blocked_microphone_gives_a_sentence(browser: Firefox) -> None:

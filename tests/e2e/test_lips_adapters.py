@@ -14,10 +14,10 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
+from tests.e2e.lips_page import PACKAGE
 from tests.glb_writer import Mesh, write_glb
 from tests.system import DEMO, NODE, ROOT
 
-PACKAGE = ROOT / "clients" / "kouxing-lips"
 PACKAGES = PACKAGE / "node_modules"
 CLIENT_PACKAGES = ROOT / "clients" / "javascript" / "node_modules"
 SIZE_PX = (320, 240)

@@ -1,6 +1,5 @@
 """The demo page of kouxing-lips in Chromium: lip sync without a server."""
 
-import base64
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,13 +10,12 @@ import pytest
 from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
 from tests.browser import Browser
+from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
 from tests.process.test_lips_package import package_faps, read
-from tests.system import DEMO, NODE, ROOT
+from tests.system import DEMO, NODE
 
-PACKAGE = ROOT / "clients" / "kouxing-lips"
 SIZE_PX = (420, 700)
 FACE = "document.getElementById('face')"
-NOTE = "document.getElementById('note').textContent"
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +75,10 @@ def test_frames_in_the_browser_equal_those_of_node(
     samples = read(DEMO / "lake-male.wav")
     for name, content in web_model().items():
         (tmp_path / name).write_bytes(content)
-    sound = base64.b64encode(samples.astype("<f4").tobytes()).decode()
     with serve_folder(site) as origin:
         open_demo(browser, origin)
-        faps = browser.evaluate(
-            "(async () => { const all = [];"
-            "const lips = window.lips;"
-            "lips.addEventListener('frames', ({ detail }) => all.push(...detail.frames));"
-            f"const bytes = Uint8Array.from(atob('{sound}'), (c) => c.charCodeAt(0));"
-            "await lips.open(16000); lips.push(new Float32Array(bytes.buffer));"
-            "await lips.finish(); return all.map(({ faps }) => [...faps]); })()"
-        )
-    np.testing.assert_allclose(np.array(faps), package_faps(tmp_path, samples), atol=1e-3)
+        faps = frames_of(browser, samples)
+    np.testing.assert_allclose(faps, package_faps(tmp_path, samples), atol=1e-3)
 
 
 def test_an_avatar_speaks(browser: Browser, site: Path) -> None:
@@ -124,12 +114,7 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
 def test_sound_before_a_click_gives_a_notice(browser: Browser, site: Path) -> None:
     with serve_folder(site) as origin:
         open_demo(browser, origin)
-        play = "window.lips.listenTo(new AudioBuffer({ length: 48000, sampleRate: 48000 }))"
-        browser.evaluate(f"{play}.then(() => 1)")
-        assert "click on the page" in browser.evaluate(NOTE)
-        browser.click("note")
-        browser.wait_for("window.lips.context.state === 'running'")
-        browser.wait_for(f"{NOTE} === ''")
+        check_sound_waits_for_a_click(browser)
 
 
 def test_a_blocked_microphone_gives_a_sentence(browser: Browser, site: Path) -> None:

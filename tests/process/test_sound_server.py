@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 
 from kouxing.shared.sound_devices import monitor, sound_devices
+from tests.sound_server import sound_server
 from tests.system import wait_until
 
 RATE_HZ, TONE_HZ = 16_000, 1000
 MAX_BLOCKS = 3000  # 60 s: playback without a loudspeaker may start late
-SERVER = (
-    *"pulseaudio -n --daemonize=no --exit-idle-time=-1 --use-pid-file=no --disable-shm=yes".split(),
-    *("-L", "module-null-sink sink_properties=device.description=Loudspeaker"),
-    *("-L", "module-native-protocol-unix"),
-)
 PLAYER = (
     *"pacat --client-name=Player --format=s16le --channels=1 --latency-msec=50".split(),
     f"--rate={RATE_HZ}",
@@ -29,23 +25,12 @@ def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     folder = tmp_path_factory.mktemp("sound")
     tone = 16384 * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(60 * RATE_HZ))
     (folder / "tone").write_bytes(tone.astype("<i2").tobytes())
-    quiet = subprocess.DEVNULL
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HOME", str(folder))
-        patch.setenv("XDG_RUNTIME_DIR", str(folder))
-        server = subprocess.Popen(SERVER, stderr=quiet)
-        try:
-            info = ["pactl", "info"]
-            wait_until(lambda: subprocess.call(info, stdout=quiet, stderr=quiet) == 0)
-            with (folder / "tone").open("rb") as sound:
-                player = subprocess.Popen(PLAYER, stdin=sound, stderr=quiet)
-            wait_until(lambda: len(programs()) == 1)
-            yield
-            player.terminate()
-            player.wait(30)
-        finally:
-            server.terminate()
-            server.wait(30)
+    with sound_server(folder), (folder / "tone").open("rb") as sound:
+        player = subprocess.Popen(PLAYER, stdin=sound, stderr=subprocess.DEVNULL)
+        wait_until(lambda: len(programs()) == 1)
+        yield
+        player.terminate()
+        player.wait(30)
 
 
 def programs() -> list[str]:

@@ -64,7 +64,7 @@ _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Behavior:
-    """Behavior of a face while it speaks and listens. A field that is None changes nothing."""
+    """Idle motion in speech and while listening. A field that is None changes nothing."""
 
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer

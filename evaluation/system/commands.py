@@ -1,0 +1,161 @@
+"""The commands ``kouxing bench``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from typer.core import TyperGroup
+
+from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, write_json
+
+SENTENCE = Path(__file__).parents[2] / "shared" / "demo" / "hello-female.wav"
+
+AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
+
+
+class BenchGroup(TyperGroup):
+    """Accepts ``kouxing bench my.wav`` for ``kouxing bench chain my.wav``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the command if it is missing."""
+        if args and args[0] not in {*self.commands, *self.get_help_option_names(ctx)}:
+            args = ["chain", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(cls=BenchGroup, add_completion=False, help="Measure the running system.")
+
+
+@app.command()
+def chain(
+    audio: AudioFile,
+    repeats: Annotated[int, typer.Option(min=1, help="Times to stream the file.")] = 3,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure latency, CPU time and images per second of the whole chain on this machine.
+
+    If Chromium is installed, the page is also measured.
+    """
+    from kouxing.evaluation.system import chromium, costs, latency, page
+
+    check_output(json_file, force=force)
+    delays = latency.measure(audio, repeats, CONSOLE)
+    sessions = costs.measure_sessions(audio)
+    images = costs.measure_images()
+    drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
+    console = Console()
+    latency.show(delays, console)
+    costs.show_sessions(sessions, console)
+    costs.show_images(images, console)
+    if drawings:
+        page.show(drawings, console)
+    page_figures = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
+    write_json(
+        json_file,
+        {**asdict(delays), "sessions": sessions, "rendering": asdict(images), "page": page_figures},
+    )
+
+
+@app.command(name="lips-page")
+def lips_page(
+    audio: AudioFile,
+    package: Annotated[Path, typer.Option(help="Folder of kouxing-lips in a source tree.")] = Path(
+        "clients/kouxing-lips"
+    ),
+    clips: Annotated[
+        Path | None,
+        typer.Option(help="Folder of clips with tracked lips, to also measure the accuracy."),
+    ] = None,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Compare lip sync in the browser: kouxing-lips, HeadAudio, wLipSync, wawa-lipsync.
+
+    The figures are download, time to load, processor time and, with clips, accuracy. Needs
+    Chromium. Other packages are compared after `npm ci` in the folder of kouxing-lips.
+    """
+    from kouxing.evaluation.system.lips_page import measure, show
+
+    check_output(json_file, force=force)
+    figures = measure(audio, package, clips)
+    show(figures, Console())
+    ours, *others = (asdict(page) for page in figures)
+    write_json(json_file, ours | {"others": others})
+
+
+@app.command()
+def sizes(json_file: JsonFile = None, force: Force = False) -> None:
+    """Measure model sizes, and the minimum processor time of the networks on this machine."""
+    from kouxing.evaluation.system.sizes import measure, show
+
+    check_output(json_file, force=force)
+    figures = measure()
+    show(figures, Console())
+    floors = {f"hop {hop}": figures.floor_cores(hop) for hop in (1, 4)}
+    write_json(json_file, asdict(figures) | {"floor_cores": floors})
+
+
+@app.command()
+def load(
+    audio: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings to stream. Default: the samples.")
+    ] = None,
+    sessions: Annotated[
+        int, typer.Option(min=1, max=1000, help="Number of sessions in the last step.")
+    ] = 24,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="Duration of each of up to 9 steps, in seconds.")
+    ] = 12.0,
+    picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure how many live sessions all services can serve here.
+
+    A single client process streams to all sessions, with different voices.
+    """
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.system.load import draw, measure, show
+
+    check_output(picture, json_file, force=force)
+    figures = measure(audio or sorted(SENTENCE.parent.glob("*.wav")), sessions, seconds, CONSOLE)
+    show(figures, Console())
+    if picture is not None:
+        save_figure(draw(figures), picture)
+    write_json(json_file, asdict(figures) | {"summary": figures.summary})
+
+
+@app.command()
+def busy(
+    audio: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings to stream. Default: the samples.")
+    ] = None,
+    programs: Annotated[
+        list[int] | None,
+        typer.Option(min=0, max=100, help="Number of busy programs; repeatable. Default: 0, 2, 6."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each load.")] = 30.0,
+    after: Annotated[float, typer.Option(min=1.0, help="Seconds of speech after a load.")] = 15.0,
+    picture: Annotated[Path | None, typer.Option(help="Plot the lateness (.png).")] = None,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure the lateness of a live face while other programs keep the processor busy.
+
+    Also measures the processor time and the wake-ups of each service. Needs Linux.
+    """
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.system.busy import draw, measure, show
+
+    check_output(picture, json_file, force=force)
+    paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
+    figures = measure(paths, programs or (0, 2, 6), seconds, after, CONSOLE)
+    show(figures, Console())
+    if picture is not None:
+        save_figure(draw(figures), picture)
+    write_json(json_file, asdict(figures) | {"summary": [run.summary for run in figures.runs]})
