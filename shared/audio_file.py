@@ -120,7 +120,6 @@ def _open_file(
         if wav := pcm_of_wav(begin):
             return _wav_audio(file, begin, wav, path)
         raise UserError(f"{path}: the file has several parts of sound; convert them separately")
-    file.seek(0)
     sound = MediaSound(file, path, begin, track, is_pipe=False)
     return _source(sound, path, name, block_s, begin, lambda: num_bytes)
 

@@ -65,7 +65,7 @@ class Socket:
         self._connection: Connection | None = None  # connection of the last message
         self._sender = NO_PEER  # sender of the last message
         self._has_unread_parts = False  # unread parts of the last message remain
-        self._unread_parts_from: Connection | None = None  # connection of the unread parts
+        self._unread_parts_from: Connection | None = None
         self._name = secrets.token_hex(8)
         self._followed: set[bytes] = set()  # subscriptions, now or before
         self._prefixes: tuple[bytes, ...] = ()  # those that are not a whole topic

@@ -72,7 +72,7 @@ class WavParts:
 
 
 def num_parts(file: BinaryIO) -> int:
-    """Return how many parts of sound a file has, from its start; 0 if it is no WAV file."""
+    """Return the number of parts of sound, or 0 if this is not a WAV file; rewind the file."""
     count = place = file.seek(0)
     while (kind := file.read(4)).strip().isalnum():
         size = int.from_bytes(file.read(4), "little")

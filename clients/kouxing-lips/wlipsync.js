@@ -18,23 +18,26 @@ export class WLipSyncAudioNode extends GainNode {
 
   /** How far the mouth moves, 0 to 1: the sum of the vowels' VRM weights. */
   get volume() {
-    return Math.min(1, this.#sum);
+    return Math.min(1, sumOf(this.#vowels()));
   }
 
   /** Shares of the vowels by the names of the profile; their product with the volume is the VRM weight. */
   get weights() {
-    const sum = this.#sum;
-    return Object.fromEntries(this.#names.map((name) => [name, sum > 0 ? this.#weightOf(name) / sum : 0]));
+    const vowels = this.#vowels();
+    const sum = sumOf(vowels);
+    return Object.fromEntries(this.#names.map((name) => [name, sum > 0 ? (vowels[name] ?? 0) / sum : 0]));
   }
 
-  get #sum() {
-    return Object.keys(VOWELS).reduce((sum, vowel) => sum + this.#weightOf(vowel), 0);
+  /** Return the VRM weights by vowel. */
+  #vowels() {
+    const weights = this.#lips.current?.vrm ?? [];
+    const shapes = this.#lips.names.vrm;
+    return Object.fromEntries(Object.entries(VOWELS).map(([vowel, shape]) => [vowel, weights[shapes.indexOf(shape)] ?? 0]));
   }
+}
 
-  #weightOf(name) {
-    const index = this.#lips.names.vrm.indexOf(VOWELS[name]);
-    return this.#lips.current?.vrm[index] ?? 0;
-  }
+function sumOf(vowels) {
+  return Object.values(vowels).reduce((sum, weight) => sum + weight, 0);
 }
 
 /** Create a node. The profile only names the weights, because the models suit all voices. */

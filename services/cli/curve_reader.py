@@ -61,11 +61,10 @@ def read_table(path: Path) -> FapAnimation:
         try:
             times.append(row[names.index(time_name)])
             values.append(np.array([row[column] for column in columns], np.float64))
+            is_valid = len(row) == len(names) and (np.abs(values[-1]) <= _MAX_FAP).all()
         except (ValueError, TypeError, IndexError):
-            raise UserError(
-                f"{path}, frame {number}: a value is missing or not a number; correct it"
-            ) from None
-        if len(row) != len(names) or not (np.abs(values[-1]) <= _MAX_FAP).all():
+            is_valid = False
+        if not is_valid:
             raise UserError(
                 f"{path}, frame {number}: a value is missing or not a number; correct it"
             )

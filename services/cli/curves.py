@@ -30,6 +30,7 @@ from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.output_file import write_error
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.terminal import write_text
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import Motion
@@ -168,7 +169,7 @@ class CueExporter(CurveExporter):
         cues = kind.cues_of(frames)
         suffix = self._output.suffix.lower()
         text = write_cues(suffix, cues, kind.rest, end_s, curves.source)
-        _write_lines(self._output, text.splitlines())
+        write_text(self._output, text)
         return len(frames)
 
 

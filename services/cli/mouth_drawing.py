@@ -5,6 +5,7 @@ Interpolation gives R(t), and R(t) gives the contour. The paper's mouth has one 
 lip model gives the width, so that the mouth is round for u, ü and o.
 """
 
+import codecs
 import csv
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
@@ -48,7 +49,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
-from kouxing.shared.output_file import write_error
+from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
@@ -289,24 +290,21 @@ def _label_at(time_s: float, spans: Sequence[Span]) -> str:
 def _write_csv(output: Path, mouth: _Mouth) -> str:
     times_s, openings, widths = mouth.sample()
     symbols = mouth.symbols
-    try:
-        with output.open("w", encoding="utf-8", newline="") as file:
-            table = csv.writer(file, lineterminator="\n")
-            table.writerow(CSV_COLUMNS)
-            for first in range(0, len(times_s), _BLOCK_FRAMES):
-                block = slice(first, first + _BLOCK_FRAMES)
-                contours = rounded_contour(openings[block], widths[block], mouth.num_points)
-                for time_s, opening, lines in zip(
-                    times_s[block], openings[block], contours, strict=True
-                ):
-                    at, phone = f"{time_s:.3f}", _label_at(time_s, symbols)
-                    table.writerows(
-                        (at, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
-                        for name, line in zip(LINES, lines, strict=True)
-                        for number, (x, y) in enumerate(line)
-                    )
-    except OSError as error:
-        raise write_error(output, error) from None
+    with open_output(output) as file:
+        table = csv.writer(codecs.getwriter("utf-8")(file), lineterminator="\n")
+        table.writerow(CSV_COLUMNS)
+        for first in range(0, len(times_s), _BLOCK_FRAMES):
+            block = slice(first, first + _BLOCK_FRAMES)
+            contours = rounded_contour(openings[block], widths[block], mouth.num_points)
+            for time_s, opening, lines in zip(
+                times_s[block], openings[block], contours, strict=True
+            ):
+                at, phone = f"{time_s:.3f}", _label_at(time_s, symbols)
+                table.writerows(
+                    (at, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
+                    for name, line in zip(LINES, lines, strict=True)
+                    for number, (x, y) in enumerate(line)
+                )
     return plural(len(times_s), "frame")
 
 

@@ -89,9 +89,8 @@ class LiveBatches:
             is_behind = any(session.audio.overload.is_behind for session in sessions)
             self._pace.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
         part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
-        for begin in range(
-            0, len(sessions), SESSIONS_TOGETHER
-        ):  # the first ones do not wait for all
+        # the first sessions do not wait for all
+        for begin in range(0, len(sessions), SESSIONS_TOGETHER):
             group = sessions[begin : begin + SESSIONS_TOGETHER]
             for session in group:
                 session.accept_waveform(part_s, now_s, self._pace.hop)

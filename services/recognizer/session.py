@@ -79,11 +79,12 @@ class RecognizerSession:
                 lip_predictor = lip_predictor.with_mouth_profile(start.mouth_profile)
             except UserError as error:
                 self.mouth_profile_error = f"the mouth profile is not used: {error}"
+        face_delay_s = (start.facts.delay_ms or 0.0) / 1e3
         self.stream = recognizer.create_stream(
             sample_rate_hz=start.sample_rate_hz,
             num_channels=start.num_channels,
             lip_predictor=lip_predictor,
-            face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
+            face_delay_s=face_delay_s,
             speech_time=start.speech_time or 0,
             language=start.facts.language,
         )
@@ -109,7 +110,7 @@ class RecognizerSession:
         self.acknowledged_s = 0.0
         self.is_laughing = False  # the speaker
         self._published_acoustic = AcousticModelName.FULL
-        self._sound = SoundPackets((start.facts.delay_ms or 0.0) / 1e3)
+        self._sound = SoundPackets(face_delay_s)
         self.sequence_out = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.output_file import open_output
 from kouxing.shared.user_file import read_file, split_lines
 
 _VERSION = "2.1"
@@ -92,10 +93,8 @@ def write_fap(path: Path, animation: FapAnimation) -> None:
     lines = [f"{_VERSION} {name} {animation.frame_rate_hz:.10g} {len(low)}"]
     for number, row in enumerate(rows):
         lines += [mask, f"{number} {' '.join(row)}"]
-    try:
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}; choose another path") from error
+    with open_output(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())
 
 
 def _parse(path: Path, text: str) -> FapAnimation:

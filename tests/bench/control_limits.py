@@ -32,13 +32,12 @@ from kouxing.shared.wire.control import (
     StartSession,
 )
 from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
+from tests.control_stage import LOCAL, PROVIDED
 
 SESSIONS_PER_WORKER = 100
 BATCH = 64  # sessions that are opened at once
 ROUNDS = 4  # of heartbeats
 SOCKETS_PER_BUS = 250
-LOCAL = "tcp://127.0.0.1:*"
-PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 
 
 @dataclass(slots=True)

@@ -1,7 +1,6 @@
 """The recognizer's loop with real sockets: how much it does at a time."""
 
 import threading
-import time
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -23,7 +22,7 @@ from kouxing.shared.wire.message import MAX_AUDIO_BYTES, replace
 from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
-from tests.system import free_port
+from tests.system import free_port, wait_until
 
 RATE_HZ = START.sample_rate_hz
 PHONE_INPUT = {"phone_input": f"tcp://127.0.0.1:{free_port()}"}
@@ -114,9 +113,9 @@ def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
             service.step(0.0)
             assert live.next_media_time == 320 * (number + 1)  # at once
             assert other.media_time - before <= MAX_UNPACED_S * 16000 + 320
-        end_s = time.monotonic() + 60
-        while other.next_media_time < 8000 * num_long and time.monotonic() < end_s:
-            service.step(0.01)
+        wait_until(
+            lambda: other.next_media_time >= 8000 * num_long, step=lambda: service.step(0.01)
+        )
         assert other.next_media_time == 8000 * num_long
         assert other.num_gaps == 0  # no audio was dropped
     assert not service.warned
@@ -146,9 +145,7 @@ def test_other_sessions_continue_while_a_model_is_loaded(
     service.stop_session("closed")
     assert service.started == ["live"]
     is_released.set()
-    end_s = time.monotonic() + 60
-    while len(service.started) < 2 and time.monotonic() < end_s:
-        service.step(0.01)
+    wait_until(lambda: len(service.started) >= 2, step=lambda: service.step(0.01))
     assert service.started == ["live", "de"]
     assert {*service._sessions} == {"live", "de"}
     assert service._sessions["de"].face.settings.acoustic == AcousticModelName.LIGHT
@@ -168,8 +165,6 @@ def test_reports_a_model_that_cannot_be_loaded(
 
     monkeypatch.setattr(starting_sessions, "model_of_language", fail)
     service._on_start_session(replace(UNPACED, facts=SessionFacts(language="german")), Peer())
-    end_s = time.monotonic() + 60
-    while not service.warned and time.monotonic() < end_s:
-        service.step(0.01)
+    wait_until(lambda: service.warned, step=lambda: service.step(0.01))
     assert service.warned == [("start", "no model for german")]
     assert not service._sessions

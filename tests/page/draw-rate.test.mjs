@@ -74,8 +74,9 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
   const gl = { fenceSync: () => ({}), flush() {}, clientWaitSync: () => 0, deleteSync() {} };
   const drawRate = new DrawRate(1, 1, false);
   const queue = new ImageQueue({ ...gl, TIMEOUT_EXPIRED: 1 }, drawRate);
+  let numVisible = 0;
   const show = (seenAfterMs, isHidden) => {
-    queue.draw(nowMs, () => {});
+    queue.draw(nowMs, () => {}, () => numVisible++);
     if (isHidden) page.dispatchEvent(new Event("visibilitychange"));
     nowMs += seenAfterMs;
     ticks.pop()(nowMs);
@@ -83,6 +84,7 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
   for (let i = 0; i < 20; i++) show(40, false);
   show(60000, true);
   assert.ok(drawRate.visibleDelayMs < 100, `${drawRate.visibleDelayMs}`);
+  assert.equal(numVisible, 20);
   show(1900, false);
   assert.ok(drawRate.visibleDelayMs >= 1900, `${drawRate.visibleDelayMs}`);
 });

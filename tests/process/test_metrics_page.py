@@ -34,21 +34,20 @@ def start(port: int = 0) -> MetricsServer:
     return MetricsServer("127.0.0.1", port, metrics, "tester", lambda: True)
 
 
-def get(server: MetricsServer, path: str) -> str:
-    address = f"http://127.0.0.1:{server.server_port}{path}"
-    with urllib.request.urlopen(address, timeout=30) as page:
+def get(port: int, path: str) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=LIMIT_S) as page:
         text: str = page.read().decode()
         return text
 
 
 def test_serves_metrics_and_health(server: MetricsServer) -> None:
-    assert 'kouxing_resent_total{service="tester"} 5.0' in get(server, "/metrics")
-    assert get(server, "/healthz") == "alive\n"
+    assert 'kouxing_resent_total{service="tester"} 5.0' in get(server.server_port, "/metrics")
+    assert get(server.server_port, "/healthz") == "alive\n"
     server.is_alive = lambda: False
     with pytest.raises(urllib.error.HTTPError, match="503"):
-        get(server, "/healthz")
+        get(server.server_port, "/healthz")
     with pytest.raises(urllib.error.HTTPError, match="404"):
-        get(server, "/")
+        get(server.server_port, "/")
 
 
 def test_answers_while_too_many_connections_send_no_request(server: MetricsServer) -> None:
@@ -57,7 +56,7 @@ def test_answers_while_too_many_connections_send_no_request(server: MetricsServe
         for _ in range(MAX_REQUESTS + 1):
             connection = socket.create_connection(address, timeout=30)
             connections.enter_context(connection).sendall(b"GET /metr")
-        assert get(server, "/healthz") == "alive\n"
+        assert get(server.server_port, "/healthz") == "alive\n"
 
 
 @pytest.mark.parametrize("request_line", [b"GET /healthz HTTP/1.1", b"\xff\xff / HTTP/9"])
@@ -105,19 +104,13 @@ def families(system: System) -> dict[str, list[Metric]]:
         system.wait_until(lambda _: _heartbeats(client) > before + 5)  # they set the gauges
         for port in ports:
             pour(port, 0.2)  # which the pages outlast
-        pages = [[*text_string_to_metric_families(_page(port))] for port in ports]
+        pages = [[*text_string_to_metric_families(get(port, "/metrics"))] for port in ports]
     return dict(zip(CHAIN, pages, strict=True))
 
 
 def _heartbeats(client: Client) -> float:
     (control,) = (state for state in client.status().services if state.service == "control")
     return control.metrics.get("in_heartbeat", 0.0)  # control's own heartbeat has them
-
-
-def _page(port: int) -> str:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LIMIT_S) as page:
-        text: str = page.read().decode()
-        return text
 
 
 def _names(families: dict[str, list[Metric]]) -> set[str]:

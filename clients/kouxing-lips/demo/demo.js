@@ -87,9 +87,10 @@ async function startComparing(lips) {
   const { headAudio, wLipSync } = await import("./rivals.js");
   const shown = [];
   for (const [title, start] of Object.entries({ HeadAudio: headAudio, wLipSync })) {
-    shown.push({ face: Object.assign(document.createElement("kouxing-face"), { title }), lips: await start(lips.context) });
+    const rival = Object.assign(document.createElement("kouxing-face"), { title });
+    rival.setAttribute("manual", "");
+    shown.push({ face: rival, lips: await start(lips.context) });
   }
-  for (const { face: rival } of shown) rival.setAttribute("manual", "");
   const [first, second] = shown;
   byId("faces").prepend(first.face);
   byId("faces").append(second.face);

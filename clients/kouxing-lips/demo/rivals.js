@@ -65,16 +65,16 @@ function shapeOf(name) {
 /** Return a function from weights by name to FAPs. */
 async function mixer() {
   const [header, ...rows] = (await (await fetch("visemes.tsv")).text()).trim().split("\n").map((line) => line.split("\t"));
-  const visemes = rows
+  const visemes = {};
+  rows
     .filter(([kind]) => kind === "viseme")
-    .map((row) => {
-      const faps = new Float32Array(NUM_FAPS);
+    .forEach((row, number) => {
+      const faps = (visemes[OCULUS[number]] = new Float32Array(NUM_FAPS));
       header.forEach((column, i) => column.startsWith("fap") && (faps[column.slice(3) - 1] = row[i]));
-      return faps;
     });
   return (weights) => {
     const sum = new Float32Array(NUM_FAPS);
-    for (const [name, weight] of Object.entries(weights)) visemes[OCULUS.indexOf(name)].forEach((x, i) => (sum[i] += weight * x));
+    for (const [name, weight] of Object.entries(weights)) visemes[name].forEach((x, i) => (sum[i] += weight * x));
     return sum;
   };
 }

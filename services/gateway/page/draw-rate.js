@@ -131,7 +131,10 @@ export class ImageQueue {
     return !this.#isDrawing && this.#drawRate.isDue(nowMs);
   }
 
-  /** Draw the face of a time with render(). onVisible gets the time at which it becomes visible, ms. */
+  /**
+   * Draw the face of a time with render(). onVisible gets the time at which it becomes visible, ms,
+   * unless the page was hidden in the meantime.
+   */
   draw(nowMs, render, onVisible = () => {}) {
     this.#isDrawing = true;
     const startMs = performance.now();
@@ -143,7 +146,8 @@ export class ImageQueue {
       this.#drawRate.recordDrawn(startMs, doneMs);
       requestAnimationFrame((tickMs) => {
         const visibleMs = Math.max(tickMs, doneMs); // a busy page gets a tick late
-        if (startMs > this.#hiddenMs) this.#drawRate.recordVisible(nowMs, visibleMs);
+        if (startMs <= this.#hiddenMs) return; // its delay says nothing
+        this.#drawRate.recordVisible(nowMs, visibleMs);
         onVisible(visibleMs);
       });
     });

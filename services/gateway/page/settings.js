@@ -4,7 +4,7 @@ import { element } from "./elements.js";
 import { languageFor, say, setLanguage } from "./language.js";
 import { TEXTS } from "./texts.js";
 
-const STRENGTH = 0.8; // strength of an expression
+const EXPRESSION_STRENGTH = 0.8;
 const AMOUNTS = ["expressiveness", "feeling"];
 export const MOTIONS = [...AMOUNTS, "still", "eye_contact"]; // names of face settings
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
@@ -38,7 +38,7 @@ export class Settings {
     }
     this.#bind("language", () => this.#applyLanguage());
     element("expressions").onclick = ({ target }) => {
-      if (target.value) handlers.express({ [target.value]: STRENGTH });
+      if (target.value) handlers.express({ [target.value]: EXPRESSION_STRENGTH });
     };
   }
 

@@ -5,8 +5,9 @@ import { Microphone } from "./microphone.js";
 
 export class SpeechControls {
   microphone;
-  state = "off"; // state of the microphone
-  session = null; // session of the microphone
+  // of the microphone
+  state = "off";
+  session = null;
   #sound;
   #handlers;
   #wasSoundWanted = false; // before the microphone or a lesson muted the sound

@@ -98,7 +98,7 @@ class GmmModel(AcousticModel):
     mixtures: GaussianMixtures
     rotation: Floats  # (39, 39)
     prior_mean: Floats  # (13,) cepstral mean of the training corpus
-    half_width: int  # half width of the differences
+    half_width: int  # of the differences, frames
     acoustic_scale: float = 1.0  # weight of the log scores: neighboring frames are correlated
 
     @cached_property

@@ -57,6 +57,7 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
 
 
 def _block_network() -> NDArray[np.uint8]:
-    blocks_model = load_model("blocks")
-    assert isinstance(blocks_model, blocks.BlockModel)  # noqa: S101 - the shipped file
-    return blocks_model.network
+    model = _loaded.get("blocks")
+    if isinstance(model, blocks.BlockModel):
+        return model.network
+    return read_archive(model_path("blocks")).array("network", None).astype(np.uint8)
