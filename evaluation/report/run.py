@@ -21,7 +21,7 @@ from kouxing.evaluation.report.steps import ROOT, STEPS, Step
 from kouxing.shared.terminal import print_message
 
 _SOURCES = {".py", ".js", ".mjs", ".ts", ".json", ".toml", ".tsv", ".npz", ".txt"}
-_DROPPED = {"rules", "late_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
+_DROPPED = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
 _DROPPED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
 

@@ -56,20 +56,20 @@ class Run:
 
     num_programs: int
     quiet_median_s: float  # from the audio of a frame to its arrival, before the load
-    late_s: list[float]  # lateness, every STEP_S from the start of the load
+    lateness_s: list[float]  # every STEP_S from the start of the load
     load_s: float  # duration of the load
     missing: float  # fraction of the frames that never arrived
 
     @property
     def worst_s(self) -> float:
         """The largest lateness."""
-        return max(self.late_s)
+        return max(self.lateness_s)
 
     @property
     def longest_s(self) -> float:
         """Duration of the longest time in which the face was behind."""
         longest = current = 0
-        for late_s in self.late_s:
+        for late_s in self.lateness_s:
             current = current + 1 if late_s > LATE_S else 0
             longest = max(longest, current)
         return longest * STEP_S
@@ -78,7 +78,7 @@ class Run:
     def recovery_s(self) -> float | None:
         """Time from the end of the load until the face has recovered; None if it does not."""
         num_steady = round(STEADY_S / STEP_S)
-        after = self.late_s[round(self.load_s / STEP_S) :]
+        after = self.lateness_s[round(self.load_s / STEP_S) :]
         for start in range(len(after) - num_steady + 1):
             if max(after[start : start + num_steady]) <= RECOVERED_S:
                 return start * STEP_S
@@ -88,7 +88,7 @@ class Run:
     def worst_by_second_s(self) -> list[float]:
         """The largest lateness of each second."""
         size = round(1.0 / STEP_S)
-        return [max(self.late_s[at : at + size]) for at in range(0, len(self.late_s), size)]
+        return [max(self.lateness_s[at : at + size]) for at in range(0, len(self.lateness_s), size)]
 
     @property
     def summary(self) -> dict[str, float | None]:
@@ -168,7 +168,7 @@ def _run(
     return Run(
         num_programs=num_programs,
         quiet_median_s=median_s,
-        late_s=[float(age_s) for age_s in _ages_s(frames, start_s, end_s) - median_s],
+        lateness_s=[float(age_s) for age_s in _ages_s(frames, start_s, end_s) - median_s],
         load_s=load_s,
         missing=max(0.0, 1.0 - num_shown / num_due),
     )
@@ -308,8 +308,8 @@ def draw(busy: Busy) -> Any:
     figure = new_figure(9.0, 4.0)
     axes = figure.subplots()
     for run in busy.runs:
-        times_s = np.arange(len(run.late_s)) * STEP_S
-        axes.plot(times_s, run.late_s, label=f"{run.num_programs} busy programs", linewidth=1)
+        times_s = np.arange(len(run.lateness_s)) * STEP_S
+        axes.plot(times_s, run.lateness_s, label=f"{run.num_programs} busy programs", linewidth=1)
     axes.axvspan(0.0, busy.runs[0].load_s, color="grey", alpha=0.15, label="load")
     axes.axhline(LATE_S, color="grey", linestyle=":", label=f"{LATE_S:g} s")
     axes.set(xlabel="time, s", ylabel="lateness of the face, s", ylim=(0, None))

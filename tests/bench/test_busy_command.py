@@ -12,10 +12,10 @@ from kouxing.evaluation.system.commands import app
 from tests.system import VOWELS_FILE
 
 
-def _run(late_s: list[tuple[float, float]], load_s: float) -> Run:
+def _run(lateness_s: list[tuple[float, float]], load_s: float) -> Run:
     """Make a run from pairs of a duration and its lateness."""
-    values = [late for lasts_s, late in late_s for _ in range(round(lasts_s / STEP_S))]
-    return Run(num_programs=1, quiet_median_s=0.1, late_s=values, load_s=load_s, missing=0.0)
+    values = [late for lasts_s, late in lateness_s for _ in range(round(lasts_s / STEP_S))]
+    return Run(num_programs=1, quiet_median_s=0.1, lateness_s=values, load_s=load_s, missing=0.0)
 
 
 def test_summarizes_the_lateness() -> None:
@@ -40,9 +40,9 @@ def test_prints_writes_and_plots_the_same_figures(
     assert result.exit_code == 0, result.output
     written = json.loads(figures.read_text(encoding="utf-8"))
     (run,) = written["runs"]
-    assert len(run["late_s"]) == 100
-    assert max(run["late_s"]) == written["summary"][0]["worst_s"]
-    assert f"{max(run['late_s']):.2f}" in result.stdout
+    assert len(run["lateness_s"]) == 100
+    assert max(run["lateness_s"]) == written["summary"][0]["worst_s"]
+    assert f"{max(run['lateness_s']):.2f}" in result.stdout
     assert 0 < written["speaking"]["recognizer"]["cpu_cores"] < 2
     assert written["idle"]["control"]["wake_ups"] > 0
     assert picture.read_bytes().startswith(b"\x89PNG")

@@ -16,6 +16,9 @@ from kouxing.evaluation.report.markdown import markdown
 from kouxing.evaluation.report.page import TABLES, write_page
 from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.evaluation.system.busy import Run
+from kouxing.evaluation.system.continuity import Continuity
+from kouxing.evaluation.system.faults import Outcome
 from kouxing.evaluation.system.latency import Latency
 from kouxing.evaluation.system.lips_page import LipsPage
 from kouxing.evaluation.system.page import Drawing
@@ -188,3 +191,20 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
         "2.4 / -",
     ]
     assert "HeadAudio in the browser: download, MB / share of a core, %" in rows
+
+
+def test_the_table_of_faults_reads_a_stored_result(tmp_path: Path) -> None:
+    values: dict[str, Any] = dict.fromkeys((field.name for field in fields(Continuity)), 0)
+    face = Continuity(**values | {"stood_s": 0.5, "late_s": 0.25, "largest_step": 1.2})
+    killed = Outcome(fault="control killed", failure="", face=face, load=1.0)
+    write_result(tmp_path / "faults.json", step_file([asdict(killed)]))
+    stored = json.loads((tmp_path / "faults.json").read_text("utf-8"))
+    (row,) = system_tables.faults({"faults": stored["result"]})[1]
+    assert row == ["control killed", "0.50", "0.25", "0", "0 / 0 / 0", "1.2", "0"]
+
+
+def test_the_lateness_of_each_frame_is_not_stored(tmp_path: Path) -> None:
+    run = Run(num_programs=2, quiet_median_s=0.1, lateness_s=[0.0, 0.2], load_s=1.0, missing=0.0)
+    write_result(tmp_path / "busy.json", step_file({"runs": [asdict(run)]}))
+    stored = json.loads((tmp_path / "busy.json").read_text("utf-8"))
+    assert [*stored["result"]["runs"][0]] == ["num_programs", "quiet_median_s", "load_s", "missing"]
