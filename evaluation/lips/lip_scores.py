@@ -11,12 +11,12 @@ from pathlib import Path
 
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import LipClip, aligned_phones, read_clips, training_clips
+from kouxing.corpora.lip_clips import LipClip, aligned_phones
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES, Take
 from kouxing.evaluation.lips.live_faces import Samples, events_of_faces, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth
 from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
-from kouxing.evaluation.lips.references import clips_to_score, reference_of
+from kouxing.evaluation.lips.references import read_parts, reference_of
 from kouxing.evaluation.recognizer.disturbances import (
     BABBLE,
     CLEAN,
@@ -100,22 +100,20 @@ def score_lips(
     """
     model = load_model()
     faces = {} if tables and not names else load_faces(names, delays_ms, model.inventory)
-    clips = clips_to_score(folder, [Path(name) for name in names if name.endswith(".json")])[
-        ::every
-    ]
-    training = training_clips(read_clips(folder, language=None))
+    parameters = [Path(name) for name in names if name.endswith(".json")]
+    held_out, training = read_parts(folder, parameters)
+    clips = held_out[::every]
     programs = load_programs(tables, clips, training)
     known = {clip.speaker for clip in training}
-    voices = babble([clip.samples for clip in clips])
-    disturbances: dict[str, Disturb] = {
-        CLEAN: lambda samples: samples,
-        BABBLE: lambda samples: add_sound(samples, voices, _BELOW_DB),
-        MUSIC: lambda samples: add_sound(samples, music, _BELOW_DB),
-    }
-    used = {name: disturbances[name] for name in CONDITIONS if name in (CLEAN, *conditions)}
+    disturbances: dict[str, Disturb] = {CLEAN: lambda samples: samples}
+    if faces and BABBLE in conditions:
+        voices = babble([clip.samples for clip in clips])
+        disturbances[BABBLE] = lambda samples: add_sound(samples, voices, _BELOW_DB)
+    if faces and MUSIC in conditions:
+        disturbances[MUSIC] = lambda samples: add_sound(samples, music, _BELOW_DB)
     takes: dict[tuple[str, str, str], list[Take]] = {}
     for clip in track(clips, description="clips", transient=True):
-        for title, condition, take in takes_of(model, clip, faces, used, programs):
+        for title, condition, take in takes_of(model, clip, faces, disturbances, programs):
             for group in groups_of(clip, known):
                 takes.setdefault((title, condition, group), []).append(take)
     results: Results = {}

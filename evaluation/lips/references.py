@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips, training_clips
 from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.curves import is_near
 from kouxing.evaluation.lips.mouths import CURVES, Mouth, real_faps, real_mouth
@@ -128,6 +128,20 @@ def clips_to_score(
     ``parameters`` are files; those of the package are always included. Clips with sound out of sync
     are left out. Raises UserError if no clip is left.
     """
+    return _held_out(folder, read_clips(folder, language=language), parameters)
+
+
+def read_parts(
+    folder: Path, parameters: Collection[Path | None] = ()
+) -> tuple[list[LipClip], list[LipClip]]:
+    """Read the clips to score (see ``clips_to_score``) and those for training."""
+    clips = read_clips(folder, language=None)
+    return _held_out(folder, clips, parameters), training_clips(clips)
+
+
+def _held_out(
+    folder: Path, clips: list[LipClip], parameters: Collection[Path | None]
+) -> list[LipClip]:
     seen = {name for path in {None, *parameters} for name in clips_seen(path)}
     filters: dict[str, Callable[[LipClip], bool]] = {
         "no clip is held out; list clips or speakers in held.txt": lambda clip: clip.part == "held",
@@ -139,7 +153,6 @@ def clips_to_score(
             not np.isnan(CURVES["opening"](real_faps(clip))).all()
         ),
     }
-    clips = read_clips(folder, language=language)
     for message, is_kept in filters.items():
         clips = [clip for clip in clips if is_kept(clip)]
         if not clips:

@@ -3,18 +3,15 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from kouxing.evaluation.report.markdown import (
-    Results,
-    Table,
-    format_number,
-    format_percent,
-    join_values,
-)
+from kouxing.evaluation.lips.lip_scores import ALL, REAL
+from kouxing.evaluation.lips.mouths import CURVES
+from kouxing.evaluation.lips.scheme_report import PAPER
+from kouxing.evaluation.recognizer.disturbances import BABBLE, CLEAN, MUSIC
+from kouxing.evaluation.report.markdown import Results, Table, join_values
+from kouxing.evaluation.tables import format_number, percent
 
-_REAL, _CLEAN, _BABBLE, _MUSIC = "real", "clean", "babble 10 dB", "music 10 dB"
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
-_ALL = "all"
-_COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", _ALL: "all clips"}
+_COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", ALL: "all clips"}
 _OWN = "learnt"
 _COMPARED = {  # compared measures, and whether higher is better
     "r_opening": ("correlation of the opening", True),
@@ -61,22 +58,19 @@ def agreement(results: Results) -> Table:
     """Return the correlations with tracked lips in speech, best opening first."""
     faces = _clean_scores(results.get("rivals", {}))
     columns = ("face, delay", *(f"{name}: opening / width / jaw" for name in _GROUPS.values()))
-    order = sorted(faces, key=lambda face: -(faces[face][_ALL]["r_opening"] or 0.0))
+    order = sorted(faces, key=lambda face: -(faces[face][ALL]["r_opening"] or 0.0))
     return columns, [
         [
             title_of(face),
             *(
                 join_values(
-                    format_number(faces[face].get(group, {}).get(f"r_{name}")) for name in _CURVES
+                    format_number(faces[face].get(group, {}).get(f"r_{name}")) for name in CURVES
                 )
                 for group in _GROUPS
             ),
         ]
         for face in order
     ]
-
-
-_CURVES = ("opening", "width", "jaw")
 
 
 def better_programs(results: Results) -> list[str]:
@@ -89,9 +83,9 @@ def better_programs(results: Results) -> list[str]:
     others = [face for face in scores if face.partition(", ")[0] in _NAMES]
     sentences = []
     for group, group_title in _COMPARED_GROUPS.items():
-        real = faces[_REAL][_CLEAN].get(group, {})
+        real = faces[REAL][CLEAN].get(group, {})
         for measure, name in _MEASURE_NAMES.items():
-            if measure in _LIKE_REAL and group != _ALL:
+            if measure in _LIKE_REAL and group != ALL:
                 continue
             values = {face: scores[face].get(group, {}).get(measure) for face in (own, *others)}
             losses = {
@@ -118,8 +112,8 @@ def _loss(measure: str, value: float, real: float | None) -> float:
 
 def _format_measure(measure: str, value: float | None) -> str:
     if measure.endswith("_ms"):
-        return f"{format_number(value, 0)} ms"
-    return format_number(value, 0 if measure in ("rest_opening", "phone_spread") else 2)
+        return f"{format_number(value, '.0f')} ms"
+    return format_number(value, ".0f" if measure in ("rest_opening", "phone_spread") else ".2f")
 
 
 def closures(results: Results) -> Table:
@@ -145,7 +139,7 @@ def closures(results: Results) -> Table:
         "share_shut",
     )
     return columns, [
-        [title, *(format_percent(scores.get(measure)) for measure in measures)]
+        [title, *(percent(scores.get(measure), ".0f") for measure in measures)]
         for title, scores in _all_faces(results)
     ]
 
@@ -163,18 +157,18 @@ def motion(results: Results) -> Table:
         "spread",
         "turns per s",
     )
-    digits = {
-        "lag_ms": 0,
-        "mtm_ms": 0,
-        "slcc": 2,
-        "effort_correlation": 2,
-        "rest_opening": 0,
-        "closing_time_ms": 0,
-        "phone_spread": 0,
-        "turns_per_s": 1,
+    forms = {
+        "lag_ms": ".0f",
+        "mtm_ms": ".0f",
+        "slcc": ".2f",
+        "effort_correlation": ".2f",
+        "rest_opening": ".0f",
+        "closing_time_ms": ".0f",
+        "phone_spread": ".0f",
+        "turns_per_s": ".1f",
     }
     return columns, [
-        [title, *(format_number(scores.get(measure), places) for measure, places in digits.items())]
+        [title, *(format_number(scores.get(measure), form) for measure, form in forms.items())]
         for title, scores in _all_faces(results)
     ]
 
@@ -183,13 +177,13 @@ def disturbed_lips(results: Results) -> list[str]:
     """Return a sentence for each lip model: its scores in clean audio, babble and music."""
     sentences = []
     for face, scores in results.get("lips", {}).items():
-        conditions = [name for name in (_CLEAN, _BABBLE, _MUSIC) if name in scores]
+        conditions = [name for name in (CLEAN, BABBLE, MUSIC) if name in scores]
         measures = ("r_opening", "closure_f1")
         figures = (
-            f"{name} {join_values(format_number(scores[name][_ALL][m]) for m in measures)}"
+            f"{name} {join_values(format_number(scores[name][ALL][m]) for m in measures)}"
             for name in conditions
         )
-        if face != _REAL and len(conditions) > 1:
+        if face != REAL and len(conditions) > 1:
             sentences.append(f"{face}, correlation of the opening / F1: {', '.join(figures)}")
     return sentences
 
@@ -211,13 +205,12 @@ def lookahead_curves(results: Results) -> dict[str, dict[int, dict[str, Any]]]:
     curves: dict[str, dict[int, dict[str, Any]]] = {}
     for face, groups in _clean_scores(results.get("lookahead", {})).items():
         lips, _, delay = face.partition(", ")
-        curves.setdefault(lips, {})[int(float(delay.removesuffix(" ms")))] = groups[_ALL]
+        curves.setdefault(lips, {})[int(float(delay.removesuffix(" ms")))] = groups[ALL]
     return curves
 
 
 def schemes(results: Results) -> Table:
     """Return the four schemes of Li et al. 2011 with the paper's scores."""
-    paper = {1: "4.34 / 4.01", 2: "3.98 / 3.81", 3: "3.42 / 3.50", 4: "3.21 / 3.16"}
     columns = (
         "lips",
         "scheme",
@@ -234,10 +227,10 @@ def schemes(results: Results) -> Table:
             str(score["scheme"]),
             score["recognizer"] or "(text)",
             join_values(format_number(value) for value in like["correlation"].values()),
-            format_number(like["lag_ms"], 0),
+            format_number(like["lag_ms"], ".0f"),
             format_number(like["closure_f1"]),
-            join_values(format_number(score[f"phone_delay_{p}_ms"], 0) for p in ("p50", "p95")),
-            paper[score["scheme"]],
+            join_values(format_number(score[f"phone_delay_{p}_ms"], ".0f") for p in ("p50", "p95")),
+            join_values(format_number(opinion) for opinion in PAPER[score["scheme"]][:2]),
         ]
         for step in ("schemes", "schemes-paper-rule")
         for score in results.get(step, {}).get("scores", [])
@@ -256,7 +249,8 @@ def viseme_fit(results: Results) -> Table:
         frames = max(error["num_frames"] for error in of_viseme.values())
         cells = (
             join_values(
-                format_number(of_viseme[measure][key], 0) for key in ("learnt", "guessed", "extent")
+                format_number(of_viseme[measure][key], ".0f")
+                for key in ("learnt", "guessed", "extent")
             )
             if measure in of_viseme
             else "-"
@@ -276,7 +270,7 @@ def ferguson(results: Results) -> Table:
             method,
             *(
                 join_values(
-                    format_percent(score[kind][method]) for kind in ("of_frames", "of_phones")
+                    percent(score[kind][method], ".0f") for kind in ("of_frames", "of_phones")
                 )
                 for score in scores
             ),
@@ -286,13 +280,13 @@ def ferguson(results: Results) -> Table:
 
 
 def _clean_scores(faces: Results) -> dict[str, dict[str, Any]]:
-    return {face: scores[_CLEAN] for face, scores in faces.items() if face != _REAL}
+    return {face: scores[CLEAN] for face, scores in faces.items() if face != REAL}
 
 
 def _all_faces(results: Results) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield title and scores of all clips: real lips, own lip models, then other programs."""
     faces = results.get("rivals", {})
-    if _REAL in faces:
-        yield "real lips", faces[_REAL][_CLEAN][_ALL]
+    if REAL in faces:
+        yield "real lips", faces[REAL][CLEAN][ALL]
     for face, groups in _clean_scores(faces).items():
-        yield title_of(face), groups[_ALL]
+        yield title_of(face), groups[ALL]

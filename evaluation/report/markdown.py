@@ -1,12 +1,10 @@
-"""Tables in Markdown, and the numbers in their cells."""
+"""Tables in Markdown."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 Results = Mapping[str, Any]  # result of each measured step, by its name
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # columns and rows
-
-UNKNOWN = "-"
 
 
 def markdown(table: Table) -> str:
@@ -19,16 +17,6 @@ def markdown(table: Table) -> str:
 def bullets(sentences: Iterable[str]) -> str:
     """Return a list in Markdown."""
     return "".join(f"- {sentence}\n" for sentence in sentences)
-
-
-def format_number(value: float | None, digits: int = 2) -> str:
-    """Format a number; None is a dash."""
-    return UNKNOWN if value is None else f"{value:.{digits}f}"
-
-
-def format_percent(rate: float | None, digits: int = 0) -> str:
-    """Format a rate as a percentage without its sign; None is a dash."""
-    return UNKNOWN if rate is None else f"{100 * rate:.{digits}f}"
 
 
 def join_values(values: Iterable[str]) -> str:

@@ -84,5 +84,8 @@ STEPS: Mapping[str, Step] = {
         (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
         ("clients/kouxing-lips", "services/cli/web_model.py", "evaluation/system"),
     ),
-    "sizes": Step(("bench sizes",), ("services/recognizer/models", "shared/wire")),
+    "sizes": Step(
+        ("bench sizes",),
+        ("services/recognizer/models", "shared/wire", "evaluation/system/sizes.py"),
+    ),
 }

@@ -2,16 +2,12 @@
 
 from collections.abc import Iterator
 
-from kouxing.evaluation.report.markdown import (
-    Results,
-    Table,
-    format_number,
-    format_percent,
-    join_values,
-)
+from kouxing.evaluation.report.markdown import Results, Table, join_values
+from kouxing.evaluation.tables import format_number, percent
+from kouxing.shared.face.faps import NUM_FAPS
 
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20
-_FRAME_BYTES, _FRAMES_PER_S = 68 * 4, 50
+_FRAME_BYTES, _FRAMES_PER_S = 4 * NUM_FAPS, 50
 
 
 def system(results: Results) -> Table:
@@ -42,7 +38,7 @@ def _chain(results: Results) -> Iterator[list[str]]:
     ]
     for name, drawing in chain["page"]["drawings"].items():
         title = f"page in headless Chromium, {name}, pictures per s"
-        yield [title, format_number(drawing["pictures_per_s"], 0), "60", "display"]
+        yield [title, format_number(drawing["pictures_per_s"], ".0f"), "60", "display"]
 
 
 def _load(results: Results) -> Iterator[list[str]]:
@@ -54,15 +50,15 @@ def _load(results: Results) -> Iterator[list[str]]:
     floor = load["cores"] / floor_cores if floor_cores else None
     yield [
         f"sessions on {load['cores']} cores, all speaking",
-        format_number(summary["sessions"], 0),
-        format_number(floor, 0),
+        format_number(summary["sessions"], ".0f"),
+        format_number(floor, ".0f"),
         "cores / floor of the processor time; under load, the block network runs every 160 ms",
     ]
     if "recognizer_mb_per_session" in summary:
         memory = (summary[f"{name}_mb_per_session"] for name in ("recognizer", "synthesizer"))
         yield [
             "memory of a session, recognizer / synthesizer, MB",
-            join_values(format_number(value, 1) for value in memory),
+            join_values(format_number(value, ".1f") for value in memory),
             "1.5",
             "keys and values of the block network, 2.5 s",
         ]
@@ -73,7 +69,7 @@ def _busy(results: Results) -> Iterator[list[str]]:
     for run, summary in zip(busy["runs"], busy["summary"], strict=True) if busy else ():
         yield [
             f"{run['num_programs']} busy programs: largest lateness, s / frames missing, %",
-            join_values([format_number(summary["worst_s"]), format_percent(summary["missing"])]),
+            join_values([format_number(summary["worst_s"]), percent(summary["missing"], ".0f")]),
             "0",
             "",
         ]
@@ -86,7 +82,7 @@ def _browser(results: Results) -> Iterator[list[str]]:
     yield [
         "lips in the browser: sound to weights, p50 / p95, ms",
         _percentiles(browser["delay_ms"]),
-        format_number(_LOOK_AHEAD_MS + _FRAME_MS / 2, 0),
+        format_number(_LOOK_AHEAD_MS + _FRAME_MS / 2, ".0f"),
         "look-ahead + half a frame; the display adds up to a tick of 17 ms",
     ]
     models = results.get("sizes", {}).get("model_bytes", {})
@@ -97,11 +93,11 @@ def _browser(results: Results) -> Iterator[list[str]]:
             f"{package['name']} in the browser: download, MB / share of a core, %",
             join_values(
                 [
-                    format_number(package["download_bytes"] / 1e6, 1),
-                    format_percent(package["processor_share"]),
+                    format_number(package["download_bytes"] / 1e6, ".1f"),
+                    percent(package["processor_share"], ".0f"),
                 ]
             ),
-            f"{format_number(needed, 1)} / -" if is_ours and needed else "",
+            f"{format_number(needed, '.1f')} / -" if is_ours and needed else "",
             "weights of its models" if is_ours and needed else "",
         ]
 
@@ -111,17 +107,17 @@ def _sizes(results: Results) -> Iterator[list[str]]:
     if not sizes:
         return
     total = sum(sizes["model_bytes"].values()) / 1e6
-    yield ["all models of the recognizer, MB", format_number(total, 1), "", ""]
+    yield ["all models of the recognizer, MB", format_number(total, ".1f"), "", ""]
     yield [
         "FAP frames to a subscriber, kB/s",
-        format_number(sizes["frame_bytes"] * _FRAMES_PER_S / 1e3, 1),
-        format_number(_FRAME_BYTES * _FRAMES_PER_S / 1e3, 1),
-        "68 floats, 50 times a second",
+        format_number(sizes["frame_bytes"] * _FRAMES_PER_S / 1e3, ".1f"),
+        format_number(_FRAME_BYTES * _FRAMES_PER_S / 1e3, ".1f"),
+        f"{NUM_FAPS} floats, {_FRAMES_PER_S} times a second",
     ]
 
 
 def _percentiles(values: Results) -> str:
-    return join_values(format_number(values.get(key), 1) for key in ("p50", "p95"))
+    return join_values(format_number(values.get(key), ".1f") for key in ("p50", "p95"))
 
 
 def faults(results: Results) -> Table:
@@ -144,7 +140,7 @@ def faults(results: Results) -> Table:
                 format_number(face["late_s"]),
                 str(face["frames_lost"]),
                 join_values(str(face[f"phones_{kind}"]) for kind in ("lost", "doubled", "changed")),
-                format_number(face["largest_step"], 1),
+                format_number(face["largest_step"], ".1f"),
             ]
             if face
             else [outcome["failure"], "-", "-", "-", "-"]

@@ -13,7 +13,6 @@ below the loudest frames of the recording (0) to these (1).
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -25,15 +24,10 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.signal import resample_poly
 
-from kouxing.corpora.lip_clips import (
-    SAMPLE_RATE_HZ,
-    LipClip,
-    label_clip,
-    read_clips,
-    training_clips,
-)
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.curve_tables import read_table
-from kouxing.evaluation.lips.references import clips_to_score
+from kouxing.evaluation.lips.references import read_parts
+from kouxing.evaluation.rivals.node import find_node
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
 
@@ -73,8 +67,8 @@ def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
     unknown = {*programs} - {*PROGRAMS}
     if unknown:
         raise UserError(f"unknown program: {min(unknown)}; choose from {', '.join(PROGRAMS)}")
-    training = training_clips(read_clips(folder, language=None))
-    clips = [*clips_to_score(folder), *training]
+    held_out, training = read_parts(folder)
+    clips = [*held_out, *training]
     for program in track(programs, description="programs", transient=True):
         tables = output / program
         tables.mkdir(parents=True, exist_ok=True)
@@ -98,21 +92,13 @@ def _run(program: str, clips: Sequence[LipClip], tables: Path, profile: Any = No
             sound.astype("<f4").tofile(sounds / f"{clip.name}.f32")
         arguments = [program, str(sounds), str(tables.resolve())]
         if program in NODE_PROGRAMS:
-            command = [_node(), "run.js", *arguments, *([str(settings)] if profile else [])]
+            _installed("node_modules")
+            command = [find_node(), "run.js", *arguments, *([str(settings)] if profile else [])]
         else:
             command = [str(_installed(".venv/bin/python")), "run.py", *arguments]
         done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=False)  # noqa: S603
         if done.returncode:
             raise UserError(f"{program} failed: {done.stderr[-500:]}")
-
-
-def _node() -> str:
-    _installed("node_modules")
-    beside = Path(sys.executable).parent / "node"
-    node = str(beside) if beside.exists() else shutil.which("node")
-    if node is None:
-        raise UserError("this program needs Node; install it with 'make setup'")
-    return node
 
 
 def _installed(name: str) -> Path:

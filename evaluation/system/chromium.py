@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import numpy as np
+from numpy.typing import NDArray
 
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
@@ -201,10 +203,14 @@ def write_microphone(audio: Path, wav: Path) -> None:
 
     Raises ``UserError`` if the file is not audio.
     """
-    samples, rate_hz = read_audio(audio)
-    with wave.open(str(wav), "wb") as voice:
-        voice.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
-        voice.writeframes((samples * 32767).astype("<i2").tobytes())
+    write_wav(wav, *read_audio(audio))
+
+
+def write_wav(path: Path, samples: NDArray[np.float32], rate_hz: int) -> None:
+    """Write samples (num_samples, num_channels) to a WAV file of 16 bits."""
+    with wave.open(str(path), "wb") as file:
+        file.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
+        file.writeframes((samples * 32767).astype("<i2").tobytes())
 
 
 def wait_until(condition: Callable[[], object], limit_s: float) -> None:

@@ -14,12 +14,9 @@ samples, or from clips for training.
 from __future__ import annotations
 
 import gzip
-import shutil
 import subprocess
-import sys
 import tempfile
 import time
-import wave
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -30,12 +27,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips, training_clips
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
-from kouxing.evaluation.lips.references import clips_to_score
-from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone
+from kouxing.evaluation.lips.references import read_parts
+from kouxing.evaluation.rivals.node import find_node
+from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
 from kouxing.evaluation.tables import format_number
 from kouxing.services.cli.web_model import web_model
 from kouxing.shared.audio_file import read_audio
@@ -149,10 +147,12 @@ def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsP
     has_rivals = (package / "node_modules" / "wlipsync").is_dir()
     if clips and not has_rivals:
         raise UserError(f"the packages to compare are missing; run npm ci in {package}")
-    names = list(_DOWNLOADS) if has_rivals else [OURS]
-    held_out = clips_to_score(clips) if clips else []
-    recordings = [clip.samples for clip in _profile_clips(clips)] if clips else _samples(package)
-    with _site(package, recordings) as folder:
+    names, profile = [OURS], None
+    held_out, training = read_parts(clips) if clips else ([], [])
+    if has_rivals:
+        names = [*_DOWNLOADS]
+        profile = _wlipsync_profile(package, _recordings(training) if clips else _samples(package))
+    with _site(package, profile) as folder:
         voice = folder / "voice.wav"
         write_microphone(audio, voice)
         try:
@@ -167,8 +167,8 @@ def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsP
 
 
 @contextmanager
-def _site(package: Path, recordings: Iterable[NDArray[np.float32]]) -> Iterator[Path]:
-    """Write the page with all packages to a temporary folder."""
+def _site(package: Path, profile: bytes | None) -> Iterator[Path]:
+    """Write the page with all packages, and the profile of wLipSync, to a temporary folder."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         for file in _CODE:
@@ -183,15 +183,13 @@ def _site(package: Path, recordings: Iterable[NDArray[np.float32]]) -> Iterator[
         for file, content in web_model().items():
             (folder / "models" / file).write_bytes(content)
         (folder / "index.html").write_text(_PAGE, encoding="utf-8")
-        if (package / "node_modules" / "wlipsync").is_dir():
-            profile = _wlipsync_profile(package, recordings)
+        if profile is not None:
             (folder / "wlipsync-profile.json").write_bytes(profile)
         yield folder
 
 
-def _profile_clips(folder: Path) -> list[LipClip]:
-    clips = training_clips(read_clips(folder, language=None))
-    return clips[:: -(-len(clips) // _NUM_PROFILE_CLIPS)]
+def _recordings(clips: Sequence[LipClip]) -> list[NDArray[np.float32]]:
+    return [clip.samples for clip in clips[:: -(-len(clips) // _NUM_PROFILE_CLIPS)]]
 
 
 def _samples(package: Path) -> list[NDArray[np.float32]]:
@@ -201,14 +199,13 @@ def _samples(package: Path) -> list[NDArray[np.float32]]:
 
 def _wlipsync_profile(package: Path, recordings: Iterable[NDArray[np.float32]]) -> bytes:
     """Return a profile for wLipSync from recordings, samples at 16 kHz."""
-    node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
-    if node is None:
-        raise UserError("this comparison needs Node: pip install 'kouxing[page]'")
     with tempfile.TemporaryDirectory() as name:
         for number, samples in enumerate(recordings):
             samples.astype("<f4").tofile(Path(name) / f"{number}.f32")
         script = package / "demo" / "wlipsync-profile.mjs"
-        done = subprocess.run([node, script, name], capture_output=True, check=False)  # noqa: S603
+        done = subprocess.run(  # noqa: S603
+            [find_node(), script, name], capture_output=True, check=False
+        )
     if done.returncode:
         raise UserError(f"no profile for wLipSync: {done.stderr.decode(errors='replace')[-300:]}")
     return done.stdout
@@ -261,18 +258,12 @@ def _with_accuracy(
     with _page(folder, voice, origin, [page.name for page in pages]) as browser:
         browser.wait_for("window.play !== undefined")
         for number, clip in enumerate(track(clips, description="clips", transient=True)):
-            _write_clip(clip, folder / f"{number}.wav")
+            write_wav(folder / f"{number}.wav", clip.samples[:, np.newaxis], SAMPLE_RATE_HZ)
             browser.evaluate(f"window.rows = null; window.play('{number}.wav'); 1")
             browser.wait_for("window.rows !== null", 60.0 * clip.minutes + _LIMIT_S)
             rows = np.array(browser.evaluate("window.rows"))
             takes.append((rows, real_mouth(clip.time_s, real_faps(clip))))
     return [_scored(page, column, takes) for column, page in enumerate(pages, 1)]
-
-
-def _write_clip(clip: LipClip, wav: Path) -> None:
-    with wave.open(str(wav), "wb") as file:
-        file.setparams((1, 2, SAMPLE_RATE_HZ, 0, "NONE", ""))
-        file.writeframes((clip.samples * 32767).astype("<i2").tobytes())
 
 
 def _scored(page: LipsPage, column: int, takes: Sequence[tuple[Array, Mouth]]) -> LipsPage:

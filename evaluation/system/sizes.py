@@ -8,18 +8,17 @@ the small ear each position once.
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from kouxing_client.messages import encode
 from rich.console import Console
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.load import MODELS, load_model
+from kouxing.services.recognizer.ear import EAR_PATH
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.terminal import print_table
 
-_MODELS = Path(__file__).parents[2] / "services" / "recognizer" / "models"
 _SIZE, _MEASURE_S = 512, 0.5
 _POSITIONS_PER_S = 50
 _INT8_SPEED_UP = 4
@@ -50,13 +49,13 @@ def measure() -> Sizes:
     blocks = load_model("blocks")
     assert isinstance(blocks, BlockModel)  # noqa: S101 - the file of this name is one
     sizes = blocks.session.sizes
-    ear_bytes = len(np.load(_MODELS / "ear.npz", allow_pickle=False)["network"])
+    ear_bytes = len(np.load(EAR_PATH, allow_pickle=False)["network"])
     weighted_positions = {  # weights are bytes; positions per second of speech
         _BLOCKS: len(blocks.network) * sizes.length * _POSITIONS_PER_S / sizes.block,
         _EAR: ear_bytes * _POSITIONS_PER_S,
     }
     return Sizes(
-        model_bytes={path.stem: path.stat().st_size for path in sorted(_MODELS.glob("*.npz"))},
+        model_bytes={path.stem: path.stat().st_size for path in sorted(MODELS.glob("*.npz"))},
         frame_bytes=sum(map(len, _frame_message())),
         gemm_gflops=_gemm_gflops(),
         network_gflop_per_s={
