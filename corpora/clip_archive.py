@@ -6,7 +6,7 @@ from pathlib import Path
 from kouxing.corpora.lip_clips import read_clips
 from kouxing.corpora.speech_corpus import may_ship
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import open_output
+from kouxing.shared.output_file import write_error
 
 _SUFFIXES = (".flac", ".csv", ".json")
 _COLUMNS = ("clip", "part", "language", "speaker", "license")
@@ -23,12 +23,18 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
         raise UserError(f"{folder}: no clip has a license that allows sharing, such as CC BY")
     rows = [(c.name, c.part, c.language, c.speaker, c.license.replace("\t", " ")) for c in clips]
     table = "\n".join("\t".join(row) for row in [_COLUMNS, *rows]) + "\n"
-    with open_output(archive) as output, zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr("clips.tsv", table)
-        file.writestr("held.txt", "".join(f"{c.name}\n" for c in clips if c.part == "held"))
-        for clip in clips:
-            for suffix in _SUFFIXES:
-                file.write(folder / (clip.name + suffix), clip.name + suffix)
+    part = archive.with_name(archive.name + ".part")
+    try:
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
+            file.writestr("clips.tsv", table)
+            file.writestr("held.txt", "".join(f"{c.name}\n" for c in clips if c.part == "held"))
+            for clip in clips:
+                for suffix in _SUFFIXES:
+                    file.write(folder / (clip.name + suffix), clip.name + suffix)
+        part.replace(archive)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise write_error(archive, error) from None
     return len(clips)
 
 
