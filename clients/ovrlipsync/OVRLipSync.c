@@ -6,7 +6,7 @@
 
 #include "lips.h"
 
-enum { MAX_CONTEXTS = 256, MIN_RATE_HZ = 8000, MAX_RATE_HZ = 192000, PIECE = 1024 };
+enum { MAX_CONTEXTS = 256, MIN_RATE_HZ = 8000, MAX_RATE_HZ = 192000 };
 
 typedef struct {
   Lips *lips; /* NULL if the slot is free */
@@ -96,7 +96,7 @@ ovrLipSyncResult ovrLipSync_SendSignal(ovrLipSyncContext context, ovrLipSyncSign
   return arg1 >= 1 && arg1 <= 100 ? ovrLipSyncSuccess : ovrLipSyncError_InvalidParam;
 }
 
-/* Return a sample as mono; values that are not finite are silence. */
+/* Return a sample as mono, in [-1, 1]; values that are not finite are silence. */
 static float sample_at(const void *buffer, ovrLipSyncAudioDataType type, int i) {
   const int16_t *integers = buffer;
   const float *floats = buffer;
@@ -107,7 +107,7 @@ static float sample_at(const void *buffer, ovrLipSyncAudioDataType type, int i) 
     case ovrLipSyncAudioDataType_F32_Mono: sample = floats[i]; break;
     case ovrLipSyncAudioDataType_F32_Stereo: sample = 0.5f * (floats[2 * i] + floats[2 * i + 1]); break;
   }
-  return isfinite(sample) ? sample : 0.0f;
+  return isfinite(sample) ? fminf(fmaxf(sample, -1.0f), 1.0f) : 0.0f;
 }
 
 ovrLipSyncResult ovrLipSync_ProcessFrameEx(ovrLipSyncContext context, const void *audioBuffer, int sampleCount,
@@ -115,9 +115,9 @@ ovrLipSyncResult ovrLipSync_ProcessFrameEx(ovrLipSyncContext context, const void
   Context *found = find(context);
   if (!found || !audioBuffer || sampleCount < 0 || dataType > ovrLipSyncAudioDataType_F32_Stereo) return ovrLipSyncError_InvalidParam;
   if (!pFrame || !pFrame->visemes || pFrame->visemesLength < LIPS_NUM_VISEMES) return ovrLipSyncError_InvalidParam;
-  for (int begin = 0; begin < sampleCount; begin += PIECE) {
-    float piece[PIECE];
-    const int size = sampleCount - begin < PIECE ? sampleCount - begin : PIECE;
+  for (int begin = 0; begin < sampleCount; begin += LIPS_MAX_PIECE) {
+    float piece[LIPS_MAX_PIECE];
+    const int size = sampleCount - begin < LIPS_MAX_PIECE ? sampleCount - begin : LIPS_MAX_PIECE;
     for (int i = 0; i < size; i++) piece[i] = sample_at(audioBuffer, dataType, begin + i);
     lips_push(found->lips, piece, size);
   }

@@ -14,7 +14,7 @@ typedef struct {
 #define LAYER(NAME) \
   ((Layer){NAME##_INTEGERS, NAME##_SCALES, NAME##_BIAS, NAME##_INTEGERS_SIZE_0, NAME##_INTEGERS_SIZE_1})
 
-enum { NUM_BINS = MEL_BANDS_SIZE_0, NUM_VOICES = 4 };
+enum { HALF_WINDOW = MEL_WINDOW_SAMPLES / 2, NUM_BINS = MEL_BANDS_SIZE_0, NUM_VOICES = 4 };
 
 static double sigmoid(double x) { return 0.5 * tanh(0.5 * x) + 0.5; }
 
@@ -28,13 +28,17 @@ void ear_init_tables(void) {
 }
 
 void log_mel(const float *window, float *bands) {
-  double sound[MEL_WINDOW_SAMPLES], powers[NUM_BINS];
+  double sound[MEL_WINDOW_SAMPLES], even[HALF_WINDOW], odd[HALF_WINDOW], powers[NUM_BINS];
   for (int n = 0; n < MEL_WINDOW_SAMPLES; n++) sound[n] = MEL_HANN[n] * window[n];
+  for (int n = 1; n < HALF_WINDOW; n++) { /* cosines are equal at n and -n; sines have opposite signs */
+    even[n] = sound[n] + sound[MEL_WINDOW_SAMPLES - n];
+    odd[n] = sound[n] - sound[MEL_WINDOW_SAMPLES - n];
+  }
   for (int bin = 0; bin < NUM_BINS; bin++) {
-    double real = 0.0, imaginary = 0.0;
-    for (int n = 0, angle = 0; n < MEL_WINDOW_SAMPLES; n++) {
-      real += sound[n] * cosines[angle];
-      imaginary += sound[n] * sines[angle];
+    double real = sound[0] + (bin % 2 ? -1.0 : 1.0) * sound[HALF_WINDOW], imaginary = 0.0;
+    for (int n = 1, angle = bin; n < HALF_WINDOW; n++) {
+      real += even[n] * cosines[angle];
+      imaginary += odd[n] * sines[angle];
       angle += bin;
       if (angle >= MEL_WINDOW_SAMPLES) angle -= MEL_WINDOW_SAMPLES;
     }
@@ -103,11 +107,14 @@ void ear_process(Ear *ear) {
   ear->laughter += TRAITS_EVIDENCE_SHARE * (laughter - ear->laughter);
 }
 
-/* Compute the product of a vector and a matrix (rows, columns), plus a bias. */
-static void multiply(double *out, const double *vector, const float *matrix, int rows, int columns, const float *bias) {
-  for (int column = 0; column < columns; column++) out[column] = bias ? bias[column] : 0.0;
+static void copy(double *out, const float *values, int size) {
+  for (int i = 0; i < size; i++) out[i] = values[i];
+}
+
+/* Add the product of a vector and a matrix (rows, columns), whose rows are stride numbers apart. */
+static void add_product(double *out, const double *vector, const float *matrix, int rows, int columns, int stride) {
   for (int row = 0; row < rows; row++) {
-    for (int column = 0; column < columns; column++) out[column] += vector[row] * matrix[row * columns + column];
+    for (int column = 0; column < columns; column++) out[column] += vector[row] * matrix[row * stride + column];
   }
 }
 
@@ -121,33 +128,30 @@ static int chosen_delay(void) {
 }
 
 LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const float *features) {
-  enum { PROJECTED = LIPS_PROJECTION_SIZE_1, GATES = LIPS_STATE_BIAS_SIZE_0, DELAYS = LIPS_DELAYS_SIZE_0 };
-  double centered[NUM_FEATURES], projected[PROJECTED], entered[LIP_WIDTH], state[LIP_WIDTH];
-  double from_input[GATES], from_state[GATES], outputs[LIPS_NUM_OUTPUTS];
-  const int delay = chosen_delay();
-  for (int i = 0; i < NUM_FEATURES; i++) centered[i] = (double)features[i] - LIPS_FEATURE_MEAN[i];
-  multiply(projected, centered, LIPS_PROJECTION, NUM_FEATURES, PROJECTED, NULL);
-  multiply(entered, projected, LIPS_ENTRY_WEIGHTS, PROJECTED, LIP_WIDTH, LIPS_ENTRY_BIAS);
-  for (int i = 0; i < LIP_WIDTH; i++) {
-    entered[i] = fmax(entered[i], 0.0);
-    state[i] = predictor->state[i];
-  }
-  multiply(from_input, entered, LIPS_INPUT_WEIGHTS, LIP_WIDTH, GATES, LIPS_INPUT_BIAS);
-  multiply(from_state, state, LIPS_STATE_WEIGHTS, LIP_WIDTH, GATES, LIPS_STATE_BIAS);
+  enum { GATES = LIPS_STATE_BIAS_SIZE_0, ALL_OUTPUTS = LIPS_DELAYS_SIZE_0 * LIPS_NUM_OUTPUTS };
+  double inputs[NUM_FEATURES], centered[NUM_FEATURES], from_input[GATES], from_state[GATES], outputs[LIPS_NUM_OUTPUTS];
+  double hidden[2 * LIP_WIDTH], *state = hidden, *entered = hidden + LIP_WIDTH;
+  copy(inputs, features, NUM_FEATURES);
+  for (int i = 0; i < NUM_FEATURES; i++) centered[i] = inputs[i] - LIPS_FEATURE_MEAN[i];
+  copy(entered, LIPS_ENTRY_BIAS, LIP_WIDTH);
+  add_product(entered, centered, LIPS_ENTRY, NUM_FEATURES, LIP_WIDTH, LIP_WIDTH);
+  for (int i = 0; i < LIP_WIDTH; i++) entered[i] = fmax(entered[i], 0.0);
+  copy(from_input, LIPS_INPUT_BIAS, GATES);
+  add_product(from_input, entered, LIPS_INPUT_WEIGHTS, LIP_WIDTH, GATES, GATES);
+  copy(state, predictor->state, LIP_WIDTH);
+  copy(from_state, LIPS_STATE_BIAS, GATES);
+  add_product(from_state, state, LIPS_STATE_WEIGHTS, LIP_WIDTH, GATES, GATES);
   for (int i = 0; i < LIP_WIDTH; i++) {
     const double reset = sigmoid(from_input[i] + from_state[i]);
     const double update = sigmoid(from_input[LIP_WIDTH + i] + from_state[LIP_WIDTH + i]);
     const double next = tanh(from_input[2 * LIP_WIDTH + i] + reset * from_state[2 * LIP_WIDTH + i]);
     predictor->state[i] = (float)((1.0 - update) * next + update * state[i]);
   }
-  for (int output = 0; output < LIPS_NUM_OUTPUTS; output++) {
-    const int place = delay * LIPS_NUM_OUTPUTS + output, stride = DELAYS * LIPS_NUM_OUTPUTS;
-    double sum = LIPS_OUTPUT_BIAS[place];
-    for (int i = 0; i < NUM_FEATURES; i++) sum += (double)features[i] * LIPS_LIP_WEIGHTS[i * stride + place];
-    for (int i = 0; i < LIP_WIDTH; i++) sum += predictor->state[i] * (double)LIPS_OUTPUT_WEIGHTS[i * stride + place];
-    for (int i = 0; i < LIP_WIDTH; i++) sum += entered[i] * LIPS_OUTPUT_WEIGHTS[(LIP_WIDTH + i) * stride + place];
-    outputs[output] = sum;
-  }
+  copy(state, predictor->state, LIP_WIDTH);
+  const int delay = chosen_delay(), first = delay * LIPS_NUM_OUTPUTS; /* column of this delay */
+  copy(outputs, LIPS_OUTPUT_BIAS + first, LIPS_NUM_OUTPUTS);
+  add_product(outputs, inputs, LIPS_LIP_WEIGHTS + first, NUM_FEATURES, LIPS_NUM_OUTPUTS, ALL_OUTPUTS);
+  add_product(outputs, hidden, LIPS_OUTPUT_WEIGHTS + first, 2 * LIP_WIDTH, LIPS_NUM_OUTPUTS, ALL_OUTPUTS);
   LipFrame frame = {.time_s = known_s - LIPS_DELAYS[delay], .delay_s = LIPS_DELAYS[delay]};
   for (int i = 0; i < LIPS_COLUMNS_LENGTH; i++) frame.faps[LIPS_COLUMNS[i]] = (float)outputs[i];
   for (int i = 0; i < LIPS_OTHERS_LENGTH; i++) frame.faps[LIPS_OTHERS[i]] = frame.faps[LIPS_ONES[i]];

@@ -101,7 +101,7 @@ static bool is_sound(const Rest *rest, double level_db) {
 
 static double next_sound_s(const Rest *rest) {
   for (int i = 0; i < rest->num_levels; i++) {
-    if (is_sound(rest, rest->level_db[i])) return rest->level_s[i];
+    if (is_sound(rest, rest->levels[i].level_db)) return rest->levels[i].time_s;
   }
   return INFINITY;
 }
@@ -135,15 +135,14 @@ static void follow_voice(Rest *rest, double time_s) {
   }
   rest->num_changes -= number;
   memmove(rest->changes, rest->changes + number, rest->num_changes * sizeof(SpeechChange));
-  for (number = 0; number < rest->num_levels && rest->level_s[number] <= time_s; number++) {
-    if (is_sound(rest, rest->level_db[number])) {
-      rest->sound_s = rest->level_s[number];
+  for (number = 0; number < rest->num_levels && rest->levels[number].time_s <= time_s; number++) {
+    if (is_sound(rest, rest->levels[number].level_db)) {
+      rest->sound_s = rest->levels[number].time_s;
       rest->stays_shut = false;
     }
   }
   rest->num_levels -= number;
-  memmove(rest->level_s, rest->level_s + number, rest->num_levels * sizeof(double));
-  memmove(rest->level_db, rest->level_db + number, rest->num_levels * sizeof(double));
+  memmove(rest->levels, rest->levels + number, rest->num_levels * sizeof(Level));
 }
 
 /* Return the log odds that silence subtracts from a closure. */
@@ -399,10 +398,7 @@ void face_change_speech(Face *face, double time_s, bool is_active) {
 
 void face_add_level(Face *face, double time_s, double level_db) {
   Rest *rest = &face->rest;
-  if (rest->num_levels < MAX_LEVELS) {
-    rest->level_s[rest->num_levels] = time_s;
-    rest->level_db[rest->num_levels++] = level_db;
-  }
+  if (rest->num_levels < MAX_LEVELS) rest->levels[rest->num_levels++] = (Level){time_s, level_db};
   rest->loudest_db = fmax(level_db, rest->loudest_db - REST_FADE_DB);
   rest->known_s = time_s;
 }

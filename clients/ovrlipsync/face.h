@@ -29,9 +29,13 @@ typedef struct {
   bool is_active;
 } SpeechChange;
 
+typedef struct {
+  double time_s, level_db;
+} Level;
+
 /* Lips in pauses: the share of the mouth that is ajar. */
 typedef struct {
-  double level_s[MAX_LEVELS], level_db[MAX_LEVELS]; /* of future frames */
+  Level levels[MAX_LEVELS]; /* of future frames */
   int num_levels;
   SpeechChange changes[MAX_CHANGES]; /* of future frames */
   int num_changes;

@@ -8,13 +8,13 @@
 
 #define PI 3.14159265358979323846
 
-enum { MAX_PIECE = 4096, FRAMES = SEGMENTER_FRAMES_PER_POSITION, MAX_RECENT = SEGMENTER_MAX_RECENT };
+enum { FRAMES = SEGMENTER_FRAMES_PER_POSITION, MAX_RECENT = SEGMENTER_MAX_RECENT };
 
 /* Resampling to 16 kHz; front_end/resample.py has the formula. */
 typedef struct {
   int up, down, half;
   float *table; /* rows (up, 2 * half) of the filter, one for each phase */
-  float *known; /* (2 * half + MAX_PIECE + down / up + 2,) samples */
+  float *known; /* (2 * half + LIPS_MAX_PIECE + down / up + 2,) samples */
   int num_known;
   int64_t first, num_out; /* number of the first known sample, and of the next output */
 } Resampler;
@@ -62,7 +62,7 @@ static bool resampler_init(Resampler *r, int rate_hz) {
   r->down = rate_hz / common;
   r->half = (int)ceil(RESAMPLE_HALF_WIDTH / lower);
   r->table = malloc(sizeof(float) * r->up * 2 * r->half);
-  r->known = calloc(2 * r->half + MAX_PIECE + r->down / r->up + 2, sizeof(float));
+  r->known = calloc(2 * r->half + LIPS_MAX_PIECE + r->down / r->up + 2, sizeof(float));
   if (!r->table || !r->known) return false;
   for (int phase = 0; phase < r->up; phase++) {
     float *row = r->table + phase * 2 * r->half;
@@ -226,12 +226,7 @@ void lips_reset(Lips *lips) {
 
 void lips_push(Lips *lips, const float *samples, int num_samples) {
   lips->num_in += num_samples;
-  for (int begin = 0; begin < num_samples; begin += MAX_PIECE) {
-    float piece[MAX_PIECE];
-    const int size = num_samples - begin < MAX_PIECE ? num_samples - begin : MAX_PIECE;
-    for (int i = 0; i < size; i++) piece[i] = fminf(fmaxf(samples[begin + i], -1.0f), 1.0f);
-    resample(lips, piece, size);
-  }
+  resample(lips, samples, num_samples);
 }
 
 double lips_newest(const Lips *lips, float *weights) {

@@ -4,12 +4,13 @@
 import { readFile, readdir, writeFile } from "node:fs/promises";
 import { join, resolve } from "node:path";
 import { pathToFileURL } from "node:url";
+import { product } from "../kouxing-lips/engine/lip-predictor.js";
 import { loadModel } from "../kouxing-lips/engine/model.js";
 import { readGraph } from "../kouxing-lips/engine/onnx-file.js";
 
 const MODULES = "closures expressiveness learnt lipFrames lips mel resample rest segmenter shapes stream track traits vad".split(" ");
 const LAYERS = "entry first.ih first.hh second.ih second.hh output".split(" ");
-const ARRAYS = /^(mel\.bands|lips\.|traits\.(weights|bias)|shapes\.oculus)/;
+const ARRAYS = /^(mel\.bands|lips\.(?!projection|entry_weights)|traits\.(weights|bias)|shapes\.oculus)/;
 const TYPES = { Float32Array: "float", Float64Array: "double", Int8Array: "int8_t" };
 const WORD_BYTES = 8;
 
@@ -33,6 +34,8 @@ for (const layer of LAYERS) {
 for (const name of ["step", "min_scale"]) define(`ear.${name}`, tensors[name].values[0]);
 define("ear.num_features", tensors["features.lengths"].values[0]);
 define("ear.num_phones", tensors["features.lengths"].values[1]);
+const entry = product(model.arrays["lips.projection"], model.arrays["lips.entry_weights"]);
+addArray("lips.entry", entry.values, entry.shape);
 for (const [name, { values, shape }] of Object.entries(model.arrays)) if (ARRAYS.test(name)) addArray(name, values, shape);
 for (const name of MODULES) for (const [key, value] of Object.entries(model.constants[name])) define(`${name}.${key}`, value);
 for (const [name, value] of Object.entries(model.closureRule)) define(`rule.${name}`, value);

@@ -95,17 +95,23 @@ def assert_close(ours: Weights, theirs: Weights) -> None:
     assert np.percentile(difference.max(axis=1), 95) < 0.03
 
 
-@pytest.mark.parametrize("name", ["bilabials-female", "hello-male"])
-def test_a_c_program_has_the_servers_visemes(folder: Path, name: str) -> None:
+def run_program(folder: Path, name: str) -> tuple[Frames, Weights]:
+    """Return a sound and the rows that the program prints for it."""
     integers = np.round(read(DEMO / f"{name}.wav") * 32768).clip(-32768, 32767).astype("<i2")
     printed = subprocess.run(
         [folder / "visemes", "16000"], input=integers.tobytes(), capture_output=True, check=True
     ).stdout.decode()
     rows = np.array([line.split() for line in printed.splitlines()], float)
+    return (integers / 32768).astype(np.float32), rows
+
+
+@pytest.mark.parametrize("name", ["bilabials-female", "hello-male"])
+def test_a_c_program_has_the_servers_visemes(folder: Path, name: str) -> None:
+    sound, rows = run_program(folder, name)
     numbers, delays_ms, weights = rows[:, 0], rows[:, 1], rows[:, 3:]
     assert numbers.tolist() == [*range(len(rows))]
     assert delays_ms[10:].max() == 60
-    expected = server_weights((integers / 32768).astype(np.float32))
+    expected = server_weights(sound)
     assert_close(weights, at_faces(expected, (numbers + 1) / FRAME_RATE_HZ, delays_ms))
     assert weights[:, 1:].max(axis=0)[[0, 9]].min() > 0.3  # PP and aa
 
@@ -172,13 +178,8 @@ def laughter_of(samples: Frames) -> list[float]:
 
 
 def test_laughter_scores_are_the_servers_evidence(folder: Path, library: Any) -> None:
-    samples = read(DEMO / "lake-male.wav")
-    integers = np.round(samples * 32768).clip(-32768, 32767).astype("<i2")
-    printed = subprocess.run(
-        [folder / "visemes", "16000"], input=integers.tobytes(), capture_output=True, check=True
-    ).stdout.decode()
-    scores = np.array([line.split()[2] for line in printed.splitlines()], float)
-    expected = np.clip(laughter_of((integers / 32768).astype(np.float32)), 0.0, 1.0)
+    sound, rows = run_program(folder, "lake-male")
+    scores, expected = rows[:, 2], np.clip(laughter_of(sound), 0.0, 1.0)
     assert scores.max() > 0.1
     number = min(len(scores), len(expected)) - 1
     np.testing.assert_allclose(scores[1 : number + 1], expected[:number], atol=0.02)

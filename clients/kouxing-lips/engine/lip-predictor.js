@@ -94,7 +94,7 @@ export class LipPredictor {
 }
 
 /** Return the product of two matrices. */
-function product(one, other) {
+export function product(one, other) {
   const [rows, columns] = [one.shape[0], other.shape[1]];
   const values = new Float32Array(rows * columns);
   const row = new Float64Array(columns);
