@@ -76,7 +76,8 @@ def _part(name: str, steps: Results, results: Results) -> str:
 def _describe_measurement(step: Results) -> str:
     commands = "`, `".join(step["commands"])
     measured = f"{step['machine']}, {step['date']}, commit {step['commit']}"
-    return f"`{commands}`: {measured}, {step['seconds']} s, load {step['load']:.1f}"
+    cpu = f" ({step['cpu_seconds']} s of processor time)" if "cpu_seconds" in step else ""
+    return f"`{commands}`: {measured}, {step['seconds']} s{cpu}, load {step['load']:.1f}"
 
 
 def _lookahead_figure(results: Results) -> Any:

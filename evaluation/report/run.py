@@ -4,7 +4,6 @@ A result is a JSON file with the commands, machine, date, commit and load. It is
 hash of the code and models that its step depends on has changed.
 """
 
-import hashlib
 import json
 import os
 import platform
@@ -17,10 +16,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.evaluation.report.code_hash import code_hash
+from kouxing.evaluation.report.steps import ROOT, STEPS
 from kouxing.shared.terminal import print_message
 
-_SOURCES = {".py", ".js", ".mjs", ".ts", ".json", ".toml", ".tsv", ".npz", ".txt"}
 _DROPPED = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
 _DROPPED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
@@ -45,7 +44,7 @@ def run_steps(
         missing = [
             key for key, folder in folders.items() if not folder and f"{{{key}}}" in str(commands)
         ]
-        code = code_hash(step)
+        code = code_hash(step.code)
         if not commands or missing:
             reason = f"give --{missing[0]}" if missing else "it is not part of a quick report"
             print_message(f"{name}: skipped ({reason})")
@@ -61,20 +60,6 @@ def run_steps(
                 shown = [f"kouxing {_without_braces(command)}" for command in commands]
                 write_result(path, {"commands": shown, **measured, "code": code, **figures})
     return failed
-
-
-def code_hash(step: Step) -> str:
-    """Return a hash of the sources and models that a step depends on."""
-    digest = hashlib.sha256()
-    for pattern in step.code:
-        for path in sorted(ROOT.glob(pattern)):
-            files = sorted(path.rglob("*")) if path.is_dir() else [path]
-            for file in files:
-                inner = {"node_modules", ".venv"} & {*file.relative_to(ROOT).parts}
-                if file.suffix in _SOURCES and not inner and file.is_file():
-                    digest.update(str(file.relative_to(ROOT)).encode())
-                    digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def describe_run() -> dict[str, Any]:
@@ -99,15 +84,14 @@ def describe_run() -> dict[str, Any]:
 def write_result(path: Path, result: Mapping[str, Any]) -> None:
     """Write a result rounded to five digits, without figures by speaker and by frame."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(_trim_figures(result), indent=1, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    path.write_text(_to_json(_trim_figures(result)) + "\n", encoding="utf-8")
 
 
 def _run(commands: Iterable[str], folders: Mapping[str, Path | None]) -> dict[str, Any] | None:
     *earlier, last = commands
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "result.json"
-        load, start_s = os.getloadavg()[0], time.monotonic()
+        load, start_s, start_cpu_s = os.getloadavg()[0], time.monotonic(), _cpu_s()
         for command in (*earlier, f"{last} --json {path}"):
             arguments = command.format_map(folders).split()
             done = subprocess.run(  # noqa: S603
@@ -115,12 +99,36 @@ def _run(commands: Iterable[str], folders: Mapping[str, Path | None]) -> dict[st
             )
             if done.returncode:
                 return None
-        seconds = round(time.monotonic() - start_s)
-        return {"load": load, "seconds": seconds, "result": json.loads(path.read_text("utf-8"))}
+        return {
+            "load": load,
+            "seconds": round(time.monotonic() - start_s),
+            "cpu_seconds": round(_cpu_s() - start_cpu_s),
+            "result": json.loads(path.read_text("utf-8")),
+        }
+
+
+def _cpu_s() -> float:
+    """Return the processor time of all programs that have ended, seconds."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _without_braces(command: str) -> str:
     return command.replace("{", "").replace("}", "")
+
+
+def _to_json(value: Any, indent: str = "") -> str:
+    """Return JSON with a line for each object or list that contains no others."""
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if not any(isinstance(item, dict | list) for item in items):
+        return json.dumps(value, ensure_ascii=False)
+    inner = f"{indent} "
+    if isinstance(value, list):
+        lines = [inner + _to_json(item, inner) for item in value]
+    else:
+        lines = [f"{inner}{json.dumps(key)}: {_to_json(value[key], inner)}" for key in value]
+    start, end = "[]" if isinstance(value, list) else "{}"
+    return "\n".join([start, ",\n".join(lines), indent + end])
 
 
 def _trim_figures(value: Any) -> Any:

@@ -16,10 +16,27 @@ _DELAYS = " ".join(f"--delay-ms {delay}" for delay in DELAYS_MS)
 _ALL_LIPS = "--lips learnt --lips dynamic-visemes --lips ferguson"
 _TABLES = " ".join(f"--from-csv {{rivals}}/{name}" for name in PROGRAMS)
 
-_RECOGNIZER = ("services/recognizer", "shared/phones", "evaluation/recognizer", "corpora")
-_LIPS = (*_RECOGNIZER, "services/synthesizer", "services/*.py", "shared/face", "evaluation/lips")
-_SYSTEM = ("services/control", "services/recognizer", "services/synthesizer", "services/gateway")
-_CHAIN = (*_SYSTEM, "shared", "evaluation/system")
+# A change of these files makes a result out of date, and so does a change of imported modules.
+_RECOGNIZER = (
+    "evaluation/recognizer/error_rates.py",
+    "shared/phones/mandarin",
+    *(f"services/recognizer/models/{name}.npz" for name in ("blocks", "ear", "gmm", "phone_lm")),
+)
+_FACES = (
+    "services/recognizer/models/*.npz",
+    "services/synthesizer/lips",
+    "shared/face",
+    "shared/phones/*/*.tsv",
+)
+_LIP_SCORES_CODE = ("evaluation/lips/lip_scores.py", *_FACES)
+_SCHEMES_CODE = ("evaluation/lips/scheme_scores.py", "evaluation/lips/sentences.py", *_FACES)
+_SERVICES = (
+    "services/control",
+    "services/recognizer",
+    "services/synthesizer",
+    "shared/face",
+    "shared/phones",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +48,7 @@ class Step:
     """
 
     commands: tuple[str, ...]
-    code: tuple[str, ...]  # folders and files
+    code: tuple[str, ...]  # folders and files, also patterns
     quick: tuple[str, ...] | None = None  # None: the same as ``commands``; empty: skipped
 
 
@@ -52,12 +69,12 @@ STEPS: Mapping[str, Step] = {
     "disturbed": Step(("evaluate recognizer --manifest {corpus} --split dev",), _RECOGNIZER, ()),
     "lips": Step(
         (_LIP_SCORES,),
-        _LIPS,
+        _LIP_SCORES_CODE,
         (_LIP_SCORES + " --condition clean --every 8",),
     ),
     "lookahead": Step(
         (f"{_LIP_SCORES} --condition clean {_DELAYS}",),
-        _LIPS,
+        _LIP_SCORES_CODE,
         (f"{_LIP_SCORES} --condition clean {_DELAYS} --every 16",),
     ),
     "rivals": Step(
@@ -65,27 +82,46 @@ STEPS: Mapping[str, Step] = {
             "evaluate rivals {rivals} --clips {lips}",
             f"{_LIP_SCORES} --condition clean {_ALL_LIPS} {_TABLES}",
         ),
-        (*_LIPS, "evaluation/rivals"),
+        (*_LIP_SCORES_CODE, "evaluation/rivals"),
         (
             "evaluate rivals {rivals} --clips {lips} --program headaudio --program loudness",
             f"{_LIP_SCORES} --condition clean --lips learnt --from-csv {{rivals}}/headaudio"
             " --from-csv {rivals}/loudness --every 8",
         ),
     ),
-    "schemes": Step((_SCHEMES,), _LIPS, ("evaluate schemes",)),
-    "schemes-paper-rule": Step((_SCHEMES + " --paper-rule",), _LIPS, ()),
-    "visemes": Step(("evaluate visemes --clips {lips}",), _LIPS, ()),
-    "ferguson": Step(("evaluate ferguson --clips {lips}",), _LIPS, ()),
-    "chain": Step((f"bench chain {SAMPLE.relative_to(ROOT)}",), _CHAIN),
-    "load": Step(("bench load",), _CHAIN, ("bench load --sessions 6 --seconds 3",)),
-    "busy": Step(("bench busy",), _CHAIN, ("bench busy --programs 6 --seconds 10",)),
-    "faults": Step(("evaluate faults",), _CHAIN, ()),
+    "schemes": Step((_SCHEMES,), _SCHEMES_CODE, ("evaluate schemes",)),
+    "schemes-paper-rule": Step((_SCHEMES + " --paper-rule",), _SCHEMES_CODE, ()),
+    "visemes": Step(
+        ("evaluate visemes --clips {lips}",), ("evaluation/lips/viseme_fit.py", *_FACES), ()
+    ),
+    "ferguson": Step(
+        ("evaluate ferguson --clips {lips}",), ("evaluation/lips/speaking_rates.py", *_FACES), ()
+    ),
+    "chain": Step(
+        (f"bench chain {SAMPLE.relative_to(ROOT)}",),
+        (
+            *(f"evaluation/system/{name}.py" for name in ("latency", "costs", "page")),
+            "services/gateway",
+            *_SERVICES,
+        ),
+    ),
+    "load": Step(
+        ("bench load",),
+        ("evaluation/system/load.py", *_SERVICES),
+        ("bench load --sessions 6 --seconds 3",),
+    ),
+    "busy": Step(
+        ("bench busy",),
+        ("evaluation/system/busy.py", *_SERVICES),
+        ("bench busy --programs 6 --seconds 10",),
+    ),
+    "faults": Step(("evaluate faults",), ("evaluation/system/faults.py", *_SERVICES), ()),
     "browser": Step(
         (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
-        ("clients/kouxing-lips", "services/cli/web_model.py", "evaluation/system"),
+        ("clients/kouxing-lips", "evaluation/system/lips_page.py"),
     ),
     "sizes": Step(
         ("bench sizes",),
-        ("services/recognizer/models", "shared/wire", "evaluation/system/sizes.py"),
+        ("services/recognizer/models/*.npz", "evaluation/system/sizes.py"),
     ),
 }

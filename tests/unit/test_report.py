@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.report import lip_tables, run, system_tables
+from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.markdown import markdown
 from kouxing.evaluation.report.page import TABLES, write_page
 from kouxing.evaluation.report.run import run_steps, write_result
@@ -41,8 +42,9 @@ def rivals() -> dict[str, Any]:
 
 
 def step_file(result: Any) -> dict[str, Any]:
-    about = {"machine": "m", "date": "2026-01-01", "commit": "c", "load": 0.5, "seconds": 3}
-    return {"commands": ["kouxing x"], **about, "code": "1", "result": result}
+    about = {"machine": "m", "date": "2026-01-01", "commit": "c", "load": 0.5}
+    time = {"seconds": 3, "cpu_seconds": 2}
+    return {"commands": ["kouxing x"], **about, **time, "code": "1", "result": result}
 
 
 def test_every_step_names_code_that_exists_and_a_command() -> None:
@@ -63,9 +65,8 @@ def test_the_page_has_at_most_ten_tables() -> None:
 def test_a_step_runs_only_if_its_code_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code = tmp_path / "code.py"
-    code.write_text("1")
-    monkeypatch.setattr(f"{run.__name__}.ROOT", tmp_path)
+    hashes = ["1", "1", "1", "2", "2"]
+    monkeypatch.setattr(f"{run.__name__}.code_hash", lambda _: hashes.pop(0))
     monkeypatch.setitem(STEPS, "mine", Step(("bench {data}",), ("code.py",)))
     commands: list[list[str]] = []
 
@@ -91,9 +92,51 @@ def test_a_step_runs_only_if_its_code_has_changed(
     assert stored["commit"] == "abc"
     assert run_mine() == 0
     assert run_mine(is_fresh=True) == 1
-    code.write_text("2")
-    assert run_mine() == 1
+    assert run_mine() == 1  # the code has changed
     assert run_steps(["mine"], {"data": None}, tmp_path, **options) == []  # left out without data
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "is_changed"),
+    [
+        ("corpora/used.py", '"""Other words."""\n\nX = 1  # a comment\n', False),
+        ("corpora/used.py", "X = 2\n", True),
+        ("corpora/unused.py", "X = 2\n", False),
+        ("data/model.npz", "2", True),
+        ("data/README.md", "2", False),
+        ("data/node_modules/a.js", "2", False),
+    ],
+)
+def test_the_hash_of_code_changes_with_what_runs(
+    tmp_path: Path, name: str, content: str, is_changed: bool
+) -> None:
+    files = {
+        "measure.py": "from kouxing.corpora.used import X\n",
+        "corpora/used.py": '"""Words."""\nX = 1\n',
+        "corpora/unused.py": "X = 1\n",
+        "data/model.npz": "1",
+        "data/README.md": "1",
+        "data/node_modules/a.js": "1",
+    }
+    for path, text in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text, encoding="utf-8")
+    before = code_hash(("*.py", "data"), tmp_path)
+    (tmp_path / name).write_text(content, encoding="utf-8")
+    assert (code_hash(("*.py", "data"), tmp_path) != before) is is_changed
+
+
+def test_a_result_has_a_line_for_each_record(tmp_path: Path) -> None:
+    write_result(tmp_path / "x.json", {"load": 1, "result": {"a": {"r": 0.5, "n": 2}, "b": [1, 2]}})
+    assert (tmp_path / "x.json").read_text("utf-8").splitlines() == [
+        "{",
+        ' "load": 1,',
+        ' "result": {',
+        '  "a": {"r": 0.5, "n": 2},',
+        '  "b": [1, 2]',
+        " }",
+        "}",
+    ]
 
 
 def test_a_failed_step_is_reported_and_leaves_the_old_result(
@@ -138,7 +181,7 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert "[[" not in text
     assert "| **learnt**, 60 ms |" in text
     assert "| learnt, r | 0.50 | 0.70 |" in text
-    assert "`kouxing x`: m, 2026-01-01, commit c, 3 s, load 0.5" in text
+    assert "`kouxing x`: m, 2026-01-01, commit c, 3 s (2 s of processor time), load 0.5" in text
     assert 'make report STEPS="faults"' in text
     assert (tmp_path / "lookahead.png").stat().st_size > 1000
 
