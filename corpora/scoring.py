@@ -90,6 +90,9 @@ def feature_errors(reference: Sequence[str], recognized: Sequence[str]) -> float
     costs 1. Divided by the number of reference phones, it is the phonetic feature error rate.
     Source: Mortensen et al. 2016, "PanPhon: a resource for mapping IPA segments to articulatory
     feature vectors" (Hamming distance).
+
+    >>> round(24 * feature_errors(["b", "a"], ["p", "a"]))
+    1
     """
     known = features()
     costs = [

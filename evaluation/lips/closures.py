@@ -105,7 +105,21 @@ def contacts(made: Mouth, real: Mouth) -> list[Contact]:
 
 
 def closures(made: Mouth, real: Mouth) -> Detections:
-    """Compare closures: a real one is reproduced if made lips close within 40 ms."""
+    """Compare closures: a real one is reproduced if made lips close within 40 ms.
+
+    Adapted from the closure accuracy of Electronic Arts, which measures only recall.
+
+    In the example, there is a frame every 40 ms. The real lips close in the second frame. The made
+    lips close in the third and in the sixth.
+
+    >>> def mouth(*opening: float) -> Mouth:
+    ...     curve = np.array(opening)
+    ...     return Mouth(np.arange(len(curve)) / 25.0, {"opening": curve}, curve < 20.0)
+    >>> made, real = mouth(200, 200, 0, 200, 200, 0, 200), mouth(200, 0, 200, 200, 200, 200, 200)
+    >>> found = closures(made, real)
+    >>> found.recall, found.precision, round(found.f1, 2)
+    (1.0, 0.5, 0.67)
+    """
     real_s, made_contacts = real_closures(real), contacts(made, real)
     num_met = int(is_closed_at(real_s, made).sum())
     num_true = sum(contact.is_true for contact in made_contacts)

@@ -23,6 +23,9 @@ def correlate_by_speaker(
 
     Each speaker's values get a mean of 0 and a standard deviation of 1 first. Speakers with fewer
     than three clips are left out. None if no speaker remains.
+
+    >>> round(correlate_by_speaker(["ann"] * 3, [60.0, 66.0, 72.0], [100.0, 300.0, 200.0]), 6)
+    0.5
     """
     by_speaker: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for speaker, level, extent in zip(speakers, levels, extents, strict=True):
@@ -49,6 +52,10 @@ def lip_intensity(mouth: Mouth) -> float:
     Source: Lee et al., "Perceptually accurate 3D talking head generation", CVPR 2025: the root mean
     square of the lips' displacement between frames. Here it is the opening's, per second. The
     intensity of speech is the root mean square of the samples.
+
+    >>> opening = np.array([0.0, 4.0, 8.0])
+    >>> lip_intensity(Mouth(np.arange(3) / 50.0, {"opening": opening}, opening < 20.0))
+    200.0
     """
     speed = np.diff(mouth.opening) / np.diff(mouth.time_s)
     return float(np.sqrt(np.mean(speed**2)))

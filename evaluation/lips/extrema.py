@@ -38,7 +38,11 @@ def misalignment_s(made: Mouth, real: Mouth) -> float | None:
 
 
 def match_extrema(made: Array, real: Array) -> list[int]:
-    """Return the lag of made extrema behind the real ones that they match, frames."""
+    """Return the lag of made extrema behind the real ones that they match, frames.
+
+    >>> match_extrema(np.array([0.0, 0, 1, 4, 1, 0, 2, 2]), np.array([0.0, 1, 4, 1, 0, 2, 2, 1]))
+    [1, 1]
+    """
     kinds = [_extrema(curve) for curve in (made, real)]
     real_extrema = np.flatnonzero(kinds[1])
     offsets = []

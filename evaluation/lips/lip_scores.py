@@ -12,11 +12,12 @@ from pathlib import Path
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, aligned_phones
-from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES, Take
+from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
 from kouxing.evaluation.lips.live_faces import Samples, events_of_faces, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth
 from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
 from kouxing.evaluation.lips.references import read_parts, reference_of
+from kouxing.evaluation.lips.take import Take
 from kouxing.evaluation.recognizer.disturbances import (
     BABBLE,
     CLEAN,

@@ -36,6 +36,7 @@ from tests.control_stage import LOCAL, PROVIDED
 
 SESSIONS_PER_WORKER = 100
 BATCH = 64  # sessions that are opened at once
+SESSIONS_PER_CLIENT = 1000  # control disconnects a client that sends more requests within seconds
 ROUNDS = 4  # of heartbeats
 SOCKETS_PER_BUS = 250
 
@@ -78,7 +79,7 @@ class FakeWorker:
 
 
 class Simulation:
-    """Control with workers and one client."""
+    """Control with workers and clients."""
 
     def __init__(self, stack: ExitStack, num_workers: int) -> None:
         self.num_sessions = num_workers * SESSIONS_PER_WORKER // 2
@@ -96,9 +97,11 @@ class Simulation:
                 bus = stack.enter_context(Bus(None))
             socket = bus.connect_dealer(self.control.endpoints["commands"])
             self.workers.append(FakeWorker(list(PROVIDED)[number % 2], number, socket))
-        self.client = stack.enter_context(Bus(None)).connect_dealer(
-            self.control.endpoints["commands"]
-        )
+        client_bus = stack.enter_context(Bus(None))
+        self.clients = [
+            client_bus.connect_dealer(self.control.endpoints["commands"])
+            for _ in range(0, self.num_sessions, SESSIONS_PER_CLIENT)
+        ]
 
     def beat(self) -> float:
         """Return control's processor time for a heartbeat of every worker, seconds."""
@@ -117,12 +120,14 @@ class Simulation:
             end = min(start + BATCH, self.num_sessions)
             for number in range(start, end):
                 request = secrets.token_hex(8)
-                self.client.send(OpenSession(request=request, session=f"s{number}"))
+                client = self.clients[number // SESSIONS_PER_CLIENT]
+                client.send(OpenSession(request=request, session=f"s{number}"))
             while num_opened < end:
                 self._step()
-                for received in self.client.receive():
-                    assert not isinstance(received.message, Error), received.message
-                    num_opened += isinstance(received.message, SessionOpened)
+                for client in self.clients:
+                    for received in client.receive():
+                        assert not isinstance(received.message, Error), received.message
+                        num_opened += isinstance(received.message, SessionOpened)
         return self.cpu_s - cpu_s
 
     def _step(self) -> None:

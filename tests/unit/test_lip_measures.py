@@ -1,21 +1,35 @@
 """Measures of mouths with known results."""
 
+import doctest
 from collections.abc import Sequence
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips import lip_measures as measures
+from kouxing.corpora import scoring
+from kouxing.evaluation.lips import (
+    agreement,
+    closure_measures,
+    curves,
+    effort,
+    effort_measures,
+    extrema,
+    in_speech,
+    phone_spread,
+    rest,
+)
+from kouxing.evaluation.lips import closures as closures_module
 from kouxing.evaluation.lips.agreement import agreement_of
 from kouxing.evaluation.lips.closures import Detections, closures, contacts, is_closed_at
 from kouxing.evaluation.lips.curves import num_turns, pooled_moments
 from kouxing.evaluation.lips.effort import correlate_by_speaker, lip_intensity, opening_range
 from kouxing.evaluation.lips.extrema import match_extrema, misalignment_s, warping_path
-from kouxing.evaluation.lips.lip_measures import Take
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_mouth
 from kouxing.evaluation.lips.references import Reference
+from kouxing.evaluation.lips.take import Take
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.lips import INVENTORY, clip_of, phone
@@ -54,6 +68,17 @@ def reference(
         voice=[SpeechChange(active=True, time_s=0.0)],
         visemes=INVENTORY.visemes,
     )
+
+
+@pytest.mark.parametrize(
+    "module",
+    [agreement, closures_module, curves, effort, extrema, scoring],
+    ids=lambda module: module.__name__,
+)
+def test_examples_of_measures(module: ModuleType) -> None:
+    outcome = doctest.testmod(module)
+    assert outcome.attempted
+    assert not outcome.failed
 
 
 def test_correlation_error_and_turns_of_curves() -> None:
@@ -116,12 +141,12 @@ def test_closures_count_for_the_phones_around_them() -> None:
     made = mouth((0.5, 0.5), (1.0, 1.0), (2.5, 2.5), (3.5, 3.5))
     phones = [phone(0, "b", 0.48), phone(1, "a", 0.6, 0.9), phone(2, "u", 2.4), phone(3, "m", 3.0)]
     takes = [Take(reference(real, phones), made)]
-    assert measures.class_precision(takes, "bpm") == 1.0
-    assert measures.class_precision(takes, "aei") == 0.0
-    assert measures.class_precision(takes, "uo") == 1.0
-    assert measures.class_precision(takes, "pause") == 0.0
-    assert measures.labials_shut(takes) == 0.5  # the lips are open in m
-    assert measures.share_shut(takes) == 4 / 200
+    assert closure_measures.class_precision(takes, "bpm") == 1.0
+    assert closure_measures.class_precision(takes, "aei") == 0.0
+    assert closure_measures.class_precision(takes, "uo") == 1.0
+    assert closure_measures.class_precision(takes, "pause") == 0.0
+    assert closure_measures.labials_shut(takes) == 0.5  # the lips are open in m
+    assert closure_measures.share_shut(takes) == 4 / 200
 
 
 def test_lips_rest_and_close_after_the_sound() -> None:
@@ -129,12 +154,12 @@ def test_lips_rest_and_close_after_the_sound() -> None:
     made = mouth((0.0, 0.88), (2.44, 4.0))
     quiet = reference(mouth(), loud=(1.0, 2.0))
     takes = [Take(quiet, made)]
-    assert measures.closing_time_ms(takes) == pytest.approx(440.0)
+    assert rest.closing_time_ms(takes) == pytest.approx(440.0)
     # of 141 frames without speech, those at 0.9 s and from 2.1 to 2.42 s are open
-    assert measures.rest_opening(takes) == pytest.approx(300 * 18 / 141)
+    assert rest.rest_opening(takes) == pytest.approx(300 * 18 / 141)
     rig = replace(quiet, clip=replace(quiet.clip, is_rig=True))
-    assert measures.rest_opening([Take(rig, made)]) is None
-    never = measures.closing_time_ms([Take(quiet, mouth())])
+    assert rest.rest_opening([Take(rig, made)]) is None
+    never = rest.closing_time_ms([Take(quiet, mouth())])
     assert never == pytest.approx(1980.0, abs=25.0)  # the whole pause
 
 
@@ -142,13 +167,13 @@ def test_spread_within_phones_ignores_differences_between_them() -> None:
     curve = np.select([TIME_S < 1, TIME_S < 2, TIME_S < 3], [100.0, 300.0, 500.0], 900.0)
     phones = [phone(k, symbol, k + 0.4, 0.2) for k, symbol in enumerate("aaei")]
     takes = [Take(reference(mouth_of(2 * curve), phones), mouth_of(curve))]
-    assert measures.phone_spread(takes) == pytest.approx(100.0)  # of a: 100 and 300
-    assert measures.phone_correlation(takes) == pytest.approx(1.0)
+    assert phone_spread.phone_spread(takes) == pytest.approx(100.0)  # of a: 100 and 300
+    assert phone_spread.phone_correlation(takes) == pytest.approx(1.0)
 
 
 def test_turns_per_second_of_speech() -> None:
     takes = [Take(reference(mouth()), mouth_of(30.0 * np.arange(200.0) % 300.0))]
-    assert measures.turns_per_s(takes) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
+    assert in_speech.turns_per_s(takes) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
 
 
 def test_effort_correlates_within_speakers() -> None:
@@ -168,8 +193,8 @@ def test_louder_clips_have_wider_and_faster_lips() -> None:
         takes.append(Take(louder, mouth_of(extent * (np.arange(200.0) % 2))))
     level_db = 20 * np.log10([1.0, 2.0, 3.0])
     r_db = np.corrcoef(level_db, [100.0, 300.0, 200.0])[0, 1]
-    assert measures.effort_correlation(takes) == pytest.approx(r_db)
-    assert measures.speech_lip_intensity(takes) == pytest.approx(0.5)
+    assert effort_measures.effort_correlation(takes) == pytest.approx(r_db)
+    assert effort_measures.speech_lip_intensity(takes) == pytest.approx(0.5)
 
 
 def test_matched_extrema_of_a_late_mouth() -> None:

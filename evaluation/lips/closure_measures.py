@@ -1,0 +1,60 @@
+"""Measures of closures: how many there are, how many are real, and at which phones.
+
+``kouxing.evaluation.lips.closures`` defines a closure.
+"""
+
+import numpy as np
+
+from kouxing.evaluation.lips.closures import WINDOW_S, Detections, is_closed_at
+from kouxing.evaluation.lips.references import PAUSE, Reference
+from kouxing.evaluation.lips.take import Takes
+
+# Visemes of the classes in which closures are counted. All other visemes are consonants.
+CLOSURE_CLASSES = {
+    "bpm": {"b"},
+    "aei": {"a", "ai", "ao", "e", "ei", "er", "i"},
+    "uo": {"u", "v", "o", "ou"},
+    "pause": {PAUSE},
+}
+
+
+def closure_detections(takes: Takes) -> Detections:
+    """Compare the closures of all clips."""
+    return sum((take.closures for take in takes), Detections())
+
+
+def class_precision(takes: Takes, name: str) -> float | None:
+    """Return the share of the closures at a class of phones at which real lips are closed."""
+    hits = [
+        contact.is_true
+        for take in takes
+        for contact in take.contacts
+        if closure_class(take.reference, contact.time_s) == name
+    ]
+    return sum(hits) / len(hits) if hits else None
+
+
+def closure_class(reference: Reference, time_s: float) -> str:
+    """Return the class of the phones at a closure. A b p m within 40 ms comes first."""
+    for phone in reference.labials():
+        if phone.onset_s - WINDOW_S <= time_s <= phone.onset_s + phone.duration_s + WINDOW_S:
+            return "bpm"
+    viseme = reference.viseme_at(time_s)
+    return next((name for name, members in CLOSURE_CLASSES.items() if viseme in members), "other")
+
+
+def labials_shut(takes: Takes) -> float | None:
+    """Return the share of b p m whose lips are closed within 40 ms of the quietest moment."""
+    shut = [
+        is_closed_at(take.reference.quietest_moments(take.reference.labials()), take.made)
+        for take in takes
+    ]
+    flags = np.concatenate([np.zeros(0, bool), *shut])
+    return float(flags.mean()) if len(flags) else None
+
+
+def share_shut(takes: Takes) -> float | None:
+    """Return the share of the frames in speech in which the lips are closed."""
+    flags = [take.made.is_closed[take.reference.is_speech(take.made.time_s)] for take in takes]
+    together = np.concatenate([np.zeros(0, bool), *flags])
+    return float(together.mean()) if len(together) else None

@@ -1,0 +1,46 @@
+"""Measures of the opening within a phone: a real mouth differs each time it speaks the phone."""
+
+from collections import defaultdict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.evaluation.lips.curves import pooled_moments
+from kouxing.evaluation.lips.references import PAUSE
+from kouxing.evaluation.lips.take import Takes
+
+Array = NDArray[np.float64]
+
+
+def phone_deviations(takes: Takes) -> Array:
+    """Return made and real openings in the middle of phones, (2, n), less their classes' means.
+
+    The class of a phone is its speaker and its viseme. Classes with one phone are left out.
+    """
+    openings: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+    for take in takes:
+        if not len(take.real.time_s):
+            continue
+        for phone in take.reference.phones:
+            middle_s = phone.onset_s + 0.5 * phone.duration_s
+            viseme = take.reference.viseme_at(middle_s)
+            if viseme != PAUSE and take.real.time_s[0] <= middle_s <= take.real.time_s[-1]:
+                pair = [
+                    mouth.at("opening", np.array([middle_s]))[0] for mouth in (take.made, take.real)
+                ]
+                openings[take.reference.clip.speaker, viseme].append((pair[0], pair[1]))
+    classes = [np.array(pairs).T for pairs in openings.values() if len(pairs) > 1]
+    deviations = [pairs - pairs.mean(axis=1, keepdims=True) for pairs in classes]
+    return np.concatenate([np.zeros((2, 0)), *deviations], axis=1)
+
+
+def phone_spread(takes: Takes) -> float | None:
+    """Return the standard deviation of the opening within classes of phones, FAP units."""
+    deviations = phone_deviations(takes)[0]
+    return float(np.sqrt(np.mean(deviations**2))) if len(deviations) else None
+
+
+def phone_correlation(takes: Takes) -> float | None:
+    """Correlate made and real openings within classes of phones."""
+    made, real = phone_deviations(takes)
+    return pooled_moments([(made, real)]).correlation

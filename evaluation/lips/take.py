@@ -1,0 +1,62 @@
+"""Takes: a *take* is a clip with a mouth to judge.
+
+The mouth is made by a lip model, or it is the clip's real one, which shows what to aim for. A
+measure pools the takes of a group of clips.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.evaluation.lips.closures import Contact, Detections, closures, contacts
+from kouxing.evaluation.lips.extrema import misalignment_s
+from kouxing.evaluation.lips.mouths import Mouth
+from kouxing.evaluation.lips.references import Reference
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Take:
+    """A clip and the mouth to judge. Cached figures serve several groups of clips."""
+
+    reference: Reference
+    made: Mouth
+
+    @property
+    def real(self) -> Mouth:
+        """The clip's real mouth."""
+        return self.reference.mouth
+
+    @cached_property
+    def in_speech(self) -> Mask:
+        """Whether somebody speaks, at the times of the real frames."""
+        return self.reference.is_speech(self.real.time_s)
+
+    @cached_property
+    def opening_in_speech(self) -> Array:
+        """The opening while somebody speaks, at the times of the real frames."""
+        return self.made.at("opening", self.real.time_s)[self.in_speech]
+
+    @cached_property
+    def closures(self) -> Detections:
+        """Real and made closures."""
+        return closures(self.made, self.real)
+
+    @cached_property
+    def contacts(self) -> list[Contact]:
+        """Made closures."""
+        return contacts(self.made, self.real)
+
+    @cached_property
+    def misalignment_s(self) -> float | None:
+        """Mean temporal misalignment."""
+        return misalignment_s(self.made, self.real)
+
+
+Takes = Sequence[Take]
+Measure = Callable[[Takes], float | None]
