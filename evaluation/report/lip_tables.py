@@ -7,7 +7,7 @@ from kouxing.evaluation.lips.lip_scores import ALL, REAL
 from kouxing.evaluation.lips.mouths import CURVES
 from kouxing.evaluation.lips.scheme_report import PAPER
 from kouxing.evaluation.recognizer.disturbances import BABBLE, CLEAN, MUSIC
-from kouxing.evaluation.report.markdown import Results, Table, join_values
+from kouxing.evaluation.report.markdown import Results, Table, display_floor_ms, join_values
 from kouxing.evaluation.tables import format_number, percent
 
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
@@ -197,6 +197,7 @@ def lookahead(results: Results) -> Table:
         for measure, name in (("r_opening", "r"), ("closure_f1", "F1")):
             values = (format_number(points.get(delay, {}).get(measure)) for delay in delays)
             rows.append([f"{lips}, {name}", *values])
+    rows.append(["floor of the latency, ms", *(str(display_floor_ms(delay)) for delay in delays)])
     return ("lip model", *(f"{delay} ms" for delay in delays)), rows
 
 

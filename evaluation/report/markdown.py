@@ -1,10 +1,12 @@
-"""Tables in Markdown."""
+"""Tables in Markdown, and the physical floor that several of them have."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 Results = Mapping[str, Any]  # result of each measured step, by its name
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # columns and rows
+
+_FRAME_MS, _TICK_MS = 20, 17  # of the face; of a display at 60 Hz
 
 
 def markdown(table: Table) -> str:
@@ -22,3 +24,8 @@ def bullets(sentences: Iterable[str]) -> str:
 def join_values(values: Iterable[str]) -> str:
     """Join several values in one cell."""
     return " / ".join(values)
+
+
+def display_floor_ms(look_ahead_ms: int) -> int:
+    """Return the least time from a sound to its picture: look-ahead, frame and display tick."""
+    return look_ahead_ms + _FRAME_MS + _TICK_MS

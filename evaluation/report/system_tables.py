@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from kouxing.evaluation.report.markdown import Results, Table, join_values
+from kouxing.evaluation.report.markdown import Results, Table, display_floor_ms, join_values
 from kouxing.evaluation.tables import format_number, percent
 from kouxing.shared.face.faps import NUM_FAPS
 
@@ -39,6 +39,13 @@ def _chain(results: Results) -> Iterator[list[str]]:
     for name, drawing in chain["page"]["drawings"].items():
         title = f"page in headless Chromium, {name}, pictures per s"
         yield [title, format_number(drawing["pictures_per_s"], ".0f"), "60", "display"]
+        if drawing["voice_to_picture_ms"]:
+            yield [
+                "sound to its picture on the page, ms",
+                format_number(drawing["voice_to_picture_ms"], ".0f"),
+                str(display_floor_ms(_LOOK_AHEAD_MS)),
+                "look-ahead + frame + display tick",
+            ]
 
 
 def _load(results: Results) -> Iterator[list[str]]:
@@ -83,7 +90,7 @@ def _browser(results: Results) -> Iterator[list[str]]:
         "lips in the browser: sound to weights, p50 / p95, ms",
         _percentiles(browser["delay_ms"]),
         format_number(_LOOK_AHEAD_MS + _FRAME_MS / 2, ".0f"),
-        "look-ahead + half a frame; the display adds up to a tick of 17 ms",
+        "look-ahead + half a frame",
     ]
     models = results.get("sizes", {}).get("model_bytes", {})
     needed = sum(models.get(name, 0) for name in ("ear", "lips", "traits", "phone_lm")) / 1e6
@@ -129,6 +136,7 @@ def faults(results: Results) -> Table:
         "frames lost",
         "phones lost / doubled / changed",
         "largest step",
+        "latency p95, ms",
         "rejected sessions",
     )
     rows = []
@@ -145,5 +153,6 @@ def faults(results: Results) -> Table:
             if face
             else [outcome["failure"], "-", "-", "-", "-"]
         )
-        rows.append([outcome["fault"], *cells, str(outcome["num_refused"])])
+        late_ms = format_number(outcome["late_p95_ms"], ".0f")
+        rows.append([outcome["fault"], *cells, late_ms, str(outcome["num_refused"])])
     return columns, rows

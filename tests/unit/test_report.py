@@ -181,6 +181,7 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert "[[" not in text
     assert "| **learnt**, 60 ms |" in text
     assert "| learnt, r | 0.50 | 0.70 |" in text
+    assert "| floor of the latency, ms | 37 | 97 |" in text
     assert "`kouxing x`: m, 2026-01-01, commit c, 3 s (2 s of processor time), load 0.5" in text
     assert 'make report STEPS="faults"' in text
     assert (tmp_path / "lookahead.png").stat().st_size > 1000
@@ -201,7 +202,7 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
     )
     other = replace(page, name="HeadAudio", download_bytes=100_000, delay_ms=None)
     values: dict[str, Any] = dict.fromkeys((field.name for field in fields(Drawing)), 1.0)
-    drawing = Drawing(**values | {"pictures_per_s": 20.0})
+    drawing = Drawing(**values | {"pictures_per_s": 20.0, "voice_to_picture_ms": 140.0})
     latency = Latency(
         chunk_to_frame_ms={"p50": 4.9, "p95": 9.2},
         sound_to_frame_ms={"p50": 65.0, "p95": 69.0},
@@ -227,6 +228,7 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
     assert rows["end of a chunk to its frame, p50 / p95, ms"] == ["4.9 / 9.2", "0"]
     assert rows["processor time of all services, s per s of audio"] == ["0.30", "0.10"]
     assert rows["page in headless Chromium, microphone, pictures per s"] == ["20", "60"]
+    assert rows["sound to its picture on the page, ms"] == ["140", "97"]
     assert rows["sessions on 2 cores, all speaking"] == ["15", "50"]
     assert rows["2 busy programs: largest lateness, s / frames missing, %"] == ["0.04 / 1", "0"]
     assert rows["kouxing-lips in the browser: download, MB / share of a core, %"] == [
@@ -239,11 +241,11 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
 def test_the_table_of_faults_reads_a_stored_result(tmp_path: Path) -> None:
     values: dict[str, Any] = dict.fromkeys((field.name for field in fields(Continuity)), 0)
     face = Continuity(**values | {"stood_s": 0.5, "late_s": 0.25, "largest_step": 1.2})
-    killed = Outcome(fault="control killed", failure="", face=face, load=1.0)
+    killed = Outcome(fault="control killed", failure="", face=face, late_p95_ms=15.4, load=1.0)
     write_result(tmp_path / "faults.json", step_file([asdict(killed)]))
     stored = json.loads((tmp_path / "faults.json").read_text("utf-8"))
     (row,) = system_tables.faults({"faults": stored["result"]})[1]
-    assert row == ["control killed", "0.50", "0.25", "0", "0 / 0 / 0", "1.2", "0"]
+    assert row == ["control killed", "0.50", "0.25", "0", "0 / 0 / 0", "1.2", "15", "0"]
 
 
 def test_the_lateness_of_each_frame_is_not_stored(tmp_path: Path) -> None:
