@@ -16,7 +16,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
 HEADS := $(PAGE)/head.glb
-HEAD_SOURCES := $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py \
+HEAD_SOURCES := $(wildcard services/driver/head/assets/* services/driver/head/*.py) \
 	services/driver/render/shaders.py
 # The modules that the page loads, and their licenses; make check-wheel finds missing ones.
 PAGE_MODULES := three/LICENSE three/build/three.core.js three/build/three.module.js \

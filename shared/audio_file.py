@@ -283,7 +283,8 @@ def raw_audio(
             channels = to_float(np.frombuffer(data[:whole], raw.dtype)).reshape(-1, num_channels)
             yield raw.sample_rate_hz, guard.mix(channels, channels)
         sizes = (num_read, num_read + num_missing())
-        remarks.extend(_cut_off(name, *(size / frame_bytes / rate_hz for size in sizes)))
+        seconds = (size / frame_bytes / raw.sample_rate_hz for size in sizes)
+        remarks.extend(_cut_off(name, *seconds))
 
     blocks = _blocks(pieces(), name, rate_hz, num_mixed, BLOCK_S)
     return AudioSource(name, rate_hz, num_mixed, None, blocks, remarks)

@@ -357,7 +357,7 @@ class _GuardedFile:
 def pcm_of_wav(begin: bytes) -> WavPcm | None:
     """Find the samples of a WAV stream, if they are 16-bit integers or 32-bit floats.
 
-    None for other encodings, more than two channels, and rates that need resampling.
+    None for other encodings and for more than two channels.
     """
     if begin[:4] != b"RIFF" or begin[8:12] != b"WAVE" or codec_of_padded_wav(begin):
         return None

@@ -37,7 +37,7 @@ def open_file(path: Path, max_bytes: int, *, pipe: bool = False) -> BinaryIO:
     except FileNotFoundError:
         if str(path).startswith(("http:/", "https:/")):  # a Path has one slash
             address = str(path).replace(":/", "://", 1)
-            raise UserError(f"{address}: this is an address; download the file first") from None
+            raise UserError(f"{address}: this is a URL; download the file first") from None
         raise UserError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:  # ValueError: invalid file name
         raise _unreadable(path, error) from None

@@ -146,7 +146,10 @@ export class KouxingFace extends HTMLElement {
     const { LipSync } = await import("kouxing-lips");
     const models = this.getAttribute("local");
     const lips = await LipSync.create({ shapes: ["arkit", "oculus", "vrm"], ...(models ? { models } : {}) });
-    if (this.#renderer === null || !this.hasAttribute("local")) lips.close();
+    if (this.#renderer === null || !this.hasAttribute("local")) {
+      lips.close();
+      return lips;
+    }
     lips.addEventListener("notice", ({ detail }) => this.dispatchEvent(new CustomEvent("notice", { detail })));
     this.#localFaces = lips;
     return lips;

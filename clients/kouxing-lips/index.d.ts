@@ -34,7 +34,10 @@ export class LipSync extends EventTarget {
   at(timeS: number): LipFrame | null;
   /** Follow the microphone. Rejects with a message for the user if it cannot be opened. */
   listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;
-  /** Follow a source. AudioBuffers and media elements are also played, in sync with the face. */
+  /**
+   * Follow a source. AudioBuffers and media elements are also played, in sync with the face.
+   * Rejects with an AbortError if another source is opened first.
+   */
   listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
   /** Start a session for push(). */
   open(sampleRateHz: number): Promise<void>;

@@ -28,7 +28,7 @@ export class LipSync extends EventTarget {
   #session = 0; // number of the newest
   #track = new FrameTrack();
   #source = null; // { node, release(), startS: null before the first sound, isPlayed }
-  #pending = new Map(); // resolve functions by name
+  #pending = null; // the request that the worker has not answered: { answer, resolve, reject }
   #isSpeaking = false;
   #isLaughing = false;
 
@@ -51,11 +51,8 @@ export class LipSync extends EventTarget {
   static async create({ models = MODELS, phones = true, context = null, shapes = DEFAULT_SHAPES, ...options } = {}) {
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
     const lips = new LipSync(worker, context, { shapes, ...options });
-    await new Promise((resolve, reject) => {
-      lips.#pending.set("loaded", resolve).set("failed", reject);
-      worker.onerror = () => reject(new Error("cannot start the worker; serve the package from the page's own origin"));
-      worker.postMessage({ type: "load", models: new URL(models, location.href).href, phones });
-    });
+    worker.onerror = () => lips.#fail("cannot start the worker; serve the package from the page's own origin");
+    await lips.#request("loaded", { type: "load", models: new URL(models, location.href).href, phones });
     return lips;
   }
 
@@ -98,13 +95,13 @@ export class LipSync extends EventTarget {
     await context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
     this.stop();
     const node = sourceNode(context, source);
+    const { port1, port2 } = new MessageChannel();
+    await this.#open({ sampleRateHz: context.sampleRate }, port1);
     const input = new AudioWorkletNode(context, "kouxing-lips", { channelCount: 1, channelCountMode: "explicit", numberOfOutputs: 0 });
     const isPlayed = node.isPlayed;
     const delay = isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
     node.connect(input);
     if (delay) node.connect(delay).connect(context.destination);
-    const { port1, port2 } = new MessageChannel();
-    await this.#open({ sampleRateHz: context.sampleRate }, port1);
     this.#source = {
       node,
       isPlayed,
@@ -140,10 +137,7 @@ export class LipSync extends EventTarget {
 
   /** End pushed audio. Resolves when all its frames are known. */
   finish() {
-    return new Promise((resolve) => {
-      this.#pending.set("finished", resolve);
-      this.#worker.postMessage({ type: "finish", session: this.#session });
-    });
+    return this.#request("finished", { type: "finish", session: this.#session });
   }
 
   /** Show expressions, strengths 0 to 1 by name, for a time. */
@@ -198,6 +192,7 @@ export class LipSync extends EventTarget {
   /** Stop, and release all resources. */
   close() {
     this.stop();
+    this.#supersede();
     document.removeEventListener("visibilitychange", this.#onVisibility);
     this.#worker.terminate();
     this.#context?.removeEventListener("statechange", this.#onContextState);
@@ -207,19 +202,35 @@ export class LipSync extends EventTarget {
   async #open(options, input = null) {
     this.#track = new FrameTrack();
     const session = ++this.#session;
-    await new Promise((resolve, reject) => {
-      this.#pending.set("opened", resolve).set("failed", reject);
-      const message = { type: "open", session, options: { ...this.#options, ...options }, input };
-      this.#worker.postMessage(message, input ? [input] : []);
+    const message = { type: "open", session, options: { ...this.#options, ...options }, input };
+    await this.#request("opened", message, input ? [input] : []);
+  }
+
+  /** Send a request to the worker, and wait for its answer. It replaces an unanswered request. */
+  #request(answer, message, transfer = []) {
+    this.#supersede();
+    return new Promise((resolve, reject) => {
+      this.#pending = { answer, resolve, reject };
+      this.#worker.postMessage(message, transfer);
     });
+  }
+
+  /** Reject the unanswered request. Its caller can ignore an AbortError. */
+  #supersede() {
+    this.#pending?.reject(new DOMException("another source was opened, or lip sync was closed", "AbortError"));
+    this.#pending = null;
+  }
+
+  #fail(text) {
+    const request = this.#pending;
+    this.#pending = null;
+    if (request) request.reject(new Error(text));
+    else this.#report(text);
   }
 
   #onMessage({ type, ...data }) {
     if (type === "error") {
-      const reject = this.#pending.get("failed");
-      this.#pending.clear();
-      if (reject) reject(new Error(data.text));
-      else this.#report(data.text);
+      this.#fail(data.text);
       return;
     }
     if (type !== "loaded" && data.session !== this.#session) return;
@@ -228,9 +239,9 @@ export class LipSync extends EventTarget {
       return;
     }
     if (type === "opened") this.names = data.names;
-    const resolve = this.#pending.get(type);
-    this.#pending.clear();
-    resolve?.();
+    if (type !== this.#pending?.answer) return;
+    this.#pending.resolve();
+    this.#pending = null;
   }
 
   #onFrames({ frames, phones, startS }) {

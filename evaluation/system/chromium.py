@@ -64,7 +64,11 @@ class Chromium:
         self._num_sent = 0
         self.complaints: list[str] = []
         port_file = folder / "DevToolsActivePort"
-        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S)
+        try:
+            wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S)
+        except TimeoutError:
+            self._process.kill()
+            raise UserError(f"{program} did not start within {_TIMEOUT_S:g} s") from None
         self._port = int(port_file.read_text().split()[0])
         self._loop.run_until_complete(self._connect())
         self.command("Runtime.enable")

@@ -227,7 +227,7 @@ def express(
     ] = None,
     control: Control = "",
 ) -> None:
-    """Show expressions on a face. Without expressions, end the current ones."""
+    """Show expressions on a face. With no expressions given, clear the current ones."""
     from kouxing.shared.control_client import connect
 
     words = list(arguments or ())

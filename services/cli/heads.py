@@ -112,6 +112,10 @@ def _has_current_heads(folder: Path) -> bool:
     files = [folder / file for file in _page_files().values()]
     if not all(file.is_file() for file in files):
         return False
-    sources = [*(_DRIVER_HEADS / "assets").iterdir(), _DRIVER_HEADS / "glb_export.py"]
+    sources = [
+        *(_DRIVER_HEADS / "assets").iterdir(),
+        *_DRIVER_HEADS.glob("*.py"),
+        _DRIVER_HEADS.parent / "render" / "shaders.py",
+    ]
     newest_source_s = max(source.stat().st_mtime for source in sources)
     return min(file.stat().st_mtime for file in files) > newest_source_s

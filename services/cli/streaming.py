@@ -109,8 +109,8 @@ class _Streaming:
                 self._session.close()
         video = self._wait_for_video(drawn_before_s) if self._is_recorded else ""
         if not self._num_phones:
-            reason = "it is silent" if self._peak < QUIET_PEAK else "is there a voice in it?"
-            self._warn(f"{source.name}: no speech was found; {reason}")
+            reason = "; it is silent" if self._peak < QUIET_PEAK else ""
+            self._warn(f"{source.name}: no speech was found{reason}")
         if self._phones.num_missed:
             self._warn(missed_remark(self._phones.num_missed, "phone"))
         for remark in (*source.remarks, *clipping_remarks(source.name, self._clipped)):

@@ -232,6 +232,7 @@ class Sessions:
         """Record that a service is lost; return the sessions that lack a worker now."""
         for record in self._pending.values():
             record.waiting_for.discard(instance)
+            record.deferred.discard(instance)
         records = list(self._of_worker.get(instance, {}).values())
         for record in records:
             record.lost.add(instance)

@@ -22,7 +22,7 @@ LEARNING_LIMIT_S = 180.0
 class MouthLearner(Uploads):
     """Answers a recording with the learned mouth profile."""
 
-    busy_text = "another mouth is being learned; try again in a minute"
+    busy_text = "another mouth profile is being created; try again in a minute"
 
     def __init__(self, command: Sequence[str] = (sys.executable, "-m", worker.__name__)) -> None:
         super().__init__()

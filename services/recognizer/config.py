@@ -40,8 +40,8 @@ class RecognizerConfig(ServiceConfig):
     )
     """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011."""
     max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
-    """Seconds that a live session may be behind. A session that exceeds this limit for 0.4 s
-    skips audio. From three quarters of the limit, it uses the light acoustic model."""
+    """Maximum lag of a live session, in seconds. A session that exceeds it for 0.4 s skips audio.
+    From three quarters of the limit, it uses the light acoustic model."""
 
     @property
     def output_rule(self) -> OutputRuleConfig:

@@ -43,5 +43,4 @@ class SynthesizerConfig(FaceConfig):
     feeling: Annotated[float, Field(ge=0, le=1)] = 0.5
     """How strongly the face shows the feeling in the voice. 0 turns it off."""
     max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
-    """Seconds that a live face may be behind. If it exceeds this limit for 0.4 s, it skips
-    frames."""
+    """Maximum lag of a live face, in seconds. If it exceeds this for 0.4 s, it skips frames."""

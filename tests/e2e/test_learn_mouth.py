@@ -162,7 +162,7 @@ def test_a_slow_computer_is_reported_before_reading(browser: Browser) -> None:
     browser.click("learn")
     browser.click("lesson-start")
     browser.wait_for("window.kouxing.state.lesson === 'problem'")
-    assert "too few camera images" in text_of(browser, "lesson-problem")
+    assert "too slow to track your face" in text_of(browser, "lesson-problem")
     browser.click("learn-mouth [data-step=problem] .close")
 
 

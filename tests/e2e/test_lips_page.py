@@ -172,6 +172,16 @@ def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) 
         wait_for_notice("the microphone was unplugged")
 
 
+def test_a_source_that_another_one_replaces_is_reported(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        result = browser.evaluate(
+            "Promise.allSettled([window.lips.open(16000), window.lips.open(48000)])"
+            ".then((all) => all.map(({ status, reason }) => reason?.name ?? status))"
+        )
+        assert result == ["AbortError", "fulfilled"]
+
+
 def test_wrong_files_give_a_sentence(browser: Browser, site: Path) -> None:
     with serve_folder(site) as origin:
         open_demo(browser, origin)

@@ -99,7 +99,7 @@ def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None
     }
     assert ("meter", "level") in named
     sliders = sorted(name for role, name in named if role == "slider")
-    assert sliders[0].startswith("Feeling from the voice")
+    assert sliders[0].startswith("Emotion from the voice")
     assert sliders[1].startswith("Mouth movement")
     for node in shown:
         if node["role"]["value"] in ("button", "combobox", "slider", "meter", "image"):

@@ -146,6 +146,16 @@ def test_reports_a_wrong_wav_header(
         assert message in text
 
 
+def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    soundfile.write(tmp_path / "a.wav", np.full(4 * 96_000, 0.25), 96_000)
+    source = _open(monkeypatch, (tmp_path / "a.wav").read_bytes()[: 2 * 96_000 * 2 + 44])
+    for _ in source.blocks:
+        pass
+    assert "cut off after 2.0 s of 4.0 s" in source.remarks[0]
+
+
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
 def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     path = tmp_path / name

@@ -139,7 +139,7 @@ def test_a_moved_session_sends_the_new_recognizer_what_it_needs() -> None:
     scene.push(1)
     assert sequences(scene.audio(2)) == [3, 4, 5, 6]
     moved = {**MOVED, "epoch": 3, "phones": "phones 3"}  # the recognizer stays
-    scene.commands.answer("session-moved", **moved, next_sequence=None)
+    scene.commands.answer("session-moved", **moved)
     scene.push(1)
     assert sequences(scene.audio(2)) == [3, 4, 5, 6, 7]
 

@@ -263,6 +263,15 @@ def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
     assert system.sessions.record_started(record, synthesizer, reported) == {last}
     assert record.start_message(1.0).media_time == max(32_000, reported)
     assert system.sessions.record_started(record, last, 0) == set()
+
+
+def test_a_recognizer_that_is_lost_before_it_starts_is_not_told_to_start(system: System) -> None:
+    record = system.open()
+    system.lose("synthesizer-1")
+    system.add(worker("synthesizer", "synthesizer-2"))
+    assert system.sessions.move(record, 1.0)
+    system.lose("recognizer-1")
+    assert system.sessions.record_started(record, "synthesizer-2", 0) == set()
     assert record.waiting_for == set()
 
 

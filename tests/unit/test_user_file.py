@@ -91,7 +91,7 @@ def test_open_file_rejects_everything_but_small_regular_files(tmp_path: Path) ->
         (tmp_path, "this is a folder"),
         (tmp_path / "device", "this is a pipe or device"),
         (tmp_path / "none", "no such file"),
-        (Path("https://example.com/a.mp3"), "this is an address; download the file first"),
+        (Path("https://example.com/a.mp3"), "this is a URL; download the file first"),
         (tmp_path / "file", "larger than 1 KiB"),
         (tmp_path / ("x" * 300), "too long"),
         (tmp_path / "\0", "null byte"),

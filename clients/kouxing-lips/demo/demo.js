@@ -141,7 +141,7 @@ async function act(action) {
   try {
     await action(await face.lips);
   } catch (error) {
-    note.textContent = error.message;
+    if (error.name !== "AbortError") note.textContent = error.message;
   }
 }
 

@@ -266,9 +266,10 @@ class SessionCore:
             return
         self.epoch = moved["epoch"]
         self.place({name: moved[name] for name in ("audio", "phones", "faps")})
-        if self.stream is not None and moved["next_sequence"]:
+        next_sequence = moved.get("next_sequence")
+        if self.stream is not None and next_sequence:
             self._unknown = None
-            self.stream.move(moved["next_sequence"], self.sockets.now_s)
+            self.stream.move(next_sequence, self.sockets.now_s)
             self.connect()
 
     def place(self, endpoints: Fields) -> None:

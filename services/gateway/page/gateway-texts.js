@@ -54,7 +54,7 @@ const CHINESE = {
 
   // Learn my mouth
   "the gateway is stopping": "网关正在停止",
-  "another mouth is being learned; try again in a minute": "正在学习另一个口型，请一分钟后重试",
+  "another mouth profile is being created; try again in a minute": "正在学习另一个口型，请一分钟后重试",
   "learning failed; see the gateway's log": "学习失败，请查看网关日志",
   "the recording is larger than {size} MiB": "录制大于 {size} MiB",
   "the recording did not arrive within {limit} s": "录制未在 {limit} 秒内传完",

@@ -155,6 +155,7 @@ export class MouthLesson {
     let startMs = null;
     let isOver = false;
     let numImages = 0;
+    const timers = [];
     const over = new Promise((resolve, reject) => {
       this.#finish = () => {
         isOver = true;
@@ -163,30 +164,35 @@ export class MouthLesson {
       signal.addEventListener("abort", this.#finish);
       for (const track of stream.getTracks()) track.onended = () => reject(new UserError(say("cameraUnplugged")));
       const { from, to } = RATE_CHECK_MS;
-      setTimeout(() => (numImages = 0), from); // the first images take longer
-      setTimeout(() => {
+      const checkRate = () => {
         const rateHz = (1000 * numImages) / (to - from);
         if (rateHz < FaceRecording.minRateHz) reject(new UserError(say("tooSlow")));
         this.#isSlow = rateHz < GOOD_RATE_HZ;
-      }, to);
+      };
+      timers.push(setTimeout(() => (numImages = 0), from)); // the first images take longer
+      timers.push(setTimeout(checkRate, to));
     });
-    let next = nextImage(video);
-    while (!isOver) {
-      const { takenMs, image } = await Promise.race([next, over]);
-      if (isOver) break;
-      next = nextImage(video); // taken while the face in this one is being found
-      const landmarks = await Promise.race([tracker.find(image), over]);
-      if (isOver) break;
-      numImages++;
-      drawLips(video, tracker.lips, landmarks);
-      if (startMs === null && landmarks !== null) {
-        startMs = performance.now();
-        capture(context, stream, (chunk, rms, recordedMs) =>
-          recording.addSound(recordedMs, chunk, rms),
-        );
+    try {
+      let next = nextImage(video);
+      while (!isOver) {
+        const { takenMs, image } = await Promise.race([next, over]);
+        if (isOver) break;
+        next = nextImage(video); // taken while the face in this one is being found
+        const landmarks = await Promise.race([tracker.find(image), over]);
+        if (isOver) break;
+        numImages++;
+        drawLips(video, tracker.lips, landmarks);
+        if (startMs === null && landmarks !== null) {
+          startMs = performance.now();
+          capture(context, stream, (chunk, rms, recordedMs) =>
+            recording.addSound(recordedMs, chunk, rms),
+          );
+        }
+        if (startMs !== null) recording.addFace(takenMs, landmarks);
+        this.#showTime(startMs, recording);
       }
-      if (startMs !== null) recording.addFace(takenMs, landmarks);
-      this.#showTime(startMs, recording);
+    } finally {
+      timers.forEach(clearTimeout);
     }
   }
 

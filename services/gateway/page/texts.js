@@ -47,14 +47,14 @@ export const TEXTS = {
     en: "Close other programs, and other windows that show this page.",
     zh: "请关闭其他程序，以及显示本页的其他窗口。",
   },
-  fewerPictures: { en: "Draw fewer pictures", zh: "减少画面" },
+  fewerPictures: { en: "Lower the frame rate", zh: "减少画面" },
   useLightModel: { en: "Use the light model", zh: "使用轻量模型" },
   gatewayStopped: {
     en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
     zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
   },
   connectionRefused: {
-    en: "The gateway refused the connection. Open the whole address that “kouxing run” printed, including #token=… if it has one.",
+    en: "The gateway refused the connection. Open the full URL that “kouxing run” printed, including #token=… if it has one.",
     zh: "网关拒绝了连接。请打开 kouxing run 显示的完整地址（包括其中的 #token=…）。",
   },
   controlMissing: {
@@ -97,7 +97,7 @@ export const TEXTS = {
     zh: "网关关闭了连接。请再按“麦克风”重试。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
-  noSpeech: { en: "{file}: no speech was found; is there a voice in it?", zh: "{file}：没有找到语音，里面有人说话吗？" },
+  noSpeech: { en: "{file}: no speech was found", zh: "{file}：没有找到语音" },
   noSpeechSilent: { en: "{file}: no speech was found; it is silent", zh: "{file}：没有找到语音，文件是静音的" },
   "error.bad-audio": { en: "{text}", zh: "音频有误，请重试" },
   "error.bad-face": { en: "{text}", zh: "此设置无效，请重新选择" },
@@ -127,7 +127,7 @@ export const TEXTS = {
     en: "No graphics card was found, so the head has fewer triangles and pixels: {size}",
     zh: "没有显卡，画面已简化：{size} 像素",
   },
-  allPictures: { en: "Draw all pictures again", zh: "恢复全部画面" },
+  allPictures: { en: "Restore the full frame rate", zh: "恢复全部画面" },
   lightModel: { en: "light model", zh: "轻量模型" },
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
@@ -136,7 +136,7 @@ export const TEXTS = {
   captions: { en: "Captions", zh: "字幕" },
   still: { en: "Keep the head still", zh: "头部保持不动" },
   eye_contact: { en: "Keep eye contact", zh: "始终看着观众" },
-  feeling: { en: "Feeling from the voice", zh: "随声音流露的情绪" },
+  feeling: { en: "Emotion from the voice", zh: "随声音流露的情绪" },
   expression: { en: "Expression", zh: "表情" },
   senders: { en: "Other programs", zh: "其他程序" },
   senderAddress: { en: "Address of a program that shows the face", zh: "显示这张脸的程序的地址" },
@@ -222,7 +222,7 @@ export const TEXTS = {
   noFace: { en: "No face is visible. Sit in front of the camera, with light on your face.", zh: "看不到脸。请正对摄像头，脸部要有光。" },
   tooQuiet: { en: "The sound is too quiet. Speak louder, or turn up the microphone.", zh: "声音太小。请大声一点，或调高麦克风音量。" },
   tooSlow: {
-    en: "This computer analyzes too few camera images per second. Close other programs and try again. Or film yourself and use kouxing track and kouxing adapt.",
+    en: "This computer is too slow to track your face. Close other programs and try again. Or film yourself and use kouxing track and kouxing adapt.",
     zh: "这台电脑处理画面太慢。请关闭其他程序再试，或录一段视频，用 kouxing track 和 kouxing adapt 学习。",
   },
   cameraInsecure: {
