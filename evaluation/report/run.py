@@ -1,7 +1,7 @@
 """Runs the steps of the report that are out of date, and stores their results.
 
 A result is a JSON file with the commands, machine, date, commit and load. It is out of date if the
-hash of the code and models that its step depends on has changed.
+commands, or the hash of the code and models that its step depends on, have changed.
 """
 
 import json
@@ -44,22 +44,27 @@ def run_steps(
         missing = [
             key for key, folder in folders.items() if not folder and f"{{{key}}}" in str(commands)
         ]
+        shown = [f"kouxing {_without_braces(command)}" for command in commands]
         code = code_hash(step.code)
         if not commands or missing:
             reason = f"give --{missing[0]}" if missing else "it is not part of a quick report"
             print_message(f"{name}: skipped ({reason})")
-        elif not is_fresh and path.exists() and json.loads(path.read_text())["code"] == code:
+        elif not is_fresh and _is_up_to_date(path, shown, code):
             print_message(f"{name}: up to date")
         else:
-            print_message(f"{name}: kouxing {_without_braces(commands[-1])}")
+            print_message(f"{name}: {shown[-1]}")
             measured = describe_run()
             figures = _run(commands, folders)
             if figures is None:
                 failed.append(name)
             else:
-                shown = [f"kouxing {_without_braces(command)}" for command in commands]
                 write_result(path, {"commands": shown, **measured, "code": code, **figures})
     return failed
+
+
+def _is_up_to_date(path: Path, commands: list[str], code: str) -> bool:
+    stored = json.loads(path.read_text("utf-8")) if path.exists() else {}
+    return bool(stored) and (stored["commands"], stored["code"]) == (commands, code)
 
 
 def describe_run() -> dict[str, Any]:

@@ -104,6 +104,7 @@ STEPS: Mapping[str, Step] = {
             "services/gateway",
             *_SERVICES,
         ),
+        (f"bench chain {SAMPLE.relative_to(ROOT)} --repeats 1",),
     ),
     "load": Step(
         ("bench load",),
