@@ -11,8 +11,9 @@ With learnt lips, phones also decide where the lips do not close. In the live ch
 late.
 """
 
+import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,7 @@ from kouxing.shared.phones.events import (
     SoundEvent,
     SpeechChange,
 )
+from kouxing.shared.records import replace
 
 # Tuned on the same held-out clips as the rule of the live chain. If the sound has one closure and
 # the phones have two, the vowel between them counts. No clip has such a place.
@@ -127,7 +129,7 @@ def animate_recording(
     ``with_progress`` shows the progress.
     """
     if isinstance(lip_model, LearntLips):
-        lip_model = replace(
+        lip_model = dataclasses.replace(
             lip_model, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED
         )
     face = FaceAnimator(

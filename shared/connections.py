@@ -196,7 +196,8 @@ class LimitedSocket:
             connection.key = key
             self.limiter.restore_budget(connection)
         connection.num_delivered += 1
-        connection.spend(self.limits.cost)
+        if self.limits.cost:
+            connection.spend(self.limits.cost)
         return connection
 
     def subscribe(self, connection: Connection, topic: bytes) -> None:

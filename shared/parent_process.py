@@ -9,12 +9,12 @@ import os
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id
 PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
 IDLE_PULSE = b"-"  # the byte for a heartbeat without sessions
+_PARENT = int(os.environ.get(PARENT_VARIABLE, "0"))  # 0: no such process
 
 
 def has_exited() -> bool:
     """Return whether the process that started this one has exited."""
-    parent = os.environ.get(PARENT_VARIABLE)
-    return parent is not None and os.getppid() != int(parent)
+    return _PARENT != 0 and os.getppid() != _PARENT
 
 
 def send_pulse(*, is_idle: bool) -> None:

@@ -6,7 +6,6 @@ Undecodable messages are returned as ``BadMessage``.
 import math
 import secrets
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
 from typing import TypeVar
 
 import zmq
@@ -17,6 +16,7 @@ from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Grant, Peer, may_follow
 from kouxing.shared.names import is_name
+from kouxing.shared.records import Record
 from kouxing.shared.waker import Waker
 from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
 from kouxing.shared.wire.message import Message
@@ -33,8 +33,7 @@ T = TypeVar("T", int, str)
 _MORE, _READABLE = zmq.DONTWAIT | zmq.SNDMORE, int(zmq.POLLIN)
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(Record, frozen=True):
     """A message or the reason why it is bad, and its sender (ROUTER sockets only)."""
 
     message: Message | BadMessage
@@ -138,11 +137,16 @@ class Socket:
         message. From then on, the subscriber misses nothing.
         """
         try:
-            for _ in range(MAX_BATCH):
+            for number in range(MAX_BATCH):
                 if self.raw.closed:  # by the handler of the last message
                     return
+                # Usually there is one message. This look is cheaper than the exception below.
+                if number == 1 and not int(self.raw.get(zmq.EVENTS)) & _READABLE:
+                    self.note_empty()
+                    return
                 try:
-                    self._drop_unread_parts()
+                    if self._has_unread_parts:
+                        self._drop_unread_parts()
                     parts, key = self._take()
                 except zmq.Again:
                     if not self._has_unread_parts:
@@ -156,8 +160,8 @@ class Socket:
                 if self._publishes:
                     self._on_subscription(parts, grant)
                     continue
-                number = self._connection.inode if self._connection is not None else 0
-                self._sender = Peer(parts.pop(0), key, number) if self._routes else NO_PEER
+                inode = self._connection.inode if self._connection is not None else 0
+                self._sender = Peer(parts.pop(0), key, inode) if self._routes else NO_PEER
                 try:
                     yield Received(decode(parts), self._sender)
                 except BadMessage as error:
@@ -230,7 +234,7 @@ class Socket:
         """Return the first parts of a message and its sender's key; raise ``zmq.Again`` if none."""
         frame = self.raw.recv(zmq.DONTWAIT, copy=False)
         parts = [frame.bytes]
-        descriptor = _property(frame, zmq.SRCFD, -1)
+        descriptor = -1 if self._limited is None else _property(frame, zmq.SRCFD, -1)
         while frame.more and len(parts) < MAX_PARTS:
             frame = self.raw.recv(zmq.DONTWAIT, copy=False)
             parts.append(frame.bytes)
@@ -317,9 +321,15 @@ class Poller:
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Return the readable sockets in the order in which they were added."""
-        ready = dict(self._poller.poll(max(0, math.ceil(timeout_s * 1000))))
-        ready.update((raw, 1) for raw in self._quiet if int(raw.get(zmq.EVENTS)) & _READABLE)
+        events = self._poller.poll(max(0, math.ceil(timeout_s * 1000)))
+        ready = {raw for raw, _ in events}
+        for raw in self._quiet:
+            if int(raw.get(zmq.EVENTS)) & _READABLE:
+                ready.add(raw)
+        readable = []
         for raw, socket in self._sockets.items():
-            if raw not in ready:
+            if raw in ready:
+                readable.append(socket)
+            else:
                 socket.note_empty()
-        return [socket for raw, socket in self._sockets.items() if raw in ready]
+        return readable

@@ -15,7 +15,7 @@ phone counts when the rule emits the next one; by then the search has measured i
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
@@ -36,6 +36,7 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
+from kouxing.shared.records import replace
 
 SCHEMES = (1, 2, 3, 4)
 ALIGNED, RECOGNIZED, LIVE, NEXT_PHONE = SCHEMES

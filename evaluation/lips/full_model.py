@@ -5,7 +5,6 @@ schemes 1 (phones of a forced alignment) and 2 (recognized phones with their tim
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.records import replace
 
 _BLOCK_S = 2.0
 _REACH_S = 1.5  # visemes further away have no visible weight

@@ -24,8 +24,7 @@ Samples = NDArray[np.float32]
 FRAME_RATE_HZ = 50.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _NumberedLipPositions(LipPositions):
+class _NumberedLipPositions(LipPositions, frozen=True, kw_only=True):
     """Lip positions of one of several predictors."""
 
     predictor: int

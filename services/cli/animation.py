@@ -1,7 +1,8 @@
 """The motion of a face: computed from sound, or read from a ``.fap`` file or a table."""
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,6 +33,7 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
+from kouxing.shared.records import replace
 
 T = TypeVar("T", Phone, TimedSyllable)
 _IMAGE_RATE_HZ = 25.0  # for a video made from sound
@@ -55,7 +57,7 @@ def slow_down(motion: Motion, speed: float) -> Motion:
     """Return a motion at a speed of 0.25 to 1, with its sound at the same pitch."""
     if speed == 1.0:
         return motion
-    return replace(
+    return dataclasses.replace(
         motion,
         frames=[(time_s / speed, faps) for time_s, faps in motion.frames],
         samples=None if motion.samples is None else stretch(motion.samples, speed),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
+from kouxing.shared.records import replace
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import Motion

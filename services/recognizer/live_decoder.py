@@ -11,7 +11,6 @@ out the differences.
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -32,6 +31,7 @@ from kouxing.services.recognizer.speech_scorer import (
 )
 from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
+from kouxing.shared.records import replace
 
 _DEFAULT_CONFIDENCE = 0.5  # of a phone that was not emitted before it was final
 

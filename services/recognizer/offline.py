@@ -1,12 +1,12 @@
 """Recognizes whole recordings, by the same search as live audio."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.records import replace
 
 WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, or a progress bar
 

@@ -7,7 +7,6 @@ for later audio is void.
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -25,6 +24,7 @@ from kouxing.shared.phones.events import (
     Waveform,
 )
 from kouxing.shared.phones.final_time import FinalTime
+from kouxing.shared.records import replace
 
 WARM_UP_S = 2.8  # duration of audio before that time; docs/recognition.md explains the choice
 # Audio starts at a multiple of this time. Network blocks and positions divide it, so they are

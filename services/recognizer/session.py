@@ -34,6 +34,7 @@ from kouxing.shared.wire.speech import (
     AudioState,
     Progress,
 )
+from kouxing.shared.wire.speech import LipPositions as LipMessage
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # limit for a paced client ahead of the clock; a delayed one may catch up as much
@@ -258,7 +259,7 @@ class RecognizerSession:
     def on_acknowledge(self, ack: Acknowledge, now_s: float) -> None:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
-            if isinstance(message, SpeechMessage):
+            if isinstance(message, SpeechMessage) and not isinstance(message, LipMessage):
                 self.replay_window.update(event_of(message), self.order.last)
 
 

@@ -7,7 +7,6 @@ Any chunking of the same audio gives the same result.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
@@ -34,10 +33,10 @@ from kouxing.shared.phones.events import (
     Progress,
     Waveform,
 )
+from kouxing.shared.records import Record, replace
 
 
-@dataclass(frozen=True, slots=True)
-class FrameScores:
+class FrameScores(Record, frozen=True):
     """State scores of the next frames of speech."""
 
     settled: Floats  # (m, states) of the frames after those settled before
@@ -59,8 +58,7 @@ ScoreEvent: TypeAlias = (
 EarlyEvent: TypeAlias = LipPositions | Progress | Waveform
 
 
-@dataclass(frozen=True, slots=True)
-class _Slice:
+class _Slice(Record, frozen=True):
     """The end of a slice of 20 ms."""
 
     progress: Progress  # its measurement, without the traits of the voice

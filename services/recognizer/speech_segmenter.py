@@ -9,7 +9,6 @@ processes whole positions, in order.
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -23,6 +22,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperM
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.voice_traits import VoiceTraits, load_voice_readout
 from kouxing.shared.phones.events import LipPositions
+from kouxing.shared.records import Record
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
 _DETECTION_S = 0.06  # the ear's look-ahead, and a position
@@ -34,30 +34,26 @@ _PRE_ROLL_FRAMES = round((PRE_ROLL_S + _DETECTION_S) / HOP_S)
 _MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_POSITION
 
 
-@dataclass(frozen=True, slots=True)
-class SpeechStart:
+class SpeechStart(Record, frozen=True):
     """Speech starts. Its first frame is ``frame``."""
 
     frame: int
 
 
-@dataclass(frozen=True, slots=True)
-class SpeechEnd:
+class SpeechEnd(Record, frozen=True):
     """Speech has ended before ``frame``."""
 
     frame: int
 
 
-@dataclass(frozen=True, slots=True)
-class SpeechFrames:
+class SpeechFrames(Record, frozen=True):
     """The next frames of speech; they end with a position."""
 
     features: Floats  # (n, k), of the front end
     phones: Floats  # (n, phones), the ear's log posteriors after each frame
 
 
-@dataclass(frozen=True, slots=True)
-class Position:
+class Position(Record, frozen=True):
     """The input of the small ear at a position, and the front end's features."""
 
     features: Floats  # (2, k)

@@ -8,8 +8,6 @@ them without loss.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.pcm import SliceMeter
@@ -28,6 +26,7 @@ from kouxing.shared.phones.events import (
     SpeechChange,
     Waveform,
 )
+from kouxing.shared.records import replace
 
 MAX_JITTER = MEDIA_RATE_HZ // 10  # media time that jumps further ahead leaves a gap; samples
 SILENT_DB = -120.0  # the level after the last sample

@@ -79,30 +79,39 @@ class VoiceTraitsStream:
     def __init__(self, readout: VoiceReadout) -> None:
         self.newest = VoiceTraits()
         self._readout = readout
-        self._feeling = self._mean = readout.mean.astype(np.float64)
+        self._feeling: list[float] = readout.mean.tolist()
+        self._mean = self._feeling
         self._num_voiced = 0  # positions with a voice
-        self._evidence = np.zeros(NUM_TRAITS - 2)  # evidence of laughter and of breath
+        self._evidence = [0.0] * (NUM_TRAITS - 2)  # evidence of laughter and of breath
 
     def accept_position(self, position: EarPosition) -> None:
         """Take the next position of the ear."""
-        outputs = position.state @ self._readout.weights + self._readout.bias
+        # Few numbers: lists take less time than arrays.
+        outputs: list[float] = (
+            position.state @ self._readout.weights + self._readout.bias
+        ).tolist()
         if position.voice[Voice.SPEECH] + position.voice[Voice.SUNG] > MIN_VOICE:
             self._num_voiced += 1
             feeling = outputs[_FEELING]
             num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)
-            self._mean = self._mean + (feeling - self._mean) / num_known
+            self._mean = [m + (f - m) / num_known for m, f in zip(self._mean, feeling, strict=True)]
             share = 1.0 / min(self._num_voiced + _PRIOR_FEELING, _MEAN_POSITIONS)
-            self._feeling = self._feeling + share * (feeling - self._feeling)
-        self._evidence += _EVIDENCE_SHARE * (outputs[2:] - self._evidence)
-        relative: list[float] = (self._feeling - self._mean).tolist()
-        arousal, valence = (min(max(value, -1.0), 1.0) for value in relative)
+            self._feeling = [
+                old + share * (new - old) for old, new in zip(self._feeling, feeling, strict=True)
+            ]
+        self._evidence = [
+            old + _EVIDENCE_SHARE * (new - old)
+            for old, new in zip(self._evidence, outputs[2:], strict=True)
+        ]
+        arousal, valence = (
+            round(min(max(value - mean, -1.0), 1.0), _DIGITS)
+            for value, mean in zip(self._feeling, self._mean, strict=True)
+        )
         laughter, breath = (
-            bool(evidence > (_STOP if was_on else _START))
+            evidence > (_STOP if was_on else _START)
             for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
         )
-        self.newest = VoiceTraits(
-            round(arousal, _DIGITS), round(valence, _DIGITS), laughter, breath
-        )
+        self.newest = VoiceTraits(arousal, valence, laughter, breath)
 
 
 @cache

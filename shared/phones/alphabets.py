@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from enum import StrEnum
 from functools import cache
 from itertools import chain
@@ -13,6 +12,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable, load_inventory
 from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone
+from kouxing.shared.records import replace
 
 if TYPE_CHECKING:  # it needs NumPy, which commands import only if they need it
     from kouxing.shared.phones.events import Phone

@@ -3,16 +3,14 @@
 Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.phones.inventory import SILENCE
+from kouxing.shared.records import Record
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Phone:
+class Phone(Record, frozen=True, kw_only=True):
     """One recognized phone.
 
     A live recognizer emits the same ``index`` at least twice: first with an estimated duration
@@ -38,8 +36,7 @@ class Phone:
         return self.final and self.duration_s > 0.0 and self.symbol != SILENCE
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LipPositions:
+class LipPositions(Record, frozen=True, kw_only=True):
     """The mouth as predicted from the audio."""
 
     time_s: float  # seconds from the session's first sample
@@ -49,16 +46,14 @@ class LipPositions:
     lip_to_teeth: float  # probability that the lower lip touches the teeth, 0 to 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpeechChange:
+class SpeechChange(Record, frozen=True, kw_only=True):
     """Voice activity started or ended."""
 
     active: bool
     time_s: float  # seconds from the session's first sample
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
+class Progress(Record, frozen=True, kw_only=True):
     """Audio is processed up to ``time_s``; no later phone ends before that."""
 
     time_s: float
@@ -71,22 +66,19 @@ class Progress:
     is_breath: bool = False  # audible breath, for example before speech
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AudioSkipped:
+class AudioSkipped(Record, frozen=True, kw_only=True):
     """The recognizer was too slow and skipped the audio before ``time_s``."""
 
     time_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EndOfSound:
+class EndOfSound(Record, frozen=True, kw_only=True):
     """The audio has ended."""
 
     time_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Waveform:
+class Waveform(Record, frozen=True, kw_only=True):
     """A stretch of the session's audio as the recognizer processes it."""
 
     time_s: float  # time of the first sample

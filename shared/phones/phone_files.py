@@ -8,12 +8,12 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
 from typing import TypeAlias
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.transcript import TimedSyllable
+from kouxing.shared.records import replace
 
 _COLUMNS = ("index", "phone", "onset_s", "duration_s", "confidence")
 
@@ -64,8 +64,12 @@ def _json(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyll
     content: dict[str, object] = {"total_s": round(total_s, 4), "phones": rows}
     if syllables:
         content["syllables"] = [
-            asdict(syllable)
-            | {"onset_s": round(syllable.onset_s, 4), "duration_s": round(syllable.duration_s, 4)}
+            {
+                "text": syllable.text,
+                "spelling": syllable.spelling,
+                "onset_s": round(syllable.onset_s, 4),
+                "duration_s": round(syllable.duration_s, 4),
+            }
             for syllable in syllables
         ]
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from kouxing.shared.records import Record
+
 
 @dataclass(frozen=True, slots=True)
 class SpokenSyllable:
@@ -25,8 +27,7 @@ class Transcript:
         return [syllable.phones for syllable in self.syllables]
 
 
-@dataclass(frozen=True, slots=True)
-class TimedSyllable:
+class TimedSyllable(Record, frozen=True):
     """A syllable of a text and when it is spoken."""
 
     text: str

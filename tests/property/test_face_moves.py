@@ -1,7 +1,6 @@
 """Replacing the recognizer or synthesizer during speech is not visible."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -17,6 +16,7 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange, Waveform
+from kouxing.shared.records import replace
 from tests.live_streams import recognize_live
 from tests.system import DEMO
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FA
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.records import replace
 from tests import lips
 from tests.lips import INVENTORY, LIPS, advance, make_face
 

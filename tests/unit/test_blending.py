@@ -1,6 +1,5 @@
 """Dominance, blending, full model, parameters: Li et al. 2011, eq. 5-11; Wang and Cai, eq. 6-7."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -14,6 +13,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_tim
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.records import replace
 from tests.lips import INVENTORY, phone
 
 PARAMETERS = initial_parameters()  # independent of training
@@ -49,7 +49,7 @@ def test_two_visemes_match_a_manual_calculation() -> None:
     # the time is after the first apex and before the second apex
     assert (np.abs(p.offset_s[[first, second]]) < 0.05).all()
     want = (d_second * p.target[second] + d_first * p.target[first]) / (d_second + d_first)
-    alone = dataclasses.replace(timeline, silence_start_s=np.zeros(0), silence_end_s=np.zeros(0))
+    alone = replace(timeline, silence_start_s=np.zeros(0), silence_end_s=np.zeros(0))
     np.testing.assert_allclose(blend(p, alone, np.array([time_s]))[0], want)
 
 

@@ -1,7 +1,6 @@
 """Live Ferguson lips: phone shapes at the times of the sound, without jumps."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.records import replace
 from tests.lips import phone
 from tests.system import DEMO
 

@@ -1,7 +1,6 @@
 """Learnt lips follow lip frames smoothly, close for closures, and rest."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from kouxing.services.synthesizer.lips.learnt.rest import CLOSE_S, HOLD_S
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange
+from kouxing.shared.records import replace
 from tests import lips
 from tests.lips import LIPS
 

@@ -67,6 +67,7 @@ from kouxing.services.recognizer.acoustic.network import (
     run_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
+from kouxing.shared.records import Record
 
 FORMAT = "blocks 2"
 
@@ -158,8 +159,7 @@ class NetworkState:
     num_cached: int = 0  # positions in the rings
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
+class Block(Record, frozen=True):
     """A block of one session with its right context, to be computed."""
 
     frames: Floats  # (2 positions + 3, 80), from two before the first position's

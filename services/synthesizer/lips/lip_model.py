@@ -5,13 +5,13 @@ model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_M
 ``services.lip_models``.
 """
 
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.phones.events import SoundEvent
+from kouxing.shared.records import Record
 
 
 class Articulation(Protocol):
@@ -25,8 +25,7 @@ class Articulation(Protocol):
         """Return the usual level of the speech at a time, relative to the speaker's mean."""
 
 
-@dataclass(frozen=True, slots=True)
-class MouthFrame:
+class MouthFrame(Record, frozen=True):
     """The mouth at one time."""
 
     faps: NDArray[np.float64]  # (num_mouth_faps,) FAP units, in the order of MOUTH_FAPS

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
+from kouxing.shared.records import Record
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class FapState:
+class FapState(Record, frozen=True):
     """Value and velocity of FAPs at one time."""
 
     value: Array  # FAP units

@@ -1,17 +1,16 @@
 """The interface of modifiers, which change a FAP frame after the lip model has set the mouth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import Articulation
+from kouxing.shared.records import Record
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameContext:
+class FrameContext(Record, frozen=True, kw_only=True):
     """Information about a frame that modifiers use."""
 
     time_s: float  # media time of the frame

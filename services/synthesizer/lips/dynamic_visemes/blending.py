@@ -8,8 +8,6 @@ selects. A softmax over log weights replaces the quotient, because the silences'
 overflow.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +21,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 from kouxing.services.synthesizer.lips.trajectory import FapState
+from kouxing.shared.records import Record
 
 _STEP_S = 1e-3  # step of the numerical derivative
 
@@ -126,8 +125,7 @@ def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray
     return active
 
 
-@dataclass(frozen=True, slots=True)
-class TargetTrajectory:
+class TargetTrajectory(Record, frozen=True):
     """The trajectory of the mouth FAPs for a timeline."""
 
     parameters: VisemeParameters

@@ -46,6 +46,7 @@ from kouxing.services.synthesizer.lips.trajectory import (
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.records import Record
 
 _REST_S = 0.3  # duration of the way to rest without sound
 _TRANSITION_S = 0.04  # duration of the change to a new target trajectory
@@ -73,8 +74,7 @@ class DynamicVisemes:
         return VisemeStream(self, start_s, frame_rate_hz=frame_rate_hz, delay_s=delay_s)
 
 
-@dataclass(frozen=True, slots=True)
-class VisemeArticulation:
+class VisemeArticulation(Record, frozen=True):
     """The articulation of a timeline of visemes; implements ``Articulation``."""
 
     timeline: Timeline

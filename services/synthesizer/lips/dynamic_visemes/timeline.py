@@ -13,7 +13,6 @@ vowels. The mouth thus starts in time for a phone that will be recognized late.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.records import Record, replace
 
 EXPECTED = -1
 MAX_HOLD_S = 1.5  # a phone lasts up to this long beyond its estimate if nothing follows
@@ -39,8 +39,7 @@ _MAX_ERROR_S = 0.3  # an estimated end may be too early by this time
 _EXPECTED_EDGE_S = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class OpenPhone:
+class OpenPhone(Record, frozen=True):
     """The last phone, if its successor is unknown.
 
     The last two visemes of the timeline are this phone's last viseme and the expected viseme. The
@@ -51,8 +50,7 @@ class OpenPhone:
     is_held: bool  # its last viseme is one of a vowel, which may be held
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Timeline:
+class Timeline(Record, frozen=True, kw_only=True):
     """Visemes in order of time, and the silences before, between and after words."""
 
     viseme: NDArray[np.intp]  # (num_visemes,) rows of VisemeParameters

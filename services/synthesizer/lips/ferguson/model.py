@@ -15,7 +15,7 @@ last known phone is followed by an average phone in the same way. When segments 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -43,6 +43,7 @@ from kouxing.services.synthesizer.lips.trajectory import (
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.records import replace
 
 Array = NDArray[np.float64]
 
