@@ -25,9 +25,9 @@ from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
 from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.services.synthesizer.modifiers.feeling import FeelingMotion
-from kouxing.services.synthesizer.modifiers.idle_motion import Behavior, SpeechIdleMotion
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
 from kouxing.services.synthesizer.modifiers.nonverbal import NonverbalSounds
+from kouxing.services.synthesizer.modifiers.speech_motion import Behavior, SpeechMotion
 from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
@@ -97,7 +97,7 @@ class FaceAnimator:
         self._expressiveness = Expressiveness(expressiveness)
         self._expression = SpeechExpression()
         self._feeling = FeelingMotion(feeling)
-        self._idle_motion = SpeechIdleMotion(idle_motion_seed) if idle_motion_seed else None
+        self._idle_motion = SpeechMotion(idle_motion_seed) if idle_motion_seed else None
         self._num_frames = 0  # including frames at rest
         self._first_shown = 0  # earlier frames are rehearsals
         self._goal: Faps | None = None  # the last frame without its transition

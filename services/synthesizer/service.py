@@ -24,7 +24,7 @@ from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Fra
 from kouxing.services.synthesizer.kind import KIND
 from kouxing.services.synthesizer.lateness import IN_TIME
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.modifiers.idle_motion import Behavior
+from kouxing.services.synthesizer.modifiers.speech_motion import Behavior
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds

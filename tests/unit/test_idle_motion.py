@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator
-from kouxing.services.synthesizer.modifiers.idle_motion import Behavior
+from kouxing.services.synthesizer.modifiers.speech_motion import Behavior
 from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
 from kouxing.shared.phones.events import Progress, SpeechChange
 from tests.lips import make_face

@@ -71,7 +71,7 @@ class Behavior:
     listening: bool | None = None  # someone else speaks
 
 
-class SpeechIdleMotion:
+class SpeechMotion:
     """Idle motion with movements that accompany speech; seed and sound define the motion."""
 
     def __init__(self, seed: int) -> None:
