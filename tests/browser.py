@@ -33,6 +33,13 @@ class Browser(Chromium):
         self.command("Page.navigate", url=address)
         self.wait_for(READY)
 
+    def restart(self, address: str) -> None:
+        """Load a page of another origin, without the complaints of the page before."""
+        self.command("Page.navigate", url="about:blank")
+        self.wait_for("location.href === 'about:blank'")
+        self.complaints.clear()
+        self.command("Page.navigate", url=address)
+
     def steady_image(self) -> NDArray[np.uint8]:
         """Return the canvas once it no longer changes: every fade and redrawing is over."""
         images = [self.image()]

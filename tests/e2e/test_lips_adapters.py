@@ -49,9 +49,11 @@ window.isReady = true;
 </script>"""
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    browser = Browser(tmp_path / "profile", DEMO / "hello-female.wav", size_px=SIZE_PX)
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    browser = Browser(
+        tmp_path_factory.mktemp("profile"), DEMO / "hello-female.wav", size_px=SIZE_PX
+    )
     yield browser
     browser.close()
 
@@ -77,7 +79,7 @@ def recipe(word: str) -> str:
 def run(browser: Browser, site: Path, body: str, done: str) -> None:
     (site / "index.html").write_text(PAGE.replace("BODY", body), encoding="utf-8")
     with serve_folder(site) as origin:
-        browser.command("Page.navigate", url=f"{origin}/")
+        browser.restart(f"{origin}/")
         browser.wait_for("window.isReady")
         browser.click("start")
         browser.wait_for(done)

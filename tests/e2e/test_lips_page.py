@@ -14,7 +14,7 @@ from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, fr
 from tests.process.test_lips_package import package_faps, read
 from tests.system import DEMO, NODE
 
-SIZE_PX = (420, 700)
+SIZE_PX = (320, 480)  # heads are drawn without a GPU
 FACE = "document.getElementById('face')"
 
 
@@ -25,15 +25,17 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    browser = Browser(tmp_path, DEMO / "hello-female.wav", size_px=SIZE_PX)
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    browser = Browser(
+        tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav", size_px=SIZE_PX
+    )
     yield browser
     browser.close()
 
 
 def open_demo(browser: Browser, origin: str) -> None:
-    browser.command("Page.navigate", url=f"{origin}/")
+    browser.restart(f"{origin}/")
     browser.wait_for(f"{FACE}?.set != null")
     browser.evaluate(f"{FACE}.lips.then((lips) => {{ window.lips = lips; return 1; }})")
     browser.evaluate(
@@ -96,7 +98,6 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
     faces = "[...document.querySelectorAll('kouxing-face')]"
     with serve_folder(site) as origin:
         open_demo(browser, origin)
-        browser.resize(320, 480)  # three heads that are drawn without a GPU
         browser.click("compare")
         browser.wait_for(f"{faces}.length === 3 && {faces}.every(({{ set }}) => set === 'faps')")
         browser.evaluate(
@@ -111,15 +112,19 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
     assert not [text for text in browser.complaints if "GL Driver" not in text]
 
 
-def test_sound_before_a_click_gives_a_notice(browser: Browser, site: Path) -> None:
+def test_each_problem_gives_a_sentence(browser: Browser, site: Path) -> None:
+    def wait_for_note(text: str) -> None:
+        browser.wait_for(f"{NOTE}.includes('{text}')")
+
     with serve_folder(site) as origin:
         open_demo(browser, origin)
         check_sound_waits_for_a_click(browser)
-
-
-def test_a_blocked_microphone_gives_a_sentence(browser: Browser, site: Path) -> None:
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+        browser.evaluate(
+            "const drop = new Event('drop', { bubbles: true });"
+            "drop.dataTransfer = { files: [new File(['text'], 'speech.txt')] };"
+            "document.body.dispatchEvent(drop); 1"
+        )
+        wait_for_note("the browser cannot read this file")
         for error, text in (
             ("NotAllowedError", "the microphone is blocked; allow it"),
             ("NotFoundError", "no microphone was found"),
@@ -129,17 +134,12 @@ def test_a_blocked_microphone_gives_a_sentence(browser: Browser, site: Path) -> 
                 f" () => Promise.reject(new DOMException('', '{error}')); 1"
             )
             browser.click("microphone")
-            browser.wait_for(f"{NOTE}.startsWith('{text}')")
-
-
-def test_a_page_without_https_has_no_microphone(browser: Browser, site: Path) -> None:
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+            wait_for_note(text)
         browser.evaluate(
             "Object.defineProperty(navigator, 'mediaDevices', { value: undefined }); 1"
         )
         browser.click("microphone")
-        browser.wait_for(f"{NOTE}.includes('open it by https')")
+        wait_for_note("open it by https")
 
 
 def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) -> None:
@@ -180,14 +180,3 @@ def test_a_source_that_another_one_replaces_is_reported(browser: Browser, site: 
             ".then((all) => all.map(({ status, reason }) => reason?.name ?? status))"
         )
         assert result == ["AbortError", "fulfilled"]
-
-
-def test_wrong_files_give_a_sentence(browser: Browser, site: Path) -> None:
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
-        browser.evaluate(
-            "const drop = new Event('drop', { bubbles: true });"
-            "drop.dataTransfer = { files: [new File(['text'], 'speech.txt')] };"
-            "document.body.dispatchEvent(drop); 1"
-        )
-        browser.wait_for(f"{NOTE}.startsWith('the browser cannot read this file')")

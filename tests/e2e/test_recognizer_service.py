@@ -1,6 +1,7 @@
 """The recognizer's loop with real sockets: how much it does at a time."""
 
 import threading
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -43,6 +44,10 @@ class Recognizer(RecognizerService):
         self.media_times: list[int] = [0]
         self.warned: list[tuple[str, str]] = []
         self.started: list[str] = []
+        self.events: list[tuple[str, ...]] = []
+
+    def publish_event(self, name: str, session: str, detail: str = "", **_: object) -> None:
+        self.events.append((name, session, detail))
 
     def warn(self, reason: str, text: str, session: str = "") -> None:
         self.warned.append((reason, text))
@@ -119,6 +124,27 @@ def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
         assert other.next_media_time == 8000 * num_long
         assert other.num_gaps == 0  # no audio was dropped
     assert not service.warned
+
+
+def test_skips_audio_that_arrived_while_the_process_was_stopped(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(service, "resync_with_control", lambda: None)  # which does not answer
+    service.start_session(replace(UNPACED, paced=True))
+    for number in range(150):  # of 20 ms
+        now_s += 0.02
+        service.receive(chunk(number, 320))
+        service.decode_all()
+    now_s += 2.0
+    for number in range(150, 250):
+        service.receive(chunk(number, 320))
+    service.decode_all()
+    service.on_tick(now_s)
+    assert service._sessions["s"].stream.next_media_time == 320 * 250
+    assert service.events == [("audio-skipped", "s", "1.98 s")]
+    assert service.session_inputs()["s"].skipped_s == pytest.approx(1.98)
 
 
 def test_other_sessions_continue_while_a_model_is_loaded(

@@ -34,6 +34,7 @@ from tests.process.web_clients import (
     receive_of_session,
     until,
 )
+from tests.raw_bytes import pour
 from tests.samples import fap_frame
 from tests.system import LIMIT_S, Gateway, free_port, port_of
 
@@ -313,6 +314,31 @@ async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway:
     async with connected(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)
         assert (await receive_json(microphone, "error"))["text"] == "start one"
+
+
+MALFORMED: list[str | bytes] = [
+    "", "{", "null", "[]", "5", '"x"', '{"type": "x"}', '{"a":' * 1000, "\0", "人" * 1000,
+    '{"sample_rate_hz": "x"}', '{"encoding": []}', '{"session": {}}', '{"lips": 1}',
+    '{"flush": "x"}', '{"express": {"joy": NaN}}', '{"mouth_profile": "%%"}', '{"eof": 1}',
+    b"", b"\0", b"\xff" * 7, bytes(20_000), b"RIFF" + bytes(60),
+]  # fmt: skip
+
+
+@async_test
+async def test_malformed_messages_do_not_disturb_other_clients(
+    control: FakeControl, gateway: Gateway
+) -> None:
+    pour(port_of(gateway.page), 0.5)
+    for path in ("viewer", "microphone"):
+        for malformed in MALFORMED:
+            async with connected(gateway.page, path) as (client,):
+                send = client.send_str if isinstance(malformed, str) else client.send_bytes
+                await send(malformed)  # type: ignore[arg-type]
+    async with connected(gateway.page, "microphone") as (microphone,):
+        await microphone.send_json({"sample_rate_hz": 16000})
+        await receive_json(microphone, "opened")
+        await microphone.send_bytes(bytes(640))
+        await until(lambda: control.audio_messages)
 
 
 @async_test

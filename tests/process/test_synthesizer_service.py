@@ -38,6 +38,11 @@ class RecordingSynthesizer(SynthesizerService):
         header: dict[str, Any] = {"session": session, "epoch": 1, "sequence": sequence}
         self._on_input(Progress(**header, media_time=to_samples(time_s), level_db=-60.0), Peer())
 
+    def report(self, session: str, sequence: int, state: AudioState, media_time: int = 0) -> None:
+        """Receive the recognizer's report about a client's audio."""
+        header: dict[str, Any] = {"session": session, "epoch": 1, "sequence": sequence}
+        self._on_input(Progress(**header, media_time=media_time, state=state), Peer())
+
     def frames(self, session: str) -> list[FapFrame]:
         """Return the frames of a session so far."""
         return [m for m in self.sent if isinstance(m, FapFrame) and m.session == session]
@@ -73,8 +78,7 @@ def test_a_gap_does_not_delay_other_sessions(service: RecordingSynthesizer) -> N
     service.receive_progress("other", 1, 0.02 + SynthesizerConfig().delay_ms / 1e3)
     assert len(service.frames("other")) == 2
     service.receive_progress("gap", 2, 9.92)
-    end = Progress(session="gap", epoch=1, sequence=3, media_time=158_720, state=AudioState.ENDED)
-    service._on_input(end, Peer())
+    service.report("gap", 3, AudioState.ENDED, 158_720)
     num_ticks = 0
     while not any(isinstance(message, EndOfFaps) for message in service.sent):
         before = len(service.frames("gap"))
@@ -101,24 +105,56 @@ def test_rejects_messages_beyond_the_queue(service: RecordingSynthesizer) -> Non
     assert not service._sessions["gap"].queue
 
 
-def test_a_slow_synthesizer_skips_frames(
+def test_a_slow_synthesizer_skips_frames_and_reports_it(
     service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now_s = 0.0
+    now_s, events = 0.0, list[tuple[str, ...]]()
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
     service.receive_progress("gap", 1, 0.08)
     now_s = 10.0  # it was stopped
     for sequence in range(2, 150):
         service.receive_progress("gap", sequence, 0.1 * sequence)
     before = len(service.frames("gap"))
-    skip = Progress(
-        session="gap", epoch=1, sequence=150, media_time=320_000, state=AudioState.SKIPPED
-    )
-    service._on_input(skip, Peer())  # by the recognizer
+    service.report("gap", 150, AudioState.SKIPPED, 320_000)
     service.receive_progress("gap", 151, 20.0)
-    service.on_tick(now_s)
+    for _ in range(2):
+        service.on_tick(now_s)
     assert not service._sessions["gap"].queue
     first, newest = service.frames("gap")[before], service.frames("gap")[-1]
     newest_s = 20.0 - SynthesizerConfig().delay_ms / 1e3
     assert first.media_time == newest.media_time == to_samples(newest_s)
     assert service.session_inputs()["gap"].skipped_s == pytest.approx(14.7)
+    assert events == [("audio-skipped", "gap", "14.70 s")]
+
+
+def test_the_face_waits_for_a_slow_recognizer_and_rests_for_a_silent_client(
+    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+
+    def times_until(end_s: float) -> list[int]:
+        """Return the media times of the frames that are made until a time."""
+        nonlocal now_s
+        num_before = len(service.frames("gap"))
+        while now_s < end_s:
+            now_s += 0.04
+            service.on_tick(now_s)
+        return [frame.media_time for frame in service.frames("gap")[num_before:]]
+
+    service.receive_progress("gap", 1, 1.0)
+    (*_, newest) = times_until(1.0)
+    assert times_until(10.0) == []
+    service.report("gap", 2, AudioState.STALLED)
+    at_rest = times_until(11.0)
+    assert {*at_rest} == {newest}
+    assert len(at_rest) == pytest.approx(RATE_HZ, abs=2)
+    service.report("gap", 3, AudioState.RESUMED)
+    assert times_until(20.0) == []
+    service.receive_progress("gap", 4, 1.1)
+    times_until(20.1)
+    frames = service.frames("gap")
+    assert [frame.sequence for frame in frames] == [*range(1, len(frames) + 1)]
+    last = to_samples(1.1 - SynthesizerConfig().delay_ms / 1e3)
+    assert sorted({frame.media_time for frame in frames}) == [*range(0, last + 1, 320)]
