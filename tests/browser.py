@@ -2,7 +2,6 @@
 
 import base64
 import io
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from kouxing.evaluation.system.chromium import Chromium
 from tests.system import wait_until
 
 SIZE_PX = (480, 360)
+IS_CURRENT = "window.kouxing?.state.drawing?.isCurrent ?? true"
 READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
 
 
@@ -40,15 +40,23 @@ class Browser(Chromium):
         self.complaints.clear()
         self.command("Page.navigate", url=address)
 
+    def keep_resolution(self) -> None:
+        """Let the gateway's page draw all further images with the same number of pixels."""
+        self.evaluate(
+            "import('/draw-rate.js').then(({ DrawRate: { prototype } }) => {"
+            " const { recordDrawn } = prototype;"
+            " prototype.recordDrawn = function (...times) {"
+            "   recordDrawn.apply(this, times); this.ratio = 0.5; }; })"
+        )
+
     def steady_image(self) -> NDArray[np.uint8]:
-        """Return the canvas once it no longer changes: every fade and redrawing is over."""
+        """Return the canvas of the gateway's page once every fade and redrawing is over."""
         images = [self.image()]
 
         def is_steady() -> bool:
-            picture_ms = self.evaluate("window.kouxing?.state.drawing?.pictureMs ?? 0")
-            time.sleep(0.05 + 3 * picture_ms / 1000)  # a busy machine needs time for an image
+            self.wait_for(IS_CURRENT)
             images.append(self.image())
-            return np.array_equal(images[-1], images[-2])
+            return bool(self.evaluate(IS_CURRENT)) and np.array_equal(images[-1], images[-2])
 
         wait_until(is_steady)
         return images[-1]

@@ -25,7 +25,8 @@ def test_prints_and_writes_the_same_figures(
     latency = json.loads(figures.read_text(encoding="utf-8"))
     assert latency["num_frames"] > 50
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
-    assert latency["sound_to_frame_ms"]["p50"] > latency["delay_ms"]
+    assert latency["delay_ms"] == 60.0
+    assert latency["sound_to_frame_ms"]["p50"] > 0
     assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
     assert list(latency["sessions"]) == [
         f"{name}, 1{lips}" for name in ("blocks", "light") for lips in ("", " with lips")

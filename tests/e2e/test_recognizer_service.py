@@ -17,7 +17,7 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, replace
 from kouxing.shared.wire.session import SessionFacts
@@ -46,7 +46,9 @@ class Recognizer(RecognizerService):
         self.started: list[str] = []
         self.events: list[tuple[str, ...]] = []
 
-    def publish_event(self, name: str, session: str, detail: str = "", **_: object) -> None:
+    def publish_event(
+        self, name: EventName, session: str, detail: str = "", media_time: int = 0
+    ) -> None:
         self.events.append((name, session, detail))
 
     def warn(self, reason: str, text: str, session: str = "") -> None:

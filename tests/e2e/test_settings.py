@@ -116,8 +116,8 @@ async def _refused(page: str) -> tuple[dict[str, object], aiohttp.ClientResponse
 def test_control_closes_a_session_without_audio(system: System) -> None:
     with Client(system.control) as client:
         idle = client.open_session(encoding="f32le")
-        (event,) = (event for event in idle.events().available(60.0) if event.detail)
-        assert (event.name, "no audio" in event.detail) == ("session-closed", True)
+        event = next(event for event in idle.events() if event.name == "session-closed")
+        assert "no audio" in event.detail
         with pytest.raises(KouxingError, match=r"control has closed the session: .*no audio"):
             list(idle.frames())
 

@@ -135,14 +135,6 @@ def test_a_session_that_control_closes_ends(control: FakeControl, client: Client
         list(frames)
 
 
-def test_without_control_the_error_names_the_remedy() -> None:
-    with (
-        Client("tcp://127.0.0.1:9", insecure=True, timeout_s=0.2) as client,
-        pytest.raises(KouxingError, match="Start it with 'kouxing run'"),
-    ):
-        client.status()
-
-
 def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
     session = client.open_session("s")
     client.close()

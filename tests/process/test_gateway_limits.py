@@ -138,14 +138,12 @@ async def check_open(*readers: asyncio.StreamReader) -> None:
 
 
 async def pass_time(served: Served, ended: Awaitable[Any], timeout_s: float) -> None:
-    """Let time pass in steps until something has ended; it must end within a timeout."""
+    """Let time pass in steps until just after a timeout, and wait until something has ended."""
     waiting = asyncio.ensure_future(ended)
-    step_s = timeout_s / 10
-    end_s = served.now_s + timeout_s + 2 * step_s
-    while not waiting.done():
-        assert served.now_s < end_s
-        served.now_s += step_s
+    for _ in range(11):
+        served.now_s += timeout_s / 10
         await asyncio.wait([waiting], timeout=3 * CHECK_S)
+    await asyncio.wait_for(waiting, LIMIT_S)
 
 
 @async_test

@@ -177,6 +177,13 @@ def run_until(worker: Worker, condition: Callable[[], object]) -> None:
     wait_until(condition, step=lambda: worker.step(0.01))
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a service wait for a control that runs on a busy machine."""
+    monkeypatch.setattr("kouxing.shared.service.REPLY_TIMEOUT_S", LIMIT_S)
+
+
+@pytest.mark.usefixtures("patient")
 def test_resyncs_with_control_after_a_stall(control: FakeControl, worker: Worker) -> None:
     run_until(worker, lambda: control.heartbeats)
     with Bus() as bus:
@@ -188,6 +195,7 @@ def test_resyncs_with_control_after_a_stall(control: FakeControl, worker: Worker
     assert worker.happened[:2] == ["stop s0", "input"]
 
 
+@pytest.mark.usefixtures("patient")
 def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     control: FakeControl, worker: Worker, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,21 +3,19 @@
 from functools import cache
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
-from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
+from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import FrameScores
 from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.phones.events import Phone, Waveform
-from tests.live_streams import LiveStream
+from kouxing.shared.phones.events import Phone
 from tests.system import DEMO
 
 HELLO = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
@@ -37,42 +35,6 @@ def the_model(name: str = "blocks") -> AcousticModel:
 def last_phone_after(decoder: Decoder, row: np.ndarray) -> LastPhone:
     decoder.advance(row[None])
     return decoder.last_phone
-
-
-def recognize_chunks(chunks: list[np.ndarray], rate_hz: int) -> list[StreamOutput]:
-    stream = LiveStream(the_model(), sample_rate_hz=rate_hz)
-    outputs = [output for chunk in chunks for output in stream.feed(chunk)] + stream.finish()
-    return [output for output in outputs if not isinstance(output, Waveform)]
-
-
-@pytest.mark.slow
-@settings(max_examples=8)
-@given(cuts=CUTS, rate_hz=st.sampled_from([16_000, 44_100]))
-def test_chunks_do_not_affect_phones(cuts: list[int], rate_hz: int) -> None:
-    assert recognize_chunks(pieces(HELLO, cuts), rate_hz) == recognize_chunks([HELLO], rate_hz)
-
-
-@pytest.mark.slow
-@settings(max_examples=6)
-@given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 12))
-def test_other_sessions_do_not_affect_scores(seed: int, num_sessions: int) -> None:
-    model, rng = the_model(), np.random.default_rng(seed)
-    frames = model.create_front_end().accept_waveform(HELLO)
-    parts = [frames[start : start + 40] for start in rng.integers(0, 150, num_sessions)]
-    streams = [model.create_stream() for _ in parts]
-    scores: list[list[np.ndarray]] = [[] for _ in parts]
-    at = np.zeros(num_sessions, int)
-    while (at < 40).any():
-        ready = [number for number in np.flatnonzero(at < 40) if rng.random() < 0.9]
-        steps = rng.integers(1, 13, num_sessions)
-        work = [(streams[n], parts[n][at[n] : at[n] + steps[n]]) for n in ready]
-        at[ready] += steps[ready]
-        for number, rows in zip(ready, model.score(work), strict=True):
-            scores[number].append(rows)
-    for part, stream, rows_of in zip(parts, streams, scores, strict=True):
-        alone = model.create_stream()
-        whole = np.concatenate([alone.score(part), alone.score(None)])
-        np.testing.assert_array_equal(np.concatenate([*rows_of, stream.score(None)]), whole)
 
 
 @settings(max_examples=30)

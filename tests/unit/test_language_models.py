@@ -11,7 +11,6 @@ from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import limit_phones, model_of_language
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline import recognize
-from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import (
@@ -59,12 +58,6 @@ def test_limits_the_phones_of_a_model() -> None:
     limited = limit_phones(model, ("sil", "i", "u"))
     assert {phone.symbol for phone in recognize(limited, SAMPLES, 16_000)} <= {"sil", "i", "u"}
     assert "ao" in {phone.symbol for phone in recognize(model, SAMPLES, 16_000)}
-
-
-def test_a_recognizer_has_models_for_all_languages() -> None:
-    recognizer = Recognizer(load_model("gmm"))
-    assert recognizer.model_of(None) is recognizer.model_of("mandarin") is recognizer.model
-    assert recognizer.model_of("german") is model_of_language("german")
 
 
 def test_languages_have_codes_and_titles() -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from kouxing_client import errors as client_errors
-from kouxing_client import keys as client_keys
 
 from kouxing.corpora.commands import _read as read_speech
 from kouxing.corpora.lip_clips import read_clip
@@ -151,14 +149,6 @@ def test_a_spoken_text_is_limited(text: str) -> None:
 
 def test_a_long_word_of_pinyin_is_not_read() -> None:
     assert len(load_inventory().read("ni3hao3 " + "ni3hao3" * 1000).dropped) == 1
-
-
-def test_the_client_rejects_a_fifo_and_nested_keys(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "nested").write_text("[" * 100_000)
-    for name in ("fifo", "nested"):
-        with pytest.raises(client_errors.KouxingError, match="not a key file"):
-            client_keys.read_key(tmp_path / name)
 
 
 @pytest.mark.parametrize("place", ["fifo", "../a.mtl", "/dev/zero", "device"])

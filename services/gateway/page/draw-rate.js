@@ -111,9 +111,9 @@ export function drawsInSoftware(gl) {
 
 export class ImageQueue {
   numDrawn = 0;
+  isDrawing = false;
   #gl;
   #drawRate;
-  #isDrawing = false;
   #hiddenMs = -Infinity; // when the page was hidden last, or shown again
 
   /** @param gl a WebGL 2 context; @param {DrawRate} drawRate decides how often to draw */
@@ -128,7 +128,7 @@ export class ImageQueue {
    * instead of a queue of late ones that block the page.
    */
   isDue(nowMs) {
-    return !this.#isDrawing && this.#drawRate.isDue(nowMs);
+    return !this.isDrawing && this.#drawRate.isDue(nowMs);
   }
 
   /**
@@ -136,11 +136,11 @@ export class ImageQueue {
    * unless the page was hidden in the meantime.
    */
   draw(nowMs, render, onVisible = () => {}) {
-    this.#isDrawing = true;
+    this.isDrawing = true;
     const startMs = performance.now();
     render();
     this.#whenDone(() => {
-      this.#isDrawing = false;
+      this.isDrawing = false;
       this.numDrawn++;
       const doneMs = performance.now();
       this.#drawRate.recordDrawn(startMs, doneMs);

@@ -165,7 +165,7 @@ export class Head {
 
   /**
    * How it is drawn: { isCoarse: by the processor, width, height: pixels, numPictures: drawn since
-   * the start, pictureMs: duration of drawing }.
+   * the start, pictureMs: duration of drawing, isCurrent }. isCurrent is true if the newest face is drawn.
    */
   get drawing() {
     const { width, height } = this.#renderer.domElement;
@@ -175,6 +175,7 @@ export class Head {
       height,
       numPictures: this.#images.numDrawn,
       pictureMs: this.#drawRate.imageMs,
+      isCurrent: !this.#needsDrawing && !this.#images.isDrawing,
     };
   }
 
