@@ -313,6 +313,12 @@ def schemes(
     videos: Annotated[
         Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; skips existing files.")
     ] = None,
+    from_csv: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder with CLIP.csv: also write videos of another program's curves; repeatable."
+        ),
+    ] = None,
     anchor: Annotated[
         bool, typer.Option("--anchor", help="Also write videos with a mouth at rest.")
     ] = False,
@@ -341,8 +347,12 @@ def schemes(
         raise UserError("use either --manifest or --clips, not both")
     if (audio or split) and not manifest:
         raise UserError("--audio and --split apply to a corpus; add --manifest")
-    if (anchor or sound_at_once) and not videos:
-        raise UserError("--anchor and --sound-at-once apply to videos; add --videos FOLDER")
+    if (anchor or sound_at_once or from_csv) and not videos:
+        raise UserError(
+            "--anchor, --from-csv and --sound-at-once apply to videos; add --videos FOLDER"
+        )
+    if from_csv and not clips:
+        raise UserError("--from-csv applies to clips with tracked lips; add --clips")
     model = load_model()
     if manifest:
         chosen = sentences.corpus_sentences(model, manifest, split or "test", audio)
@@ -358,7 +368,9 @@ def schemes(
     write_json(json_file, asdict(outcome))
     if videos:
         options = {"has_anchor": anchor, "sound_at_once": sound_at_once}
-        written = write_videos(recognized, recognizers, names, videos, **options)
+        written = write_videos(
+            recognized, recognizers, names, videos, programs=from_csv or (), **options
+        )
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
         if any(sentence.aligned is None for sentence in recognized):
             print_message("no videos of scheme 1: some sentences have no text")

@@ -6,6 +6,7 @@ linear map, and the delay is 0.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ from kouxing.evaluation.lips.linear_map import fit_map
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
 
+Array = NDArray[np.float64]
 MouthOf = Callable[[LipClip], Mouth]
+FapsOf = Callable[[LipClip, Array], Array]  # of a clip at times (n,), seconds: FAPs (n, 68)
 
 _DELAYS_S = tuple(step / 50.0 for step in range(16))  # 0 to 0.3 s
 _TAIL_S = 0.5  # frames after the end of a clip's audio
@@ -39,25 +42,43 @@ def load_programs(
     return mouths
 
 
-def _mouths_of(
+def load_shipped(folder: Path, clips: Sequence[LipClip]) -> FapsOf:
+    """Load a program's curves as shipped, at the delay that agrees best with the given clips.
+
+    Raises UserError if a table is missing or cannot be used (see ``read_tables``).
+    """
+    faps_of, _ = _shipped(folder, read_tables(folder, clips, ()), clips)
+    return faps_of
+
+
+def _shipped(
     folder: Path, tables: Mapping[str, CurveTable], fitting: Sequence[LipClip]
-) -> dict[str, MouthOf]:
+) -> tuple[FapsOf, float]:
+    """Return the FAPs of a face, and its delay, seconds."""
     shipped = shipped_mouth(folder, [*tables.values()])
+
+    def faps(clip: LipClip, time_s: Array, delay_s: float) -> Array:
+        return shipped.faps(tables[clip.name].at(time_s + delay_s))
 
     reals = [real_mouth(clip.time_s, real_faps(clip)) for clip in fitting]
 
-    def as_shipped(clip: LipClip, delay_s: float) -> Mouth:
-        return made_mouth(shipped.faps(tables[clip.name].at(_frames_s(clip) + delay_s)))
-
     def agreement(delay_s: float) -> float:
         pairs = [
-            (as_shipped(clip, delay_s), real) for clip, real in zip(fitting, reals, strict=True)
+            (made_mouth(faps(clip, _frames_s(clip), delay_s)), real)
+            for clip, real in zip(fitting, reals, strict=True)
         ]
         return moments(pairs, "opening").correlation or 0.0
 
     delay_s = max(_DELAYS_S, key=agreement) if fitting else 0.0
+    return partial(faps, delay_s=delay_s), delay_s
+
+
+def _mouths_of(
+    folder: Path, tables: Mapping[str, CurveTable], fitting: Sequence[LipClip]
+) -> dict[str, MouthOf]:
+    faps_of, delay_s = _shipped(folder, tables, fitting)
     title = f"{folder.name}, {1e3 * delay_s:.0f} ms"
-    mouths: dict[str, MouthOf] = {title: lambda clip: as_shipped(clip, delay_s)}
+    mouths: dict[str, MouthOf] = {title: lambda clip: made_mouth(faps_of(clip, _frames_s(clip)))}
     if fitting:
         linear = fit_map(fitting, tables, _DELAYS_S[::2])
         title = f"{folder.name}, fitted, {1e3 * linear.delay_s:.0f} ms"
@@ -65,6 +86,6 @@ def _mouths_of(
     return mouths
 
 
-def _frames_s(clip: LipClip) -> NDArray[np.float64]:
+def _frames_s(clip: LipClip) -> Array:
     duration_s = max(float(clip.time_s[-1]), len(clip.samples) / SAMPLE_RATE_HZ)
     return np.arange(int((duration_s + _TAIL_S) * FRAME_RATE_HZ)) / FRAME_RATE_HZ

@@ -18,6 +18,7 @@ from kouxing.evaluation.lips.four_schemes import (
     all_conditions,
     make_frames,
 )
+from kouxing.evaluation.lips.other_programs import FapsOf, load_shipped
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
@@ -40,18 +41,26 @@ def write_videos(
     lips: Sequence[str],
     folder: Path,
     *,
+    programs: Sequence[Path] = (),
     has_anchor: bool = False,
     sound_at_once: bool = False,
 ) -> list[Path]:
     """Write ``CONDITION/SENTENCE.mp4`` for all conditions and sentences; keep existing videos.
 
     A condition that is not possible for every sentence is left out, because a listening test needs
-    all sentences in all conditions. ``has_anchor`` adds a condition ``anchor``, with a mouth at
-    rest. ``sound_at_once`` shows live frames when they are made, later than their sound. Raises
-    UserError if a file cannot be written.
+    all sentences in all conditions. ``programs`` are folders with curves of other programs, and
+    each is a condition, at its best delay for these sentences. ``has_anchor`` adds a condition
+    ``anchor``, with a mouth at rest. ``sound_at_once`` shows live frames when they are made, later
+    than their sound. All mouths have an expressiveness of 1, like the tracked one. Raises UserError
+    if a file cannot be written, or a program's table cannot be used.
     """
     conditions = _conditions(
-        recognized, recognizers, lips, has_anchor=has_anchor, sound_at_once=sound_at_once
+        recognized,
+        recognizers,
+        lips,
+        programs=programs,
+        has_anchor=has_anchor,
+        sound_at_once=sound_at_once,
     )
     missing = [
         (make, sentence, path)
@@ -81,6 +90,7 @@ def _conditions(
     recognizers: Sequence[TestedRecognizer],
     lips: Sequence[str],
     *,
+    programs: Sequence[Path],
     has_anchor: bool,
     sound_at_once: bool,
 ) -> Iterator[tuple[str, MakeFrames]]:
@@ -101,12 +111,16 @@ def _conditions(
     if has_anchor:
         yield "anchor", partial(_frames_with_mouth, conditions[0], _mouth_at_rest)
     clips = [sentence.sentence.clip for sentence in recognized]
+    for program in programs:
+        yield program.name, partial(_frames_with_mouth, conditions[0], load_shipped(program, clips))
     if all(len(clip.time_s) and clip.is_in_sync for clip in clips):
         yield "tracked", partial(_frames_with_mouth, conditions[0], tracked_frames)
 
 
 def _frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
-    frames = make_frames(condition, sentence, SynthesizerConfig(lips=condition.lips))
+    frames = make_frames(
+        condition, sentence, SynthesizerConfig(lips=condition.lips, expressiveness=1.0)
+    )
     assert frames is not None  # noqa: S101 - impossible conditions are left out
     return frames
 
@@ -118,7 +132,7 @@ def _late_frames(condition: Condition, sentence: RecognizedSentence) -> list[Fra
 
 def _frames_with_mouth(
     condition: Condition,
-    mouth_of: Callable[[LipClip, NDArray[np.float64]], NDArray[np.float64]],
+    mouth_of: FapsOf,
     sentence: RecognizedSentence,
 ) -> list[Frame]:
     """Replace the mouth of a condition's face; keep its blinks and head motion."""

@@ -10,8 +10,9 @@ from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.closures import closures
 from kouxing.evaluation.lips.curve_tables import read_table, read_tables, shipped_mouth
-from kouxing.evaluation.lips.mouths import real_faps, real_mouth
-from kouxing.evaluation.lips.other_programs import load_programs
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.evaluation.lips.mouths import made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.other_programs import load_programs, load_shipped
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 
@@ -62,6 +63,17 @@ def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
         assert correlation is not None
         assert correlation > 0.99
         assert closures(made, real).f1 == pytest.approx(1.0)
+
+
+def test_the_faps_of_a_program_are_at_its_best_delay(tmp_path: Path) -> None:
+    write_table(tmp_path / "held_1.csv", late_opening())
+    real = real_mouth(HELD.time_s, real_faps(HELD))
+    made = made_mouth(load_shipped(tmp_path, [HELD])(HELD, np.arange(430) / FRAME_RATE_HZ))
+    correlation = moments([(made, real)], "opening").correlation
+    assert correlation is not None
+    assert correlation > 0.99
+    with pytest.raises(UserError, match=r"add train_1\.csv"):
+        load_shipped(tmp_path, [HELD, TRAINING])
 
 
 def test_without_training_clips_the_curves_count_as_they_are(tmp_path: Path) -> None:

@@ -125,6 +125,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("head export heads --all --head ada", "leave out --head or --all"),
         ("keys add tablet", "tablet.key exists; add --force"),
         ("evaluate schemes --anchor", "add --videos FOLDER"),
+        ("evaluate schemes --from-csv . --videos .", "add --clips"),
         ("evaluate schemes --split dev", "add --manifest"),
         ("train phone-lm -o lm.npz --words 9", "--words applies to sampled words"),
     ],
