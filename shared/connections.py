@@ -225,12 +225,11 @@ class LimitedSocket:
 
     def accepted(self) -> Iterator[int]:
         """Yield the descriptors of new connections."""
-        with contextlib.suppress(zmq.Again):
-            while True:
-                data, _endpoint = self._monitor.recv_multipart(zmq.DONTWAIT)
-                event, descriptor = _EVENT.unpack(data)
-                if event == zmq.EVENT_ACCEPTED:
-                    yield descriptor
+        while int(self._monitor.get(zmq.EVENTS)) & zmq.POLLIN:
+            data, _endpoint = self._monitor.recv_multipart()
+            event, descriptor = _EVENT.unpack(data)
+            if event == zmq.EVENT_ACCEPTED:
+                yield descriptor
 
     def close(self) -> None:
         """Stop watching the socket."""

@@ -53,6 +53,7 @@ TICK_S = 0.01  # minimum time between ticks
 FOLLOW_UP_S = 0.03  # time between two ticks if a message arrived within ``TICK_S``
 HEARTBEAT_S = 0.25  # interval between heartbeats with sessions
 IDLE_HEARTBEAT_S = 1.0  # interval after a heartbeat without sessions
+SNAPSHOT_S = 1.0  # interval between computations of rates and percentiles for heartbeats
 SESSIONS_PER_HEARTBEAT = 16  # limit for a worker, so that a heartbeat's cost does not grow
 RESYNC_AFTER_S = 0.55  # delay of a heartbeat after which control may have moved the sessions
 REPLY_TIMEOUT_S = 0.5
@@ -98,6 +99,8 @@ class Service(MessageLoop):
         self._ticked_s = self._tick_due_s = 0.0
         self._heartbeat_due_s = time.monotonic()
         self._num_reported = 0  # sessions in earlier heartbeats
+        self._snapshot: dict[str, float] = {}  # of the metrics
+        self._snapshot_due_s = -math.inf
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
         self._reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S
         self._control_instance = ""
@@ -356,6 +359,9 @@ class Service(MessageLoop):
         parent_process.send_pulse(is_idle=not sessions)
         for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
             self.metrics.set(name, value)
+        if now_s >= self._snapshot_due_s:
+            self._snapshot_due_s = now_s + SNAPSHOT_S
+            self._snapshot = {**self.metrics.snapshot(now_s), "memory_mb": memory_mb()}
         self.deliver_heartbeat(
             Heartbeat(
                 service=self.name,
@@ -370,9 +376,9 @@ class Service(MessageLoop):
                 build=_BUILD,
                 load=load,
                 metrics={
-                    **self.metrics.snapshot(now_s),
+                    **self._snapshot,
+                    **self.metrics.values,
                     "cpu_s": time.process_time(),
-                    "memory_mb": memory_mb(),
                     "clock_offset_ms": -self.clock_offset.offset_ms,
                 },
                 sessions=sessions if all_sessions else self._next_sessions(sessions),

@@ -247,9 +247,12 @@ class GatewayService(Service):
 
     def on_tick(self, now_s: float) -> float:
         """Follow sessions, move the face at rest, and request the status of the services."""
-        for name in self._needed_sessions() & self._sessions.keys():
-            if not self._sessions[name].follower.is_following:
-                self._sessions[name].follower.follow()
+        followers = [session.follower for session in self._sessions.values()]
+        if not all(follower.is_following for follower in followers):
+            needed = self._needed_sessions()
+            for follower in followers:
+                if follower.session in needed and not follower.is_following:
+                    follower.follow()
         rest_due_s = max(self._rest_due_s, self._viewers.rest_from_s)
         if now_s >= rest_due_s:
             self._rest_due_s = rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)

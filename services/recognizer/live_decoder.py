@@ -121,21 +121,30 @@ class LiveDecoder:
     def _search(self, scores: Floats) -> list[Phone]:
         """Continue the search; the output rule gets the frames that it has not had."""
         num_checked = max(0, self._num_checked - self._decoder.num_frames)
-        confidence = [self._decoder.advance(scores[:num_checked])]
+        confidence = [self._decoder.advance(scores[:num_checked])] if num_checked else []
         out: list[Phone] = []
-        for frame in range(num_checked, len(scores)):
-            confidence.append(self._decoder.advance(scores[frame : frame + 1]))
-            out += self._emit_phone()
+        scores = scores[num_checked:]
+        while len(scores):
+            phones, newest = self._decoder.advance_until(
+                scores, self._rule.last_emitted, self._rule.min_confidence
+            )
+            confidence.append(newest)
+            scores = scores[len(phones) :]
+            self._num_checked = self._decoder.num_frames
+            # Only the last of these frames may emit a phone.
+            emits = [
+                self._rule.update(*frame)
+                for frame in zip(phones.tolist(), newest.tolist(), strict=True)
+            ]
+            if emits[-1]:
+                out += self._emit_phone()
         if self._decoder is self._settled:
             self._confidence = np.concatenate([self._confidence, *confidence])
         return out
 
     def _emit_phone(self) -> list[Phone]:
-        """Return the last phone and corrections, if the output rule emits it at this frame."""
-        self._num_checked = self._decoder.num_frames
+        """Return the last phone and corrections."""
         phone, start, confidence = self._decoder.last_phone
-        if not self._rule.update(phone, confidence):
-            return []
         revised = self._revise(self._decoder.path_since(self._done), num_following=1)
         before = self._index_of(self._open[-1]) if self._open else self._last_final
         position = FIRST if before == self._silence else INSIDE

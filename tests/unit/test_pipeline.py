@@ -33,5 +33,6 @@ def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
     Recognizer(load_model()).warm_up()
     assert decoder._steps.signatures
-    assert decoder._paths_through.signatures
+    assert decoder._count_paths.signatures
+    assert decoder._compact.signatures
     assert hello_phones() == expected

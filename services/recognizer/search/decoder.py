@@ -24,6 +24,7 @@ memory stays bounded in endless speech. Phones in that part are final (``shared_
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -129,7 +130,16 @@ class Decoder:
 
         Returns the confidence in the last phone after each frame, (frames,).
         """
-        confidence = np.empty(len(scores))
+        return self.advance_until(scores, 0, math.inf)[1]
+
+    def advance_until(
+        self, scores: NDArray[np.float32], known_phone: int, min_confidence: float
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Search the next frames until another phone than a known one is confidently the last.
+
+        Returns the last phone and the confidence in it after each frame, (frames,) each.
+        """
+        phones, confidence = np.empty(len(scores), dtype=np.int32), np.empty(len(scores))
         num_advanced = 0
         while num_advanced < len(scores):
             if self._num_records + _MAX_TOKENS > len(self._records):
@@ -137,7 +147,10 @@ class Decoder:
             num_done, self._num_tokens, self._num_records, token, state = _steps(
                 self.num_frames,
                 scores[num_advanced:],
+                phones[num_advanced:],
                 confidence[num_advanced:],
+                known_phone,
+                min_confidence,
                 self._num_tokens,
                 self._tokens,
                 _token_table(len(self._graph.last_phone)),
@@ -149,9 +162,11 @@ class Decoder:
             self._best = (token, state)
             self.num_frames += num_done
             num_advanced += num_done
-        if num_advanced:
-            self._confidence = float(confidence[-1])
-        return confidence
+            newest = num_advanced - 1
+            self._confidence = float(confidence[newest])
+            if phones[newest] != known_phone and confidence[newest] >= min_confidence:
+                break
+        return phones[:num_advanced], confidence[:num_advanced]
 
     @property
     def last_phone(self) -> LastPhone:
@@ -196,23 +211,17 @@ class Decoder:
 
     def drop_records(self) -> None:
         """Store the phones that all paths share, and drop records that no path needs."""
-        live = self._tokens.score[: self._num_tokens] > _IMPOSSIBLE
-        links = self._tokens.link[: self._num_tokens][live]
-        paths = _paths_through(links, self._records[: self._num_records, 2])
-        shared = int(np.flatnonzero(paths == len(links)).max(initial=_NO_RECORD))
+        paths = np.zeros(self._num_records, dtype=np.int32)
+        shared = _count_paths(self._num_tokens, self._tokens, self._records, paths)
         self._shared += self._trace(shared)
-        kept = np.flatnonzero(paths)
-        kept = kept[kept >= shared]
-        new = np.full(self._num_records + 1, _NO_RECORD, dtype=np.int32)  # last: for _NO_RECORD
-        new[kept] = np.arange(len(kept))
-        records = self._records[kept]
-        records[:, 2] = new[records[:, 2]]
-        if len(kept) + _MAX_TOKENS > len(self._records) // 2:
-            self._records = np.empty((len(kept) + _MIN_RECORDS, 3), dtype=np.int32)
-        self._records[: len(kept)] = records
-        self._num_records = len(kept)
-        self._tokens.link[: self._num_tokens][live] = new[links]
-        self._last_shared = int(new[shared])
+        num_kept, self._last_shared = _compact(
+            shared, paths, self._num_tokens, self._tokens, self._records
+        )
+        if num_kept + _MAX_TOKENS > len(self._records) // 2:
+            records = self._records
+            self._records = np.empty((num_kept + _MIN_RECORDS, 3), dtype=np.int32)
+            self._records[:num_kept] = records[:num_kept]
+        self._num_records = num_kept
 
     def _trace(self, record: int) -> list[Segment]:
         """Return the phones after the shared ones, up to the one of a record."""
@@ -246,7 +255,10 @@ def _token_table(num_contexts: int) -> NDArray[np.int16]:
 def _steps(
     frame: int,
     observed: NDArray[np.float32],
+    phones: NDArray[np.int32],
     confidence: NDArray[np.float64],
+    known_phone: int,
+    min_confidence: float,
     num_tokens: int,
     tokens: _Tokens,
     token_of: NDArray[np.int16],
@@ -255,10 +267,10 @@ def _steps(
     hmms: _Hmms,
     graph: Graph,
 ) -> tuple[int, int, int, int, int]:
-    """Advance all paths by the observed frames, or as far as there is room for their records.
+    """Advance all paths as in `Decoder.advance_until`, or as far as there is room for records.
 
-    Fills in the confidence after each frame. Returns the numbers of frames, tokens and records;
-    the best token, and its best state.
+    Fills in the last phone and the confidence after each frame. Returns the numbers of frames,
+    tokens and records; the best token, and its best state.
     """
     num_done, token, state = 0, 0, 0
     for number in range(num_tokens):
@@ -272,7 +284,10 @@ def _steps(
             observed[num_done], num_tokens, tokens, entry, entry_link, hmms, graph
         )
         confidence[num_done] = _normalize_scores(token, state, num_tokens, tokens, records, graph)
+        phones[num_done] = graph.last_phone[tokens.context[token]]
         num_done += 1
+        if phones[num_done - 1] != known_phone and confidence[num_done - 1] >= min_confidence:
+            break
     for number in range(num_tokens):
         token_of[tokens.context[number]] = _NO_TOKEN
     return num_done, num_tokens, num_records, token, state
@@ -443,13 +458,47 @@ def _normalize_scores(
 
 
 @numba.njit(cache=True)
-def _paths_through(links: NDArray[np.int32], before: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Count the paths, given by their links, that go through each record."""
-    paths = np.zeros(len(before), dtype=np.int64)
-    for link in links:
-        if link != _NO_RECORD:
-            paths[link] += 1
-    for record in range(len(before) - 1, -1, -1):  # a record comes after the one before it
-        if paths[record] and before[record] != _NO_RECORD:
-            paths[before[record]] += paths[record]
-    return paths
+def _count_paths(
+    num_tokens: int, tokens: _Tokens, records: NDArray[np.int32], paths: NDArray[np.int32]
+) -> int:
+    """Count the paths through each record, (records,); return the last one that all paths share."""
+    num_paths, shared = 0, _NO_RECORD
+    for token in range(num_tokens):
+        for state in range(tokens.score.shape[1]):
+            if tokens.score[token, state] > _IMPOSSIBLE:
+                num_paths += 1
+                if tokens.link[token, state] != _NO_RECORD:
+                    paths[tokens.link[token, state]] += 1
+    for record in range(len(paths) - 1, -1, -1):  # a record comes after the one before it
+        if paths[record] and records[record, 2] != _NO_RECORD:
+            paths[records[record, 2]] += paths[record]
+        if paths[record] == num_paths:
+            shared = max(shared, record)
+    return shared
+
+
+@numba.njit(cache=True)
+def _compact(
+    shared: int,
+    paths: NDArray[np.int32],
+    num_tokens: int,
+    tokens: _Tokens,
+    records: NDArray[np.int32],
+) -> tuple[int, int]:
+    """Drop the records without paths, and those before the shared one.
+
+    Returns the number of records, and the new index of the shared one.
+    """
+    new = np.full(len(paths) + 1, np.int32(_NO_RECORD))  # the last one is for _NO_RECORD
+    num_kept = 0
+    for record in range(max(shared, 0), len(paths)):
+        if paths[record]:
+            new[record] = num_kept
+            records[num_kept, 0], records[num_kept, 1] = records[record, 0], records[record, 1]
+            records[num_kept, 2] = new[records[record, 2]]
+            num_kept += 1
+    for token in range(num_tokens):
+        for state in range(tokens.score.shape[1]):
+            if tokens.score[token, state] > _IMPOSSIBLE:
+                tokens.link[token, state] = new[tokens.link[token, state]]
+    return num_kept, new[shared]

@@ -32,12 +32,13 @@ class OutputRule:
         if config.num_stable_frames < 1:
             raise ValueError(f"num_stable_frames is {config.num_stable_frames}, expected 1 or more")
         self._config = config
+        self.min_confidence = config.min_confidence
         self._initial = last_emitted
         self.reset()
 
     def reset(self) -> None:
         """Start a new stretch of speech."""
-        self._last_emitted = self._candidate = self._initial
+        self.last_emitted = self._candidate = self._initial
         self._num_agreeing = 0
 
     def update(self, phone: int, confidence: float) -> bool:
@@ -48,7 +49,7 @@ class OutputRule:
             self._num_agreeing = self._num_agreeing + 1 if phone == self._candidate else 1
         self._candidate = phone
         # Li 2011, eq. 4
-        if self._num_agreeing < self._config.num_stable_frames or phone == self._last_emitted:
+        if self._num_agreeing < self._config.num_stable_frames or phone == self.last_emitted:
             return False
-        self._last_emitted = phone
+        self.last_emitted = phone
         return True

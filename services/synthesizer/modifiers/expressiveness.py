@@ -33,9 +33,9 @@ _USUAL_PUSH = 40.0
 _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
-_LIPS = np.stack([UPPER, LOWER])
-_WIDTH = np.array([6, 7, 53, 54]) - 1  # positive is outward
-_PUSH = np.array([16, 17]) - 1  # positive is forward
+_LIPS = [*zip(UPPER.tolist(), LOWER.tolist(), strict=True)]  # the middle of the inner lips first
+_WIDTH = (5, 6, 52, 53)  # FAP 6, 7, 53 and 54; positive is outward
+_PUSH = (15, 16)  # FAP 16 and 17; positive is forward
 
 
 class Expressiveness:
@@ -48,31 +48,40 @@ class Expressiveness:
         """Scale the mouth of FAPs (68,), in place."""
         if self.amount == 1.0:
             return
-        openings = -faps[_LIPS]  # (2, 6) of the upper and the lower lip
-        upper, lower = openings
-        beyond = np.maximum(upper + lower - CLOSED, 0.0)  # (6,) excess of the gaps
-        free_lips = np.maximum(openings - CLOSED, 0.0)  # (2, 6)
-        free_upper, free_lower = free_lips
-        free = free_upper + free_lower
-        # a lower lip at the teeth (f) is also a closure
-        apart = np.minimum(free_lower / (OPEN - CLOSED), 1.0)
-        grown = apart * self._growth(np.minimum(free, beyond))
-        faps[_LIPS] -= grown / np.maximum(free, 1.0) * free_lips
-        gap = float(upper[0] + lower[0])
-        is_open = float(apart[0]) * min(max((gap - CLOSED) / (OPEN - CLOSED), 0.0), 1.0)
-        faps[JAW] += is_open * self._growth(np.maximum(faps[JAW], 0.0))
-        before = faps[_WIDTH]
-        width = before - _USUAL_WIDTH
-        # at rest the mouth is wider than in speech, but not spread
-        more = _SIDEWAYS * (self.amount - 1.0)
-        change = more * np.where(width > 0.0, is_open * width, width)
-        faps[_WIDTH] = np.maximum(before + change, np.minimum(before, _MIN_WIDTH))
-        pushed = more * np.maximum(faps[_PUSH] - _USUAL_PUSH, 0.0)
-        faps[_PUSH] = np.minimum(faps[_PUSH] + pushed, np.maximum(faps[_PUSH], _MAX_PUSH))
+        # Few numbers: floats take less time than arrays.
+        values = faps.tolist()
+        more = self.amount - 1.0
+        is_open = 0.0  # at the middle of the inner lips, 0 to 1
+        for upper, lower in _LIPS:
+            opening = -values[upper] - values[lower]
+            beyond = max(opening - CLOSED, 0.0)  # excess of the gap
+            free_upper, free_lower = (
+                max(-values[upper] - CLOSED, 0.0),
+                max(-values[lower] - CLOSED, 0.0),
+            )
+            free = free_upper + free_lower
+            # a lower lip at the teeth (f) is also a closure
+            apart = min(free_lower / (OPEN - CLOSED), 1.0)
+            if upper == _LIPS[0][0]:
+                is_open = apart * min(beyond / (OPEN - CLOSED), 1.0)
+            grown = apart * self._growth(min(free, beyond)) / max(free, 1.0)
+            faps[upper] = values[upper] - grown * free_upper
+            faps[lower] = values[lower] - grown * free_lower
+        faps[JAW] = values[JAW] + is_open * self._growth(max(values[JAW], 0.0))
+        for fap in _WIDTH:
+            before = values[fap]
+            width = before - _USUAL_WIDTH
+            # at rest the mouth is wider than in speech, but not spread
+            change = _SIDEWAYS * more * width * (is_open if width > 0.0 else 1.0)
+            faps[fap] = max(before + change, min(before, _MIN_WIDTH))
+        for fap in _PUSH:
+            before = values[fap]
+            pushed = _SIDEWAYS * more * max(before - _USUAL_PUSH, 0.0)
+            faps[fap] = min(before + pushed, max(before, _MAX_PUSH))
 
-    def _growth(self, opening: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _growth(self, opening: float) -> float:
         more = self.amount - 1.0
         if more < 0.0:
             return more * opening
-        within = np.minimum(opening, _WIDEST / 2)
-        return np.asarray(more * within * (1.0 - within / _WIDEST), np.float32)
+        within = min(opening, _WIDEST / 2)
+        return more * within * (1.0 - within / _WIDEST)

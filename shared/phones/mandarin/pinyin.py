@@ -124,6 +124,7 @@ def pronounce(text: str) -> list[tuple[str, ...]]:
     return transcript.phones
 
 
+@lru_cache(maxsize=8192)
 def spell(phones: tuple[str, ...]) -> str:
     """Return the pinyin of a syllable's phones, without tone; an initial is its own spelling.
 
@@ -142,6 +143,7 @@ def spell(phones: tuple[str, ...]) -> str:
     return initial[0] + _SPELLED_AFTER.get(final, final)
 
 
+@lru_cache(maxsize=8192)
 def write(spelling: str) -> str:
     """Return a syllable with tone mark and ü, or a phone as it is written in a syllable.
 
