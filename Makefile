@@ -41,7 +41,7 @@ LOCK_TORCH := requirements-torch.lock
 LOCK_TORCH_CPU := requirements-torch-cpu.lock
 TORCH := torch==2.13.0
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --retries 0 --timeout 10
-RIVAL_PACKAGES := pylipsync==0.2.1 openfacefx==0.24.0
+RIVAL_PACKAGES := hama==1.7.0 pylipsync==0.2.1 openfacefx==0.24.0
 BPY := bpy==4.5.15
 INSTALL := -m pip install --quiet
 PIP := $(BIN)/python $(INSTALL)

@@ -18,6 +18,10 @@ podcasts, a talk, a web seminar and a prompt, with eight voices. The publishers 
 ``Step-Audio-EditX`` provide the texts. Other texts are the output of one large recognizer
 (``RapidASR``) or the majority of several (``vad_example``), so they contain errors. Long recordings
 are cut into pieces that overlap by 0.48 s, and so are their texts.
+
+``languages.tsv`` lists recordings in several languages, by speakers that no model was trained on,
+and their phones. No setting of the universal model was chosen on these recordings, except for those
+of two native speakers of English (``en-native``).
 """
 
 import math
@@ -33,6 +37,8 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, Syllable
 from kouxing.shared.terminal import plural
 from kouxing.shared.user_file import check_content, read_text, split_lines
+
+LANGUAGES = Path(__file__).with_name("languages.tsv")  # held-out recordings in several languages
 
 # Licenses that allow distributing a model trained on the data.
 _FREE_LICENSE = re.compile(

@@ -6,7 +6,7 @@ set -eu
 packages="python3-venv libegl1 libgl1 libgl1-mesa-dri"
 if [ "$1" = test ]; then
     packages="$packages chromium xvfb iproute2 nftables tcc libc6-dev libzmq3-dev pulseaudio pulseaudio-utils"
-    packages="$packages mono-mcs mono-runtime espeak-ng"
+    packages="$packages mono-mcs mono-runtime espeak-ng mecab mecab-ipadic-utf8"
 fi
 
 if [ "$(uname)" = Darwin ]; then exit 0; fi # macOS includes OpenGL

@@ -95,6 +95,40 @@ def recognizer(
 
 
 @app.command()
+def languages(
+    audio: Annotated[
+        Path, typer.Option(help="Folder of the audio files; the manifest's paths start there.")
+    ],
+    manifest: Annotated[
+        Path | None,
+        typer.Option(help="Manifest with the column language. Default: corpora/languages.tsv."),
+    ] = None,
+    hama: Annotated[
+        bool, typer.Option("--hama", help="Also run the package hama on recordings of English.")
+    ] = False,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure feature and viseme errors of universal phones by language, live.
+
+    Each recording is recognized without a choice of language, and as its language.
+    """
+    from kouxing.corpora.speech_corpus import LANGUAGES, RowErrors
+    from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
+    from kouxing.evaluation.recognizer.references import align_corpus
+
+    manifest = manifest or LANGUAGES
+    check_output(json_file, inputs=[manifest], force=force)
+    ((_, model, rule),) = _models(["universal"])
+    errors = RowErrors()
+    references = align_corpus(model, manifest, "test", errors, audio)
+    results = evaluate_languages(references, rule, with_hama=hama)
+    print_languages(results, Console())
+    errors.report_to(print_message)
+    write_json(json_file, results)
+
+
+@app.command()
 def voice(
     manifest: Manifest,
     audio: AudioFolder = None,

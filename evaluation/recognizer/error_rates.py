@@ -172,13 +172,13 @@ def evaluate_recognizer(
     for reference in track(references, "recognizing", console=CONSOLE, transient=True):
         samples = reference.read_audio()
         for name, disturb in disturbances.items():
-            scored = _score(model, disturb(samples))
-            recognition = _recognize(model, scored, rule)
+            scored = score_live(model, disturb(samples))
+            recognition = recognize_live(model, scored, rule)
             speech[name].add(reference, recognition)
             if name == CLEAN:
                 speech[reference.group].add(reference, recognition)
                 for other in rules:
-                    by_rule[_rule_name(other)].add(reference, _recognize(model, scored, other))
+                    by_rule[_rule_name(other)].add(reference, recognize_live(model, scored, other))
     rng = np.random.default_rng(0)
     return {
         "recordings": len(references),
@@ -196,7 +196,7 @@ def _rule_name(rule: OutputRuleConfig) -> str:
     return f"N = {rule.num_stable_frames}{confidence}"
 
 
-def _score(model: AcousticModel, samples: Samples) -> list[tuple[float, list[ScoreEvent]]]:
+def score_live(model: AcousticModel, samples: Samples) -> list[tuple[float, list[ScoreEvent]]]:
     """Score a recording live; return media time in seconds and the new events, by chunk."""
     scorer = SpeechScorer(model)
     scored = []
@@ -210,11 +210,12 @@ def _score(model: AcousticModel, samples: Samples) -> list[tuple[float, list[Sco
     return [*scored, (len(samples) / SAMPLE_RATE_HZ, scorer.get_events())]
 
 
-def _recognize(
+def recognize_live(
     model: AcousticModel,
     scored: Sequence[tuple[float, list[ScoreEvent]]],
     rule: OutputRuleConfig,
 ) -> Recognition:
+    """Decode the scores of ``score_live``, chunk by chunk."""
     decoder = LiveDecoder(model.topology, rule)
     out = Recognition()
     known: set[int] = set()

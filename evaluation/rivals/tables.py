@@ -92,16 +92,17 @@ def _run(program: str, clips: Sequence[LipClip], tables: Path, profile: Any = No
             sound.astype("<f4").tofile(sounds / f"{clip.name}.f32")
         arguments = [program, str(sounds), str(tables.resolve())]
         if program in NODE_PROGRAMS:
-            _installed("node_modules")
+            find_installed("node_modules")
             command = [find_node(), "run.js", *arguments, *([str(settings)] if profile else [])]
         else:
-            command = [str(_installed(".venv/bin/python")), "run.py", *arguments]
+            command = [str(find_installed(".venv/bin/python")), "run.py", *arguments]
         done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=False)  # noqa: S603
         if done.returncode:
             raise UserError(f"{program} failed: {done.stderr[-500:]}")
 
 
-def _installed(name: str) -> Path:
+def find_installed(name: str) -> Path:
+    """Return an installed file or folder of the programs; UserError if it is missing."""
     if not (FOLDER / name).exists():
         raise UserError("this program is not installed; run 'make report' to install it")
     return FOLDER / name

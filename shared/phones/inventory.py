@@ -46,7 +46,10 @@ from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
-TABLE_LANGUAGES = "english french german italian japanese portuguese russian spanish".split()
+TABLE_LANGUAGES = (
+    "cantonese dutch english french german hindi indonesian italian japanese korean polish"
+    " portuguese russian spanish swedish turkish ukrainian vietnamese"
+).split()
 DEFAULT_LANGUAGE = "mandarin"
 UNIVERSAL = "universal"  # the phones of all languages
 AUTO = "auto"  # its code for users

@@ -5,10 +5,12 @@
 =======  ===========================================================================================
 key      meaning
 =======  ===========================================================================================
-code     ISO 639-1
+code     ISO 639-1 code, or ISO 639-3 for Cantonese and others
 titles   name for users, in ``en`` and ``zh``
 voice    voice of espeak-ng
 scripts  scripts of the words, as in the Unicode names of letters, such as ``LATIN``
+words    how words are found: ``spaced`` (the default), ``character`` (each is a word), or ``mecab``
+         (MeCab splits Japanese)
 rules    corrections of the voice's IPA: pairs of a pattern and a replacement, applied in order
 =======  ===========================================================================================
 
@@ -26,15 +28,19 @@ from importlib import resources
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.espeak import transcribe_phrases
+from kouxing.shared.phones.mecab import has_mecab, split_words
 from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
-from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone, read_ipa
+from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone, read_ipa, remove_flags
 
 SETTINGS = "language.toml"
 _SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words
+_SPACED, _CHARACTER, _MECAB = "spaced", "character", "mecab"
+_LETTER = r"(?:[^\W\d_]|[\u0900-\u0963])"  # letters, and the vowel signs of Devanagari
+_LATIN_EDGE = re.compile(r"(?<=[A-Za-z])(?![\x00-\x7f])|(?<![\x00-\x7f])(?=[A-Za-z])")
 _TOKENS = re.compile(
     r"(?P<number>[€$£¥]?[0-9]+(?:[.,:][0-9]+)*(?: ?[%€£°])?)"
-    rf"|(?P<word>[^\W\d_]+(?:['’·-][^\W\d_]+)*['’]?|[{_SIGNS}])|(?P<other>\S)"
+    rf"|(?P<word>{_LETTER}+(?:['’·-]{_LETTER}+)*['’]?|[{_SIGNS}])|(?P<other>\S)"
 )
 
 
@@ -46,6 +52,7 @@ class TableLanguage:
     titles: Mapping[str, str]
     voice: str
     scripts: tuple[str, ...]
+    words: str
     rules: tuple[tuple[str, str], ...]
     phones: tuple[str, ...]
 
@@ -66,9 +73,10 @@ class TableLanguage:
         is missing.
         """
         phrases, dropped = self._phrases_of(text)
+        spoken = [[sound for _, sound in phrase] for phrase in phrases]
         words = []
-        for phrase, sounds in zip(phrases, transcribe_phrases(phrases, self.voice), strict=True):
-            for word, ipa in zip(phrase, sounds, strict=True):
+        for phrase, sounds in zip(phrases, transcribe_phrases(spoken, self.voice), strict=True):
+            for (word, _), ipa in zip(phrase, sounds, strict=True):
                 phones = self._phones_of(ipa)
                 if phones:
                     words.append(SpokenSyllable(word, "".join(map(ipa_of, phones)), phones))
@@ -76,33 +84,58 @@ class TableLanguage:
                     dropped.append(word)
         return Transcript(tuple(words), tuple(dropped))
 
-    def _phrases_of(self, text: str) -> tuple[list[list[str]], list[str]]:
-        """Return the words between punctuation, and what cannot be read. A number is a phrase."""
-        phrases: list[list[str]] = [[]]
+    def _phrases_of(self, text: str) -> tuple[list[list[tuple[str, str]]], list[str]]:
+        """Return the words between punctuation, and what cannot be read. A number is a phrase.
+
+        A word has its text, and the text for espeak-ng.
+        """
+        phrases: list[list[tuple[str, str]]] = [[]]
         dropped = []
-        for token in _TOKENS.finditer(unicodedata.normalize("NFKC", text)):
+        plain = unicodedata.normalize("NFKC", text)
+        plain = "".join(str(unicodedata.decimal(sign, sign)) for sign in plain)  # १२ is 12
+        if self.words != _SPACED:
+            plain = _LATIN_EDGE.sub(" ", plain)
+        tokens = list(_TOKENS.finditer(plain))
+        readable = [token[0] for token in tokens if token["word"] and self._is_readable(token[0])]
+        readings = iter(self._split(readable))
+        for token in tokens:
             word = token[0]
             if token["number"]:
-                phrases += [word], []
+                phrases += [(word, word)], []
             elif token["other"]:
                 phrases.append([])
                 if unicodedata.category(word)[0] not in "PM":
                     dropped.append(word)
-            elif word in _SIGNS or all(map(self._has_letter, filter(str.isalpha, word))):
-                phrases[-1].append(word)
+            elif self._is_readable(word):
+                phrases[-1] += next(readings)
             else:
                 dropped.append(word)
         return [phrase for phrase in phrases if phrase], dropped
+
+    def _split(self, texts: list[str]) -> list[list[tuple[str, str]]]:
+        """Return the words of each text without spaces, each with the text for espeak-ng."""
+        if self.words == _MECAB and (has_mecab() or any(map(_has_character, texts))):
+            return split_words(texts)
+        pieces = [list(text) if self.words == _CHARACTER else [text] for text in texts]
+        return [[(piece, piece) for piece in some] for some in pieces]
+
+    def _is_readable(self, word: str) -> bool:
+        return word in _SIGNS or all(map(self._has_letter, filter(str.isalpha, word)))
 
     def _has_letter(self, letter: str) -> bool:
         return unicodedata.name(letter, "").startswith(self.scripts)
 
     def _phones_of(self, ipa: str) -> tuple[str, ...]:
         """Return a word in the language's phones; empty if it has unknown symbols."""
+        ipa = remove_flags(ipa)
         for pattern, replacement in self.rules:
             ipa = re.sub(pattern, replacement, ipa)
         phones, unknown = read_ipa(ipa)
         return () if unknown else tuple(nearest_phone(phone, self.phones) for phone in phones)
+
+
+def _has_character(text: str) -> bool:
+    return any(unicodedata.name(letter, "").startswith("CJK") for letter in text)
 
 
 @cache
@@ -114,6 +147,7 @@ def load_table_language(package: str) -> TableLanguage:
         titles=settings["titles"],
         voice=settings["voice"],
         scripts=tuple(settings["scripts"]),
+        words=settings.get("words", _SPACED),
         rules=tuple((pattern, replacement) for pattern, replacement in settings.get("rules", ())),
         phones=tuple(row["phone"] for row in read_table(package, "phones.tsv")),
     )

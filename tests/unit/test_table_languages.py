@@ -1,5 +1,7 @@
 """Languages that are folders of tables: their phones, and texts that espeak-ng reads."""
 
+import shutil
+
 import pytest
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import check_visemes
@@ -33,8 +35,20 @@ def test_phones_are_universal(language: str) -> None:
         ("spanish", "¡Los niños!", [("Los", "los"), ("niños", "niɲos")]),
         ("italian", "gli gnocchi", [("gli", "ʎi"), ("gnocchi", "ɲoki")]),
         ("portuguese", "manhã", [("manhã", "mɐ̃ɲɐ̃")]),
-        ("japanese", "さんぽ きょう", [("さんぽ", "sampo"), ("きょう", "kjoɯ")]),
+        ("japanese", "さんぽ きょう", [("さんぽ", "sampo"), ("きょう", "kjoo")]),
         ("russian", "щука ты", [("щука", "ɕuka"), ("ты", "tɨ")]),
+        ("korean", "한국 입니다", [("한국", "hanɡuk"), ("입니다", "imnida")]),
+        ("korean", "김치", [("김치", "kimt͡ɕʰi")]),
+        ("cantonese", "香港人", [("香", "hœŋ"), ("港", "kɔŋ"), ("人", "jɐn")]),
+        ("cantonese", "國家 打他", [*zip("國家打他", ("kwɔk", "ka", "ta", "tʰa"), strict=True)]),
+        ("hindi", "नमस्ते जल", [("नमस्ते", "nəməste"), ("जल", "d͡ʒəl")]),
+        ("dutch", "een leuk huis", [("een", "ən"), ("leuk", "løk"), ("huis", "hœys")]),
+        ("polish", "dzień szum", [("dzień", "d͡ʑɛɲ"), ("szum", "ʃum")]),
+        ("turkish", "yüz ışık", [("yüz", "jyz"), ("ışık", "ɯʃɯk")]),
+        ("ukrainian", "що їжа", [("що", "ʃt͡ʃɔ"), ("їжа", "iʒa")]),
+        ("swedish", "sju", [("sju", "ʃu")]),
+        ("indonesian", "nyanyi cucu", [("nyanyi", "ɲaɲi"), ("cucu", "t͡ʃut͡ʃu")]),
+        ("vietnamese", "người Việt", [("người", "ŋɯɤj"), ("Việt", "viɛt")]),
     ],
 )
 def test_reads_words(language: str, text: str, spoken: list[tuple[str, str]]) -> None:
@@ -45,6 +59,15 @@ def test_a_number_is_a_word_of_the_language() -> None:
     assert words_of("english", "25 men") == [("25", "twɛntifaɪv"), ("men", "mɛn")]
     assert words_of("german", "25")[0][1].startswith("fynf")
     assert words_of("english", "5%")[0] == ("5%", "faɪvpɚsɛnt")
+    assert words_of("hindi", "२५") == words_of("hindi", "25") == [("25", "pət͡ʃis")]
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_reads_numbers_in_every_language(language: str) -> None:
+    transcript = load_inventory(language).read("1 25 2026 3.5 50%")
+    assert [word.text for word in transcript.syllables] == ["1", "25", "2026", "3.5", "50%"]
+    assert len({word.spelling for word in transcript.syllables}) == 5
+    assert not transcript.dropped
 
 
 def test_words_that_espeak_joins_stay_apart() -> None:
@@ -75,10 +98,27 @@ def test_reads_mixed_sentences() -> None:
     assert dict(words)["happy"] == "hæpi"
     assert UNIVERSAL.pronounce("我 ok") == [("w", "o"), ("o", "uh", "kasp", "e", "ih")]
     japanese = UNIVERSAL.read("これは 私")
-    assert [word.text for word in japanese.syllables] == ["これは"]
-    assert japanese.dropped == ("私",)
-    with pytest.raises(UserError, match="cannot read '한국'"):
-        UNIVERSAL.pronounce("我 한국")
+    assert [word.text for word in japanese.syllables] == ["これ", "は", "私"]
+    mixed = UNIVERSAL.read("我爱 한국 भारत")
+    assert [word.spelling for word in mixed.syllables] == ["wo3", "ai4", "hanɡuk", "baɾət"]
+    with pytest.raises(UserError, match="cannot read 'ไทย'"):
+        UNIVERSAL.pronounce("我 ไทย")
+
+
+def test_reads_chinese_characters_in_japanese(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = words_of("japanese", "私は学生。キャンプ")
+    assert [word for word, _ in words] == ["私", "は", "学生", "キャンプ"]
+    assert words[1][1] == "wa"  # the particle
+    assert words[0][1].startswith("wata")
+    assert words_of("japanese", "いっぱい")[0][1] == "ippai"
+    transcript = load_inventory("japanese").read("Kはきいた")
+    assert "".join(word.text for word in transcript.syllables) == "はきいた"
+    assert transcript.dropped == ("K",)
+    which = shutil.which
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "mecab" else which(name))
+    assert words_of("japanese", "さんぽ") == [("さんぽ", "sampo")]
+    with pytest.raises(UserError, match=r"mecab is missing.*write kana, or install"):
+        load_inventory("japanese").read("私は")
 
 
 def test_missing_espeak_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

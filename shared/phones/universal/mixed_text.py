@@ -13,6 +13,8 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 # by the first word of the letters' Unicode names
 _LANGUAGES = {
     "CYRILLIC": "russian",
+    "DEVANAGARI": "hindi",
+    "HANGUL": "korean",
     "HIRAGANA": "japanese",
     "KATAKANA": "japanese",
     "LATIN": "english",

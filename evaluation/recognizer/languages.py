@@ -1,0 +1,167 @@
+"""Error rates of universal phones by language, live, next to another recognizer of English.
+
+======  ============================================================================================
+name    recognizer
+======  ============================================================================================
+auto    the universal model, without a choice of language
+own     the model of the recording's language: the universal model restricted to its phones. The
+        phones of the Mandarin model are converted to universal phones
+hama    hama, whole recordings of English only
+======  ============================================================================================
+
+All recognizers get the same recordings, and the same measures: phonetic feature errors, phone
+errors and viseme errors. The final hypothesis is that of an offline search.
+"""
+
+import subprocess
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from kouxing.evaluation.recognizer.error_rates import (
+    HYPOTHESES,
+    Recognition,
+    Score,
+    recognize_live,
+    score_live,
+)
+from kouxing.evaluation.recognizer.references import Reference
+from kouxing.evaluation.rivals.tables import FOLDER, find_installed
+from kouxing.evaluation.tables import percent
+from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import UNIVERSAL, find_language, load_inventory
+from kouxing.shared.phones.universal.segments import read_ipa
+from kouxing.shared.records import replace
+from kouxing.shared.terminal import CONSOLE, plural, print_table
+
+AUTO, OWN, HAMA = "auto", "own", "hama"
+_HAMA_LANGUAGE = "en"
+_LABEL = "language "  # as in evaluate_recognizer
+
+Figures = Mapping[str, Any]
+
+
+def evaluate_languages(
+    references: Sequence[Reference], rule: OutputRuleConfig, *, with_hama: bool = False
+) -> dict[str, dict[str, Any]]:
+    """Measure the recognizers; return figures in the form of ``evaluate_recognizer``.
+
+    A language is a code such as ``en`` or ``en-GRID``. Raises UserError if a recording's language
+    is unknown, or hama is not installed.
+    """
+    scores: dict[str, dict[str, Score]] = defaultdict(
+        lambda: defaultdict(lambda: Score(load_inventory(UNIVERSAL)))
+    )
+    for reference in track(references, "recognizing", console=CONSOLE, transient=True):
+        for name, recognition in _recognitions(reference, rule):
+            scores[name][reference.group].add(reference, recognition)
+    if with_hama:
+        english = [one for one in references if _code_of(one) == _HAMA_LANGUAGE]
+        for reference, phones in zip(english, _run_hama(english), strict=True):
+            recognition = Recognition(final=[_phone(symbol) for symbol in phones])
+            scores[HAMA][reference.group].add(reference, recognition)
+    rng = np.random.default_rng(0)
+    results: dict[str, dict[str, Any]] = {}
+    for name, by_language in scores.items():
+        speech = {group: score.summary(rng) for group, score in sorted(by_language.items())}
+        if name == HAMA:
+            for summary in speech.values():
+                del summary["first"]
+        of_name = [one for one in references if one.group in by_language]
+        results[name] = {
+            "recordings": len(of_name),
+            "speakers": len({one.utterance.speaker for one in of_name}),
+            "speech": speech,
+        }
+    return results
+
+
+def _code_of(reference: Reference) -> str:
+    return reference.utterance.language.partition("-")[0]
+
+
+def _recognitions(
+    reference: Reference, rule: OutputRuleConfig
+) -> Iterator[tuple[str, Recognition]]:
+    samples, universal = reference.read_audio(), model_of_language(UNIVERSAL)
+    scored = score_live(universal, samples)
+    yield AUTO, recognize_live(universal, scored, rule)
+    own = model_of_language(find_language(_code_of(reference)))
+    if own.inventory.language == UNIVERSAL:
+        yield OWN, recognize_live(own, scored, rule)
+        return
+    found = recognize_live(own, score_live(own, samples), rule)
+    in_universal = own.inventory.universal
+    first = [[replace(p, symbol=s) for s in in_universal[p.symbol]] for p in found.first]
+    final = [[replace(p, symbol=s) for s in in_universal[p.symbol]] for p in found.final]
+    emitted_s = [
+        time_s for time_s, phones in zip(found.emitted_s, first, strict=True) for _ in phones
+    ]
+    yield OWN, Recognition([*chain(*first)], emitted_s, [*chain(*final)])
+
+
+def _phone(symbol: str) -> Phone:
+    return Phone(index=0, symbol=symbol, onset_s=0.0, duration_s=0.1, confidence=1.0, final=True)
+
+
+def _run_hama(references: Sequence[Reference]) -> Iterator[tuple[str, ...]]:
+    """Yield the phones of each recording. hama's letters without a universal phone are an error."""
+    with tempfile.TemporaryDirectory() as name:
+        for number, reference in enumerate(references):
+            reference.read_audio().astype("<f4").tofile(Path(name) / f"{number:06}.f32")
+        command = [str(find_installed(".venv/bin/python")), "hama_phones.py", name]
+        done = subprocess.run(  # noqa: S603
+            command, cwd=FOLDER, capture_output=True, encoding="utf-8", check=False
+        )
+    if done.returncode:
+        raise UserError(f"hama failed: {done.stderr[-500:]}")
+    for line in done.stdout.splitlines():
+        phones, unknown = read_ipa(line)
+        if unknown:
+            raise UserError(f"hama wrote {unknown[0]!r}, which is not in other_ipa.tsv; add it")
+        yield phones
+
+
+def print_languages(results: Mapping[str, Figures], console: Console) -> None:
+    """Print one table: a row for each language, a column for each recognizer and hypothesis."""
+    columns = [
+        (name, hypothesis)
+        for name, figures in results.items()
+        for hypothesis in HYPOTHESES
+        if hypothesis in next(iter(figures["speech"].values()))
+    ]
+    auto = results[AUTO]
+    print_table(
+        console,
+        f"{plural(auto['recordings'], 'recording')}, {plural(auto['speakers'], 'speaker')}.\n"
+        "features/visemes wrong, %; auto: any language, own: the language's model",
+        ("language", "phones", *(f"{name} {hypothesis}" for name, hypothesis in columns)),
+        _rows(results, columns),
+    )
+
+
+def _rows(
+    results: Mapping[str, Figures], columns: Iterable[tuple[str, str]]
+) -> Iterator[list[str]]:
+    for group, score in results[AUTO]["speech"].items():
+        cells = [results[name]["speech"].get(group, {}).get(part) for name, part in columns]
+        yield [
+            group.removeprefix(_LABEL),
+            str(score["final"]["phone_errors"]["reference"]),
+            *(
+                "/".join(percent(cell[f"{unit}_error_rate"]) for unit in ("feature", "viseme"))
+                if cell
+                else "-"
+                for cell in cells
+            ),
+        ]
