@@ -26,6 +26,40 @@ from kouxing.shared.records import Record
 _STEP_S = 1e-3  # step of the numerical derivative
 
 
+class SequenceParameters(Record, frozen=True, kw_only=True):
+    """The parameters of a sequence of visemes, followed by silences.
+
+    Viseme arrays have shape (num_visemes, 1, num_mouth_faps).
+    """
+
+    offset_s: NDArray[np.float64]
+    log_alpha: NDArray[np.float64]
+    theta_minus: NDArray[np.float64]
+    theta_plus: NDArray[np.float64]
+    target: NDArray[np.float64]  # (num_visemes + num_silences, num_mouth_faps)
+    closing: list[tuple[int, NDArray[np.intp]]]  # closing visemes, and the FAPs that close
+
+
+def sequence_parameters(parameters: VisemeParameters, timeline: Timeline) -> SequenceParameters:
+    """Return the parameters of a timeline's visemes and silences; times do not affect them."""
+    viseme = timeline.viseme
+    offset_s, log_alpha, theta_minus, theta_plus = parameters.dominance[viseme, :, None].swapaxes(
+        0, 1
+    )
+    neutral = parameters.neutral[None].repeat(len(timeline.silence_start_s), axis=0)
+    return SequenceParameters(
+        offset_s=offset_s,
+        log_alpha=log_alpha,
+        theta_minus=theta_minus,
+        theta_plus=theta_plus,
+        target=np.concatenate([parameters.target[viseme], neutral]),
+        closing=[
+            (row, np.flatnonzero(parameters.closes[viseme[row]]))
+            for row in parameters.any_closes[viseme].nonzero()[0].tolist()
+        ],
+    )
+
+
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return weights that sum to one along the first axis."""
     weights: NDArray[np.float64] = np.exp(log_weights - np.maximum.reduce(log_weights))
@@ -34,7 +68,10 @@ def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def log_weights(
-    parameters: VisemeParameters, timeline: Timeline, time_s: NDArray[np.float64]
+    parameters: VisemeParameters,
+    sequence: SequenceParameters,
+    timeline: Timeline,
+    time_s: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the log weights (num_visemes + num_silences, num_times, num_mouth_faps).
 
@@ -42,17 +79,15 @@ def log_weights(
     """
     p, c = parameters, parameters.c
     time = time_s[:, None]  # (F, 1)
-    viseme = timeline.viseme
-    offset, log_alpha, theta_minus, theta_plus = p.dominance[viseme, :, None].swapaxes(0, 1)
     # signed distance to the apex: positive before it, negative after it, 0 inside
-    before = timeline.apex_start_s[:, None, None] + offset - time
-    after = timeline.apex_end_s[:, None, None] + offset - time
+    before = timeline.apex_start_s[:, None, None] + sequence.offset_s - time
+    after = timeline.apex_end_s[:, None, None] + sequence.offset_s - time
     tau = np.maximum(before, 0.0) + np.minimum(after, 0.0)  # (E, F, P)
     spoken = log_dominance(
         tau,
-        log_alpha,
-        theta_minus,
-        theta_plus,
+        sequence.log_alpha,
+        sequence.theta_minus,
+        sequence.theta_plus,
         c,
     )
     start_s = timeline.silence_start_s[:, None, None]  # (S, 1, 1)
@@ -64,19 +99,18 @@ def log_weights(
         end_s - start_s,
     )
     weights = np.concatenate([spoken, silent])
-    return _close_lips(parameters, viseme, tau, weights)
+    return _close_lips(parameters, sequence, tau, weights) if sequence.closing else weights
 
 
 def _close_lips(
     parameters: VisemeParameters,
-    viseme: NDArray[np.intp],
+    sequence: SequenceParameters,
     tau: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Apply the closure rule (Wang & Cai 2003, eq. 7) to closing visemes."""
     closed = weights
-    for row in parameters.any_closes[viseme].nonzero()[0]:
-        faps = np.flatnonzero(parameters.closes[viseme[row]])
+    for row, faps in sequence.closing:
         near = np.flatnonzero((np.abs(tau[row][:, faps]) < parameters.closure_reach_s).any(axis=1))
         if not near.size:
             continue
@@ -96,20 +130,21 @@ def _close_lips(
 
 
 def blend(
-    parameters: VisemeParameters, timeline: Timeline, time_s: NDArray[np.float64]
+    parameters: VisemeParameters,
+    timeline: Timeline,
+    time_s: NDArray[np.float64],
+    sequence: SequenceParameters | None = None,
 ) -> NDArray[np.float64]:
     """Return the mouth FAPs (num_times, num_mouth_faps) of a timeline at times (num_times,).
 
+    ``sequence`` is ``sequence_parameters`` of the timeline, if known.
     With all visemes this is Wang & Cai 2003, eq. 6; with the pair around a time, Li 2011, eq. 11.
     """
-    num_silences = len(timeline.silence_start_s)
-    if not len(timeline.viseme) + num_silences:
+    if not len(timeline.viseme) + len(timeline.silence_start_s):
         return np.tile(parameters.neutral, (len(time_s), 1))
-    weights = softmax(log_weights(parameters, timeline, time_s))  # (E + S, F, P)
-    targets = np.concatenate(
-        [parameters.target[timeline.viseme], parameters.neutral[None].repeat(num_silences, axis=0)]
-    )
-    curves: NDArray[np.float64] = np.einsum("efp,ep->fp", weights, targets)
+    sequence = sequence or sequence_parameters(parameters, timeline)
+    weights = softmax(log_weights(parameters, sequence, timeline, time_s))  # (E + S, F, P)
+    curves: NDArray[np.float64] = np.einsum("efp,ep->fp", weights, sequence.target)
     return curves  # Wang & Cai 2003, eq. 6
 
 
@@ -130,14 +165,16 @@ class TargetTrajectory(Record, frozen=True):
 
     parameters: VisemeParameters
     timeline: Timeline
+    sequence: SequenceParameters
 
     def at(self, time_s: float) -> FapState:
         """Return position and velocity at a media time."""
         times = np.array([time_s - _STEP_S, time_s, time_s + _STEP_S])
-        before, here, after = blend(self.parameters, self.timeline, times)
+        before, here, after = blend(self.parameters, self.timeline, times, self.sequence)
         return FapState(here, (after - before) / (2.0 * _STEP_S))
 
     def value_at(self, time_s: float) -> NDArray[np.float64]:
         """Return the position at a media time."""
-        value: NDArray[np.float64] = blend(self.parameters, self.timeline, np.array([time_s]))[0]
+        faps = blend(self.parameters, self.timeline, np.array([time_s]), self.sequence)
+        value: NDArray[np.float64] = faps[0]
         return value

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     TargetTrajectory,
     active_visemes,
+    sequence_parameters,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.closures import ClosureTracker
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
@@ -108,7 +109,8 @@ class VisemeStream:
         self._closures = ClosureTracker(parameters, frame_rate_hz)
         self._timeline = self._build_timeline()
         self._current = self._timeline  # with open phone extended and late closures moved
-        self._trajectory = TargetTrajectory(parameters, self._timeline)
+        sequence = sequence_parameters(parameters, self._timeline)
+        self._trajectory = TargetTrajectory(parameters, self._timeline, sequence)
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # set while media time stands still
@@ -137,8 +139,16 @@ class VisemeStream:
         extended = self._timeline.extend_open_phone(time_s + self._delay_s)
         self._current, is_postponed = self._closures.postpone(extended, self._time_s, time_s)
         active = self._current.select(active_visemes(self._current, time_s, self._delay_s))
-        is_same = active.same_visemes(self._trajectory.timeline)
-        self._trajectory = TargetTrajectory(self._parameters, active)
+        before = self._trajectory
+        is_same = active.same_visemes(before.timeline)
+        has_same_sequence = is_same and len(active.silence_start_s) == len(
+            before.timeline.silence_start_s
+        )
+        self._trajectory = TargetTrajectory(
+            self._parameters,
+            active,
+            before.sequence if has_same_sequence else sequence_parameters(self._parameters, active),
+        )
         if self._pending_s is not None or is_postponed or not is_same or self._rest is not None:
             self._start_transition()
         trajectory, transition = self._trajectory, self._transition
