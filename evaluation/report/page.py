@@ -52,7 +52,7 @@ def write_page(folder: Path, page: Path) -> None:
     """Write the page and its picture from the results in a folder."""
     steps = read_results(folder)
     results = {name: step["result"] for name, step in steps.items()}
-    better = lip_tables.better_programs(results)
+    better = [*lip_tables.better_programs(results), *system_tables.better_packages(results)]
     text = _TEMPLATE.read_text("utf-8").replace(
         "[[better]]\n", bullets(better or ["In no measure"])
     )

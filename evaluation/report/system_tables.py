@@ -9,6 +9,13 @@ from kouxing.shared.face.faps import NUM_FAPS
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20
 _FRAME_BYTES, _FRAMES_PER_S = 4 * NUM_FAPS, 50
 
+_PACKAGE_FIGURES = {  # lower is better: name, scale and unit
+    "download_bytes": ("download", 1e-6, "MB"),
+    "processor_share": ("processor time", 1e2, "% of a core"),
+    "loaded_ms": ("loading time", 1e-3, "s"),
+    "first_movement_ms": ("time until the first movement", 1e-3, "s"),
+}
+
 
 def system(results: Results) -> Table:
     """Return each figure of the running system with its physical floor."""
@@ -107,6 +114,22 @@ def _browser(results: Results) -> Iterator[list[str]]:
             f"{format_number(needed, '.1f')} / -" if is_ours and needed else "",
             "weights of its models" if is_ours and needed else "",
         ]
+
+
+def better_packages(results: Results) -> list[str]:
+    """Return a sentence for each figure in the browser in which another package is better."""
+    browser = results.get("browser")
+    if not browser:
+        return []
+    sentences = []
+    for key, (name, scale, unit) in _PACKAGE_FIGURES.items():
+        best = min((browser, *browser["others"]), key=lambda package: package[key])
+        if best is not browser:
+            shown = [f"{format_number(p[key] * scale, '.1f')} {unit}" for p in (best, browser)]
+            sentences.append(
+                f"browser, {name}: {best['name']} ({shown[0]}); {browser['name']} ({shown[1]})"
+            )
+    return sentences
 
 
 def _sizes(results: Results) -> Iterator[list[str]]:

@@ -236,6 +236,10 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
         "2.4 / -",
     ]
     assert "HeadAudio in the browser: download, MB / share of a core, %" in rows
+    assert system_tables.better_packages(results) == [
+        "browser, download: HeadAudio (0.1 MB); kouxing-lips (4.6 MB)"
+    ]
+    assert system_tables.better_packages({}) == []
 
 
 def test_the_table_of_faults_reads_a_stored_result(tmp_path: Path) -> None:
