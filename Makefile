@@ -7,7 +7,7 @@
 # make check        style, types and import rules
 # make check-wheel  installs the wheel in an empty environment, and runs it
 # make lips-demo    writes the page with lip sync in the browser to dist/lips-demo
-# make report       measures everything that is out of date, and writes docs/results.md (CLIPS, CORPUS, NATURAL, STEPS, QUICK, FRESH)
+# make report       measures everything that is out of date, and writes docs/results.md (CLIPS, CORPUS, NATURAL, LANGUAGES, STEPS, QUICK, FRESH)
 # make ovrlipsync   writes the C library with OVRLipSync's interface to dist/ovrlipsync
 # make lock         updates the locked versions and hashes of all Python packages
 #
@@ -137,11 +137,11 @@ check-wheel: wheel
 lips-demo: setup $(LIPS_MODELS) $(patsubst %,%/node_modules/.package-lock.json,$(JAVASCRIPT) $(LIPS))
 	$(BIN)/node $(LIPS)/demo/build.mjs dist/lips-demo
 
-# CLIPS, CORPUS and NATURAL are folders of recordings. STEPS names steps; QUICK=1 and FRESH=1 are options.
+# CLIPS, CORPUS, NATURAL and LANGUAGES are folders of recordings. STEPS names steps; QUICK=1 and FRESH=1 are options.
 report: .venv/installed-dev setup $(LIPS_MODELS) $(RIVALS)/.venv/installed \
 		$(patsubst %,%/node_modules/.package-lock.json,$(RIVALS) $(LIPS))
 	$(BIN)/kouxing evaluate report $(STEPS) $(CLIPS:%=--lips %) $(CORPUS:%=--corpus %) $(NATURAL:%=--natural %) \
-		$(QUICK:1=--quick) $(FRESH:1=--fresh)
+		$(LANGUAGES:%=--languages %) $(QUICK:1=--quick) $(FRESH:1=--fresh)
 
 ovrlipsync: setup $(LIPS_MODELS)
 	rm -rf dist/ovrlipsync

@@ -295,6 +295,9 @@ def report(
     lips: Annotated[Path | None, typer.Option(help="Folder of clips with tracked lips.")] = None,
     corpus: Annotated[Path | None, typer.Option(help="Corpus of read speech.")] = None,
     natural: Annotated[Path | None, typer.Option(help="Folder of conversation.")] = None,
+    languages: Annotated[
+        Path | None, typer.Option(help="Folder of the recordings in corpora/languages.tsv.")
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Use parts of the data; ten minutes.")
     ] = False,
@@ -318,7 +321,13 @@ def report(
     if not (ROOT / "docs").is_dir():
         raise UserError("the report needs the source tree; run 'make report' there")
     folder = ROOT / "out" / "report" if quick else ROOT / "docs"
-    data = {"lips": lips, "corpus": corpus, "natural": natural, "rivals": ROOT / "out" / "rivals"}
+    data = {
+        "lips": lips,
+        "corpus": corpus,
+        "natural": natural,
+        "languages": languages,
+        "rivals": ROOT / "out" / "rivals",
+    }
     results = folder / "results"
     failed = run_steps(step or STEPS, data, results, is_quick=quick, is_fresh=fresh)
     write_page(results, folder / "results.md")

@@ -13,7 +13,7 @@ from typing import Any
 from kouxing.corpora.figures import new_figure, save_figure
 from kouxing.evaluation.report import lip_tables, system_tables
 from kouxing.evaluation.report.markdown import Results, Table, bullets, markdown
-from kouxing.evaluation.report.recognition_table import recognition
+from kouxing.evaluation.report.recognition_table import better_recognizers, recognition
 from kouxing.evaluation.report.steps import STEPS
 
 PICTURE = "lookahead.png"
@@ -29,7 +29,7 @@ class Part:
 
 
 TABLES = {
-    "recognition": Part(("read", "conversation", "disturbed"), recognition),
+    "recognition": Part(("read", "conversation", "disturbed", "languages"), recognition),
     "agreement": Part(("rivals",), lip_tables.agreement),
     "closures": Part(("rivals",), lip_tables.closures),
     "lookahead": Part(("lookahead",), lip_tables.lookahead),
@@ -52,7 +52,11 @@ def write_page(folder: Path, page: Path) -> None:
     """Write the page and its picture from the results in a folder."""
     steps = read_results(folder)
     results = {name: step["result"] for name, step in steps.items()}
-    better = [*lip_tables.better_programs(results), *system_tables.better_packages(results)]
+    better = [
+        *lip_tables.better_programs(results),
+        *better_recognizers(results),
+        *system_tables.better_packages(results),
+    ]
     text = _TEMPLATE.read_text("utf-8").replace(
         "[[better]]\n", bullets(better or ["In no measure"])
     )

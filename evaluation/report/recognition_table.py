@@ -4,6 +4,26 @@ from kouxing.evaluation.recognizer.disturbances import CLEAN
 from kouxing.evaluation.report.markdown import Results, Table, join_values
 from kouxing.evaluation.tables import format_number, percent
 
+_RECOGNIZERS = {  # of the languages
+    "auto": "`universal`, no language chosen",
+    "own": "the language's own phones",
+    "hama": "hama 1.7.0, offline",
+}
+_ERRORS = {
+    "phone": "errors of phones",
+    "viseme": "errors of visemes",
+    "feature": "errors of features",
+}
+_SPEECH = {
+    "de": "German, EmoDB",
+    "en-GRID": "English, GRID",
+    "en-learner": "English, native speakers of Mandarin",
+    "en-native": "English, VCTK and LJ Speech",
+    "it": "Italian, not in training",
+    "ko": "Korean, not in training",
+    "zh": "Mandarin, read",
+}
+
 
 def recognition(results: Results) -> Table:
     """Return the errors by kind of speech and model, one decimal."""
@@ -11,7 +31,7 @@ def recognition(results: Results) -> Table:
         "speech",
         "model",
         "phones",
-        "errors of the final hypothesis, phones / visemes, %",
+        "errors of the final hypothesis, phones / visemes (/ features), %",
         "of the first hypothesis",
         "delay p50 / p95, ms",
         "p b m f: recall / precision, %",
@@ -24,16 +44,46 @@ def recognition(results: Results) -> Table:
         for kind, score in figures["speech"].items():
             if kind != CLEAN and not kind.endswith("/s"):
                 rows.append([f"read, {kind}", f"`{model}`", *_cells(score)])
+    for group, scores in _by_language(results).items():
+        for recognizer, score in scores.items():
+            rows.append([_SPEECH.get(group, group), _RECOGNIZERS[recognizer], *_cells(score)])
     paper = ["read, own corpus", "Li et al. 2011, N = 3", "", "26.3 / -", "", "45", ""]
     return columns, [*rows, paper]
+
+
+def better_recognizers(results: Results) -> list[str]:
+    """Return a sentence for each error rate of a language in which hama is better."""
+    sentences = []
+    for group, scores in _by_language(results).items():
+        for unit, name in _ERRORS.items() if "hama" in scores else ():
+            hama, own = (scores[key]["final"][f"{unit}_error_rate"] for key in ("hama", "own"))
+            if hama < own:
+                sentences.append(
+                    f"{_SPEECH.get(group, group)}, {name}: hama 1.7.0, offline ({percent(hama)} %);"
+                    f" kouxing, live ({percent(own)} %)"
+                )
+    return sentences
+
+
+def _by_language(results: Results) -> dict[str, dict[str, Results]]:
+    """Return the scores of each kind of speech by recognizer."""
+    scores: dict[str, dict[str, Results]] = {}
+    for recognizer, figures in results.get("languages", {}).items():
+        for group, score in figures["speech"].items():
+            scores.setdefault(group.removeprefix("language "), {})[recognizer] = score
+    return scores
 
 
 def _cells(score: Results) -> list[str]:
     delay = score.get("delay_ms", {})
     errors = (
         join_values(
-            percent(score[hypothesis][f"{unit}_error_rate"]) for unit in ("phone", "viseme")
+            percent(score[hypothesis][key])
+            for unit in _ERRORS
+            if (key := f"{unit}_error_rate") in score[hypothesis]
         )
+        if hypothesis in score
+        else "-"
         for hypothesis in ("final", "first")
     )
     return [

@@ -43,8 +43,8 @@ _SERVICES = (
 class Step:
     """A command whose output is part of the report.
 
-    In commands, ``{lips}``, ``{corpus}`` and ``{natural}`` are folders of recordings, ``{rivals}``
-    is a folder for tables. The last command writes the results.
+    In commands, ``{lips}``, ``{corpus}``, ``{natural}`` and ``{languages}`` are folders of
+    recordings, ``{rivals}`` is a folder for tables. The last command writes the results.
     """
 
     commands: tuple[str, ...]
@@ -67,6 +67,17 @@ STEPS: Mapping[str, Step] = {
         (),
     ),
     "disturbed": Step(("evaluate recognizer --manifest {corpus} --split dev",), _RECOGNIZER, ()),
+    "languages": Step(
+        ("evaluate languages --audio {languages} --hama",),
+        (
+            "evaluation/recognizer/languages.py",
+            "evaluation/rivals/hama_phones.py",
+            "corpora/languages.tsv",
+            "services/recognizer/models/*.npz",
+            "shared/phones",
+        ),
+        (),
+    ),
     "lips": Step(
         (_LIP_SCORES,),
         _LIP_SCORES_CODE,

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
-from kouxing.evaluation.report import lip_tables, run, system_tables
+from kouxing.evaluation.report import lip_tables, recognition_table, run, system_tables
 from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.markdown import markdown
 from kouxing.evaluation.report.page import TABLES, write_page
@@ -185,6 +185,25 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert "`kouxing x`: m, 2026-01-01, commit c, 3 s (2 s of processor time), load 0.5" in text
     assert 'make report STEPS="faults"' in text
     assert (tmp_path / "lookahead.png").stat().st_size > 1000
+
+
+def test_languages_have_a_row_for_each_recognizer_and_hama_comes_first_if_better() -> None:
+    def score(feature: float, **more: Any) -> dict[str, Any]:
+        rates = {"phone": 0.3, "viseme": 0.2, "feature": feature}
+        final: dict[str, Any] = {f"{unit}_error_rate": rate for unit, rate in rates.items()}
+        final |= {"phone_errors": {"reference": 9}, "labials": {"recall": 1.0, "precision": 0.5}}
+        return {"speech": {"language en-GRID": {"final": final, **more}}}
+
+    live = {"first": {"phone_error_rate": 0.4, "viseme_error_rate": 0.3}, "delay_ms": {"p50": 90.0}}
+    languages = {"own": score(0.1, **live), "hama": score(0.05)}
+    results = {"languages": languages}
+    own, hama = recognition_table.recognition(results)[1][:2]
+    assert own[:4] == ["English, GRID", "the language's own phones", "9", "30.0 / 20.0 / 10.0"]
+    assert own[4:] == ["40.0 / 30.0", "90 / -", "100 / 50"]
+    assert hama[1:] == ["hama 1.7.0, offline", "9", "30.0 / 20.0 / 5.0", "-", "- / -", "100 / 50"]
+    assert recognition_table.better_recognizers(results) == [
+        "English, GRID, errors of features: hama 1.7.0, offline (5.0 %); kouxing, live (10.0 %)"
+    ]
 
 
 def test_writes_a_markdown_table() -> None:
