@@ -90,7 +90,21 @@ def test_a_default_may_depend_on_another_key() -> None:
         (SynthesizerConfig, "frame_rate_hz", "nan", "a number from 10 to 240"),
         (DriverConfig, "view", "hologram", "one of auto, window, none"),
         (DriverConfig, "width_px", "641", "a multiple of 2 from 16 to 7680"),
-        (GatewayConfig, "allowed_origins", "here", "a list of origins such as https://example.org"),
+        *(
+            (
+                GatewayConfig,
+                key,
+                "https://a.example; *",
+                "a list of origins such as https://example.org",
+            )
+            for key in ("allowed_origins", "frame_ancestors")
+        ),
+        (
+            GatewayConfig,
+            "senders",
+            "vmc://127.0.0.1 http://127.0.0.1",
+            "a list of addresses such as vmc://127.0.0.1:39540",
+        ),
     ],
 )
 def test_an_error_names_key_value_origin_and_what_is_allowed(
