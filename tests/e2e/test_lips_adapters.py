@@ -21,7 +21,6 @@ from tests.system import DEMO, NODE, ROOT
 PACKAGES = PACKAGE / "node_modules"
 CLIENT_PACKAGES = ROOT / "clients" / "javascript" / "node_modules"
 SIZE_PX = (320, 240)
-SILENCE_S = 0.5
 
 PAGE = """<!doctype html><link rel="icon" href="data:,"><button id="start">Start</button>
 <div id="node" style="width: 100px; height: 100px"></div>

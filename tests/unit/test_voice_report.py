@@ -118,13 +118,3 @@ def test_reports_an_unusable_list_of_sounds(tmp_path: Path, rows: str, problem: 
     (tmp_path / "manifest.tsv").write_text(f"{columns}\n{rows}", encoding="utf-8")
     with pytest.raises(UserError, match=problem):
         read_sounds([tmp_path], shipping=False)
-
-
-def test_held_vowels_have_the_pitch_of_their_voice() -> None:
-    low, high = (held_vowels()[number] for number in (0, 6))
-    for vowel, pitch_hz in ((low, 120), (high, 220)):
-        spectrum = np.fft.rfft(vowel[RATE_HZ : 2 * RATE_HZ], 1 << 17)
-        similarity = np.fft.irfft(np.abs(spectrum) ** 2)
-        lags = np.arange(RATE_HZ * 0.7 // pitch_hz, RATE_HZ * 1.4 // pitch_hz, dtype=int)
-        period = lags[similarity[lags].argmax()]
-        assert RATE_HZ / period == pytest.approx(pitch_hz, rel=0.03)
