@@ -1,4 +1,7 @@
-"""A live session whose recognizer or synthesizer is lost continues with another one."""
+"""A live session whose recognizer or synthesizer is lost continues with another one.
+
+tests/property/test_face_moves.py checks that the face does not jump.
+"""
 
 import signal
 import time
@@ -17,8 +20,6 @@ from tests.system import CHAIN, DEMO, LIMIT_S, System
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 LOST_AT = 24000  # samples
 ONSET_TOLERANCE = 480  # samples: another recognizer has processed less audio before
-LARGEST_STEP = 1.25  # relative to the largest undisturbed step
-UNSEEN = 1.0  # FAP units; smaller steps are invisible
 MAX_LATE = 6  # messages: a new phone revises those before it
 MOVED = {"recognizer": {"audio", "phones"}, "synthesizer": {"faps"}}
 
@@ -102,10 +103,6 @@ def test_a_session_continues_without_its_worker(
     epochs = [frame.epoch for frame in sent.frames]
     assert epochs == sorted(epochs)
     assert {*undisturbed.times} <= {*sent.times}
-    if service == "synthesizer":
-        largest = np.maximum(np.abs(np.diff(undisturbed.faps, axis=0)).max(axis=0), UNSEEN)
-        steps = np.abs(np.diff(sent.faps, axis=0)).max(axis=0)
-        assert (steps <= LARGEST_STEP * largest).all()
 
 
 def instances_of(client: Client) -> set[str]:

@@ -17,14 +17,23 @@ from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.keys import CLIENT
 from tests.containers import network_or_skip
 from tests.e2e.following import samples_of_file
-from tests.system import DEMO
+from tests.system import DEMO, NOTHING_SKIPPED
 
 CUT_AT_S = 1.0
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 
 
 @pytest.fixture(scope="module")
-def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HostsSystem]:
+def _complete() -> Iterator[None]:
+    """Let services process everything on a busy machine, with the block network."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in NOTHING_SKIPPED.items():
+            patch.setenv(name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def system(_complete: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[HostsSystem]:
     """Services on hosts whose links delay and lose packets, with a second recognizer."""
     folder = tmp_path_factory.mktemp("hosts")
     states = folder / "states"
