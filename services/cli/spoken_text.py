@@ -5,7 +5,7 @@ from pathlib import Path
 from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text
 from kouxing.services.recognizer.alignment import MIN_FIT, Alignment
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory
 from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import read_file
@@ -41,15 +41,17 @@ def read_text(text: str, inventory: PhoneInventory) -> Transcript:
     named = ", ".join(words[:_MAX_NAMED])
     if len(words) > _MAX_NAMED:
         named += f" and {len(words) - _MAX_NAMED} more"
+    advice = (
+        "write them in characters, or use --language auto"
+        if inventory.language == DEFAULT_LANGUAGE
+        else "write them as they are spoken, or use another --language"
+    )
     if not transcript.syllables:
         if words:
-            raise UserError(f"no word of the text can be read: {named}; write them in characters")
+            raise UserError(f"no word of the text can be read: {named}; {advice}")
         raise UserError("the text is empty; give the spoken words")
     if words:
-        print_message(
-            f"words that cannot be read were ignored: {named}; write them as they are spoken, in"
-            " characters"
-        )
+        print_message(f"words that cannot be read were ignored: {named}; {advice}")
     return transcript
 
 

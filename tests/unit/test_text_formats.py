@@ -8,6 +8,7 @@ import pytest
 from kouxing.services.cli.spoken_text import read_text, text_of
 from kouxing.services.cli.text_formats import decode_text, extract_text
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import load_inventory
 from tests.languages import MANDARIN
 
 ONE, TWO = "大家好，我是人。", "请看我的嘴唇。"
@@ -260,8 +261,12 @@ def test_reports_each_word_that_cannot_be_read(capsys: pytest.CaptureFixture[str
         assert MANDARIN.read(text).dropped[:4] == ("hello", "world", "café", "Tom")
         assert len(read_text(text, MANDARIN).syllables) == 3
         assert "ignored: 'hello', 'world', 'café', 'Tom'; write" in capsys.readouterr().err
-    with pytest.raises(UserError, match="no word of the text can be read: 'hello', 'world'"):
+    with pytest.raises(
+        UserError, match="read: 'hello', 'world'; write them in characters, or use --language auto"
+    ):
         read_text("hello world", MANDARIN)
+    with pytest.raises(UserError, match="read: '你好'; write them as they are spoken, or use ano"):
+        read_text("你好", load_inventory("german"))
 
 
 @pytest.mark.parametrize(
