@@ -68,10 +68,12 @@ def write_page(folder: Path, page: Path) -> None:
 
 def _part(name: str, steps: Results, results: Results) -> str:
     part = TABLES[name]
-    measured = [step for step in part.steps if step in steps]
-    if not measured:
-        return f'Not measured yet: `make report STEPS="{" ".join(part.steps)}"`.\n'
-    notes = [_describe_measurement(steps[step]) for step in measured]
+    missing = [step for step in part.steps if step not in steps]
+    command = f'Not measured yet: `make report STEPS="{" ".join(missing)}"`'
+    if missing == [*part.steps]:
+        return f"{command}.\n"
+    notes = [_describe_measurement(steps[step]) for step in part.steps if step in steps]
+    notes += [command] if missing else []
     if name == "agreement" and "lips" in steps:
         notes += [*lip_tables.disturbed_lips(results), _describe_measurement(steps["lips"])]
     return f"{markdown(part.table(results))}\n{bullets(notes)}"

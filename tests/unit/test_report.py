@@ -172,6 +172,7 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     results = {
         "rivals": rivals(),
         "lookahead": faces(**{"learnt, 0 ms": SCORES, "learnt, 60 ms": BETTER}),
+        "read": {},
     }
     for name, result in results.items():
         write_result(tmp_path / "results" / f"{name}.json", step_file(result))
@@ -184,6 +185,7 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert "| floor of the latency, ms | 37 | 97 |" in text
     assert "`kouxing x`: m, 2026-01-01, commit c, 3 s (2 s of processor time), load 0.5" in text
     assert 'make report STEPS="faults"' in text
+    assert '- Not measured yet: `make report STEPS="conversation disturbed languages"`' in text
     assert (tmp_path / "lookahead.png").stat().st_size > 1000
 
 
