@@ -102,9 +102,12 @@ def analyze_recording(
                 events.append(item)
 
     meter = SliceMeter()
-    extended = np.pad(samples, (0, round(MAX_DELAY_S * MEDIA_RATE_HZ)))
-    for start in with_progress(range(0, len(extended), MEDIA_RATE_HZ)):
-        for piece, progress in meter.accept_waveform(extended[start : start + MEDIA_RATE_HZ]):
+    silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)
+    for start in with_progress(range(0, len(samples) + len(silence), MEDIA_RATE_HZ)):
+        second = samples[start : start + MEDIA_RATE_HZ]
+        if num_missing := MEDIA_RATE_HZ - len(second):
+            second, silence = np.append(second, silence[:num_missing]), silence[num_missing:]
+        for piece, progress in meter.accept_waveform(second):
             add_events(segmenter.accept_waveform(piece))
             if progress is not None:
                 events.append(replace(progress, **segmenter.traits._asdict()))

@@ -108,14 +108,14 @@ def animate(
 
     Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """
-    reading = progress.add_task("reading", total=None)
+    loading = progress.add_task("loading", total=None)
     model, predictor = _load_models(mouth, language)
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
     models = [load_lip_model(model.inventory.language, name) for name in lip_models]
     settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
     transcript = None if text is None else read_text(text, load_inventory(language))
-    samples = read_mono_16k(source, track)
-    progress.remove_task(reading)
+    progress.remove_task(loading)
+    samples = read_mono_16k(source, track, progress)
     events: Sequence[SoundEvent]
     if live:
         chains = [

@@ -1,6 +1,5 @@
 """Prints or records the output of a session: FAPs or shapes, syllables or phones."""
 
-import contextlib
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
+from kouxing.shared.interrupt import catch_interrupt
 from kouxing.shared.phones import events
 from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
@@ -107,7 +107,7 @@ def _wait_for_session(name: str, client: Client) -> Session:
 def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
     """Yield results until the session ends or the user interrupts."""
     print_message(f"following session {session}")
-    with contextlib.suppress(KeyboardInterrupt):
+    with catch_interrupt():
         yield from results
 
 

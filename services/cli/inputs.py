@@ -1,16 +1,22 @@
 """Reads the sound files of commands."""
 
+import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import Progress
 
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.shared.audio_file import clipping_remarks, limited_blocks, num_clipped, open_audio
+from kouxing.shared.channels import Samples
 from kouxing.shared.terminal import print_message
 
 
-def read_mono_16k(path: Path, track: int | None = None) -> NDArray[np.float32]:
+def read_mono_16k(
+    path: Path, track: int | None = None, progress: Progress | None = None
+) -> NDArray[np.float32]:
     """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
 
     Prints a message if the file is truncated or clipped, or has other tracks. Raises ``UserError``
@@ -20,12 +26,17 @@ def read_mono_16k(path: Path, track: int | None = None) -> NDArray[np.float32]:
     for notice in source.notices:
         print_message(notice)
     resampler = Resampler(source.sample_rate_hz, source.num_channels)
-    parts = []
+    content = bytearray()  # grows in place: joining parts would need twice the memory
     num_samples = clipped = 0
-    for block in limited_blocks(source):
-        parts.append(resampler.accept_waveform(block))
+    blocks: Iterable[Samples] = limited_blocks(source)
+    if progress is not None:
+        num_blocks = None if source.duration_s is None else math.ceil(source.duration_s)
+        blocks = progress.track(blocks, total=num_blocks, description="reading")
+    for block in blocks:
+        content += resampler.accept_waveform(block).data
         num_samples += block.size
         clipped += num_clipped(block)
+    content += resampler.finish().data
     for remark in (*source.remarks, *clipping_remarks(str(path), clipped / max(1, num_samples))):
         print_message(remark)
-    return np.concatenate([*parts, resampler.finish()])
+    return np.frombuffer(content, np.float32)

@@ -18,6 +18,7 @@ from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
+from kouxing.shared.interrupt import end_interrupt, is_interrupted
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.terminal import CONSOLE
 
@@ -134,12 +135,28 @@ for kind in KINDS.values():
 
 
 def main() -> None:
-    """Run the command line. A user error gives one line on standard error and exit status 2."""
+    """Run the command line. A user error gives one line on standard error and exit status 2.
+
+    Ctrl-C gives exit status 130, whatever exception a library turns it into.
+    """
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # also when it is a log file
     try:
+        _run_command()
+    except Exception:
+        if not is_interrupted():
+            raise
+        sys.exit(130)
+    finally:
+        end_interrupt()
+
+
+def _run_command() -> None:
+    try:
         app(prog_name="kouxing")
     except UserError as error:
+        if is_interrupted():
+            raise
         text = str(error)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):

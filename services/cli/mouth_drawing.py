@@ -272,8 +272,11 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
         open_progress() as progress,
     ):
-        writer.write_sound(mouth.samples)
+        num_sent = 0
         for time_s, opening, width in progress.track(frames, description="drawing"):
+            end = round((time_s + 1.0 / FRAME_RATE_HZ) * MEDIA_RATE_HZ)
+            writer.write_sound(mouth.samples[num_sent:end])
+            num_sent = end
             moment = drawing.LabeledMouth(
                 time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels), width
             )

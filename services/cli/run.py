@@ -27,6 +27,7 @@ from kouxing.services.kinds import (
 from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.errors import UserError, naming_option
+from kouxing.shared.interrupt import end_interrupt, install_interrupt
 from kouxing.shared.keys import check_keys, control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 
@@ -125,10 +126,15 @@ def run(
             )
             supervisor.wait()
     except KeyboardInterrupt:
-        print_message("stopping")
+        _stop_at_interrupt()
     finally:
         supervisor.stop()
         reservation.close()
+
+
+def _stop_at_interrupt() -> None:
+    end_interrupt()
+    print_message("stopping")
 
 
 def head_environment(name: str, out: Path) -> dict[str, str]:
@@ -198,8 +204,7 @@ def _port_remark(settings: Settings, moved: Mapping[str, str], control: str) -> 
 
 def _install_signal_handlers() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    # a shell's background processes ignore SIGINT
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    install_interrupt()  # a shell's background processes ignore SIGINT
 
 
 def _open_browser(page: str) -> None:

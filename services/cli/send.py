@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import threading
 import time
 from collections.abc import Iterable
@@ -15,6 +14,7 @@ from kouxing_client import Client, FapFrame, KouxingError, Results, Session
 from kouxing.services.senders.senders import Senders
 from kouxing.services.senders.target import Target
 from kouxing.shared.control_client import connect
+from kouxing.shared.interrupt import catch_interrupt, install_interrupt
 from kouxing.shared.terminal import print_message
 
 SEARCH_PERIOD_S = 0.2
@@ -28,11 +28,11 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
     While there are no frames, the face's idle motion is sent, which the seed determines. Raises
     ``UserError`` if control does not answer, or there are too many targets.
     """
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
+    install_interrupt()  # a background shell ignores SIGINT
     with (
         connect(control) as client,
         contextlib.closing(Senders(idle_motion_seed, _report)) as senders,
-        contextlib.suppress(KeyboardInterrupt),
+        catch_interrupt(),
     ):
         client.status()
         for target in targets:

@@ -68,15 +68,19 @@ def render_video(
     recording = Recording(
         path, renderer, frame_rate_hz, sound=samples is not None, captions=captions
     )
+    sound = np.zeros(0, np.float32) if samples is None else samples
+    num_sent = 0
     try:
-        if samples is not None:
-            recording.add_sound(0, samples)
-            if len(samples) / MEDIA_RATE_HZ > frames[-1][0]:
-                frames = [*frames, (len(samples) / MEDIA_RATE_HZ, frames[-1][1])]
+        if len(sound) / MEDIA_RATE_HZ > frames[-1][0]:
+            frames = [*frames, (len(sound) / MEDIA_RATE_HZ, frames[-1][1])]
         for time_s, faps in frames:
             recording.add_frame(time_s, faps)
         while recording.step():
+            end = round(recording.duration_s * MEDIA_RATE_HZ)
+            recording.add_sound(num_sent, sound[num_sent:end])
+            num_sent = min(end, len(sound))
             on_progress(min(1.0, recording.duration_s / max(frames[-1][0], 1e-9)))
+        recording.add_sound(num_sent, sound[num_sent:])
     except BaseException:
         recording.discard()
         raise

@@ -1,0 +1,67 @@
+"""Ctrl-C that ends a command, even if a library drops the exception.
+
+Python raises ``KeyboardInterrupt`` in the code that runs at this moment. The exception is lost if a
+library called this code, for example FFmpeg to read a file, or if a module with ``except:`` is
+being imported. Then it is raised again.
+"""
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+_REPEAT_S = 0.5
+
+
+def install_interrupt() -> None:
+    """Raise ``KeyboardInterrupt`` on Ctrl-C, repeatedly until it is handled.
+
+    Libraries that drop it print no traceback.
+    """
+    sys.excepthook, sys.unraisablehook = _print_error, _print_unraisable
+    signal.signal(signal.SIGALRM, _repeat)
+    signal.signal(signal.SIGINT, _interrupt)
+
+
+def is_interrupted() -> bool:
+    """Return whether Ctrl-C was pressed and is not yet handled."""
+    return signal.getitimer(signal.ITIMER_REAL)[0] > 0.0
+
+
+def end_interrupt() -> None:
+    """Stop repeating the exception: it is handled."""
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+@contextlib.contextmanager
+def catch_interrupt() -> Iterator[None]:
+    """Leave the block on Ctrl-C, without an exception."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        end_interrupt()
+
+
+def _print_error(kind: type[BaseException], *rest: Any) -> None:
+    if not issubclass(kind, KeyboardInterrupt):
+        sys.__excepthook__(kind, *rest)
+
+
+def _print_unraisable(error: Any) -> None:
+    if not issubclass(error.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(error)
+
+
+def _interrupt(*_: object) -> None:
+    signal.setitimer(signal.ITIMER_REAL, _REPEAT_S, _REPEAT_S)
+    raise KeyboardInterrupt
+
+
+def _repeat(*_: object) -> None:
+    error = sys.exception()
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return  # an except or finally block is running
+        error = error.__context__
+    raise KeyboardInterrupt

@@ -1,0 +1,98 @@
+"""Ctrl-C ends a command, even if a library drops the exception."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.system import LIMIT_S, ROOT, VOWELS_FILE, start_python
+
+PRESS = """
+import signal
+from kouxing.shared.interrupt import catch_interrupt, install_interrupt
+install_interrupt()
+"""
+DROPPED = """
+try:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except:
+        pass
+    while True:
+        signal.pause()
+except KeyboardInterrupt:
+    print("raised again")
+"""
+CLEANED_UP = """
+try:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        try:
+            raise ValueError
+        except ValueError:
+            signal.pause()  # until the exception is due again
+        signal.pause()
+        print("cleaned up")
+except KeyboardInterrupt:
+    print("raised once")
+"""
+CAUGHT = """
+with catch_interrupt():
+    signal.raise_signal(signal.SIGINT)
+print(signal.getitimer(signal.ITIMER_REAL))
+"""
+# `COMMAND` runs as the command line, with Ctrl-C in a function that FFmpeg calls.
+IN_FFMPEG = """
+import signal
+from kouxing.shared import media_file
+call = media_file._GuardedFile._call
+presses = [signal.SIGINT]
+
+def interrupt(*arguments):
+    if presses:
+        signal.raise_signal(presses.pop())
+    return call(*arguments)
+
+media_file._GuardedFile._call = interrupt
+"""
+IN_IMPORT = """
+import signal
+try:
+    signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    raise ImportError("initialization failed")
+"""
+COMMAND = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from kouxing.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "printed"),
+    [
+        (DROPPED, "raised again\n"),
+        (CLEANED_UP, "cleaned up\nraised once\n"),
+        (CAUGHT, "(0.0, 0.0)\n"),
+    ],
+)
+def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) -> None:
+    process = start_python("-c", PRESS + program, PYTHONPATH=str(ROOT))
+    assert process.communicate(timeout=LIMIT_S) == (printed, "")
+
+
+@pytest.mark.parametrize("place", ["FFmpeg", "import"])
+def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) -> None:
+    program, path = COMMAND, str(ROOT)
+    if place == "FFmpeg":
+        program = IN_FFMPEG + COMMAND
+    else:
+        (tmp_path / "onnxruntime.py").write_text(IN_IMPORT)
+        path = f"{tmp_path}{os.pathsep}{ROOT}"
+    process = start_python("-c", program, "phones", str(VOWELS_FILE), PYTHONPATH=path)
+    printed, log = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, printed) == (130, "")
+    assert "Traceback" not in log
