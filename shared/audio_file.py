@@ -22,11 +22,12 @@ from kouxing.shared.media_file import (
     to_float,
 )
 from kouxing.shared.sound_formats import (
+    MAX_ZERO_BYTES,
     NUM_BEGIN_BYTES,
-    is_sound,
     needs_more,
     needs_whole_file,
     non_audio_kind,
+    sound_place,
     stated_bytes,
 )
 from kouxing.shared.user_file import check_content, open_file
@@ -133,7 +134,8 @@ def _open_pipe(
     begin = pipe.peek()
     if not begin:
         raise UserError(f"{name}: no sound arrived; check the command that writes it")
-    if not is_sound(begin):
+    place = sound_place(begin)
+    if place is None:
         if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")
         raw = raw or RawFormat()
@@ -149,6 +151,7 @@ def _open_pipe(
             f"{name}: the format of this sound states its rate and channels; leave out --rate and"
             " --channels, or add --raw if these are raw samples"
         )
+    begin = pipe.skip(place)
     if stream.seekable() or needs_whole_file(begin):
         file = stream if stream.seekable() else pipe.read_all()
         file.seek(0)
@@ -175,11 +178,20 @@ class _Pipe:
 
     def peek(self) -> bytes:
         """Return the first bytes, as many as are needed to recognize the format."""
-        while len(self._begin) < NUM_BEGIN_BYTES and needs_more(self._begin):
+        while (
+            len(self._begin) < NUM_BEGIN_BYTES + MAX_ZERO_BYTES
+            and len(self._begin.lstrip(b"\0")) < NUM_BEGIN_BYTES
+            and needs_more(self._begin)
+        ):
             piece = self._stream.read1(NUM_BEGIN_BYTES)
             if not piece:
                 break
             self._begin += piece
+        return self._begin
+
+    def skip(self, num_bytes: int) -> bytes:
+        """Drop the first bytes; return the next ones, as ``peek`` does."""
+        self._begin = self._begin[num_bytes:]
         return self._begin
 
     def read(self, size: int) -> bytes:

@@ -21,6 +21,7 @@ from kouxing.shared.sound_formats import (
     is_transport_stream,
     unprobed_format,
     why_unreadable,
+    wrong_codec_of_wav,
 )
 
 _MAX_STREAMS = 64
@@ -79,6 +80,8 @@ class MediaSound:
         self._mixers: dict[tuple[str, str, int], list[Any]] = {}
         if begin.startswith(b"RIFX"):  # FFmpeg reads its samples in the wrong byte order
             raise UserError(f"{name}: this is a big-endian WAV file; export it as wav or flac")
+        if codec := wrong_codec_of_wav(begin):
+            raise UserError(f"{name}: {codec} is not supported; export the sound as 16-bit PCM")
         options = OPTIONS
         if is_pipe:
             options = _PACKET_OPTIONS if is_transport_stream(begin) else _PIPE_OPTIONS

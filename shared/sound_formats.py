@@ -1,11 +1,15 @@
 """Recognizes the formats of sound, and of other files, by their first bytes."""
 
 import codecs
+import re
 from typing import Literal
 
 import av
 
 NUM_BEGIN_BYTES = 16_384  # enough for all of this module; three frames of the largest size
+_MAX_LEADING_ZEROS = 4  # in a format
+MAX_ZERO_BYTES = 131_072  # padding before a format
+_NUM_FRAMED_BYTES = 8192  # size of the checked start of a stream that may begin within a frame
 _NUM_HEADER_BYTES = 4096  # size of the checked start of a WAV or MP4 file
 _SOUND = (
     (0, b"RIFF"), (0, b"RIFX"), (0, b"RF64"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"),
@@ -36,6 +40,8 @@ _FRAMED = (
     ("aac_latm", 0xFFE0, 0x56E0),
     ("sbc", 0xFF00, 0x9C00),
 )
+# Without free and invalid bit rates, which quiet samples often look like.
+_MP3_FRAME = re.compile(rb"\xff[\xe2\xe3\xf2\xf3\xfa\xfb][\x10-\xef]")
 _TS_SYNC = 0x47
 _TS_PACKETS = ((0, 188), (4, 192))  # the place of the first byte, and the packet's size
 MAX_OGG_PAGE_BYTES = 27 + 255 + 255 * 255
@@ -48,6 +54,7 @@ _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
     b"RF64": (20, 8, "little", 8),
     b"riff": (16, 8, "little", 0),
 }
+_WRONG_WAV_CODECS = {0x38: "NMS ADPCM", 0x40: "G.721 ADPCM"}  # FFmpeg takes them for others
 _ASF_PROPERTIES = b"\xa1\xdc\xab\x8c\x47\xa9\xcf\x11"  # its size of the file follows
 _OTHER = {
     b"PK\3\4": "a zip archive; unpack it first",
@@ -69,8 +76,19 @@ def is_sound(begin: bytes) -> bool:
         any(begin.startswith(mark, place) for place, mark in (*_SOUND, *_UNPROBED.values()))
         or (begin.startswith(b"\x80\0") and b"(c)CRI" in begin)  # ADX
         or is_transport_stream(begin)
-        or any(_consists_of_frames(begin, *kind) for kind in _FRAMED)
+        or _consists_of_frames(begin)
     )
+
+
+def sound_place(begin: bytes) -> int | None:
+    """Return where a format of sound starts in the first bytes of a pipe; None: nowhere.
+
+    Zeros may come before it. An MP3 stream may begin within a frame.
+    """
+    num_zeros = len(begin) - len(begin.lstrip(b"\0"))
+    places = [0, *range(max(1, num_zeros - _MAX_LEADING_ZEROS), num_zeros + 1)]
+    places += [match.start() for match in _MP3_FRAME.finditer(begin, num_zeros)]
+    return next((place for place in places if is_sound(begin[place:][:NUM_BEGIN_BYTES])), None)
 
 
 def unprobed_format(begin: bytes) -> str | None:
@@ -87,9 +105,12 @@ def needs_more(begin: bytes) -> bool:
         return True
     if begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
         return len(begin) < _NUM_HEADER_BYTES
+    if not any(begin):
+        return len(begin) < MAX_ZERO_BYTES
+    content = begin.lstrip(b"\0")
     may_be = _TS_SYNC in (begin[0], begin[4]) or begin.startswith(b"\x80\0")
-    may_be |= any(int.from_bytes(begin[:2], "big") & mask == sync for _, mask, sync in _FRAMED)
-    return may_be and not is_sound(begin)
+    may_be |= len(content) < _NUM_FRAMED_BYTES or _framed_codec(content) is not None
+    return may_be and sound_place(begin) is None
 
 
 def non_audio_kind(begin: bytes) -> str:
@@ -118,13 +139,25 @@ def why_unreadable(begin: bytes, reason: str) -> str:
 
 
 def stated_bytes(begin: bytes) -> int | None:
-    """Return the size that a WAV, W64, AVI, AIFF or WMA header states; None if unknown."""
+    """Return the size that a WAV, W64, AVI, AIFF, CAF or WMA header states; None if unknown."""
+    if begin.startswith(b"caff"):
+        return _stated_bytes_of_caf(begin)
     for mark, (start, size, order, num_before) in _SIZES.items():
         if begin.startswith(mark):
             stated = int.from_bytes(begin[start : start + size], order) + num_before
             return stated if stated < MIN_UNKNOWN_BYTES else None
     if (place := begin.find(_ASF_PROPERTIES)) > 0:
         return int.from_bytes(begin[place + 40 : place + 48], "little")
+    return None
+
+
+def _stated_bytes_of_caf(begin: bytes) -> int | None:
+    place = 8
+    while place + 12 <= len(begin):
+        end = place + 12 + int.from_bytes(begin[place + 4 : place + 12], "big", signed=True)
+        if begin[place : place + 4] == b"data":
+            return end if end > place + 12 else None
+        place = max(end, place + 12)
     return None
 
 
@@ -145,6 +178,13 @@ def codec_of_padded_wav(begin: bytes) -> str | None:
     bits = int.from_bytes(header[14:16], "little")
     is_padded = kind == 0xFFFE and subtype == 1 and bits in (24, 32) and 8 < valid < bits
     return f"pcm_s{bits}le" if begin[8:12] == b"WAVE" and is_padded else None
+
+
+def wrong_codec_of_wav(begin: bytes) -> str | None:
+    """Return the codec of a WAV file, if FFmpeg takes it for another."""
+    place = begin.find(b"fmt ") + 8
+    kind = int.from_bytes(begin[place : place + 2], "little")
+    return _WRONG_WAV_CODECS.get(kind) if begin[8:12] == b"WAVE" else None
 
 
 def needs_whole_file(begin: bytes) -> bool:
@@ -175,10 +215,17 @@ def is_transport_stream(begin: bytes) -> bool:
     )
 
 
-def _consists_of_frames(begin: bytes, codec: str, mask: int, sync: int) -> bool:
+def _framed_codec(begin: bytes) -> tuple[str, int, int] | None:
+    start = int.from_bytes(begin[:2], "big")
+    return next((kind for kind in _FRAMED if start & kind[1] == kind[2]), None)
+
+
+def _consists_of_frames(begin: bytes) -> bool:
     """Return whether a codec's parser finds frame after frame from the first byte."""
-    if int.from_bytes(begin[:2], "big") & mask != sync:
+    kind = _framed_codec(begin)
+    if kind is None:
         return False
+    codec, mask, sync = kind
     packets = [bytes(packet) for packet in av.CodecContext.create(codec, "r").parse(begin)]
     return (
         len(packets) >= 3

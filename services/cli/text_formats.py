@@ -47,7 +47,7 @@ _MARKS = (
 )
 _MIN_COMMON = 0.8  # share of common characters in a text that was decoded correctly
 
-_TIME = r"(?:\d{1,3}:)?\d{1,2}:\d{2}(?:[.,:]\d{1,3})?"
+_TIME = r"(?:\d{1,3}[:：])?\d{1,2}[:：]\d{2}(?:[.,:]\d{1,3})?"
 _LRC_TIME = r"\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
 _FRAMES = r"(?:\{\d+\}\{\d*\}|\[\d+\]\[\d*\])"
 _LABEL = (  # times of Audacity or CTM, or the name of a recording
@@ -60,8 +60,10 @@ _LINE_IN_SECONDS = (  # [0.00s -> 3.40s], as faster-whisper prints
     rf"[(\[]?{_SECONDS}[ \t]*(?:--?>|→)[ \t]*{_SECONDS}[)\]]?"
     rf"|[(\[]{_SECONDS}[ \t]*[-–—~][ \t]*{_SECONDS}[)\]]"
 )
+_TIME_IN_BRACKETS = rf"[(\[{{<（［【〔「]{_TIMES}[)\]}}>）］】〕」]"
+_EXACT_TIME = r"0?0[:：]\d{2}(?:[:：]\d{2}(?:[.,:]\d{1,3})?|[.,]\d{1,3})"
 _TIMED_LINE = (  # also the line of a speaker, with the time at its end
-    rf"(?:[(\[【]{_TIMES}[)\]】]|{_TIMES}(?=[ \t]|$)|\S.{{,30}}?[ \t]+{_TIMES}[ \t]*$)[ \t]*"
+    rf"(?:(?:{_TIME_IN_BRACKETS})+|{_TIMES}(?=[ \t]|$)|\S.{{,30}}?[ \t]+{_TIMES}[ \t]*$)[ \t]*"
 )
 _LYRICS_TIME = r"\[\d+,\d+\]"
 
@@ -237,10 +239,10 @@ def _read_timed_lyrics(text: str) -> str:
 def _read_timed_lines(text: str) -> str:
     """Extract the lines without their times.
 
-    If every timed line is followed by an untimed line, the timed lines contain speakers' names.
+    If each of several timed lines is followed by an untimed line, they contain speakers' names.
     """
     lines = [(re.match(_TIMED_LINE, line), line) for line in text.split("\n")]
-    are_names = all(
+    are_names = sum(match is not None for match, _ in lines) > 1 and all(
         match is None or (following is None and next_line.strip())
         for (match, _), (following, next_line) in pairwise([*lines, (None, "")])
     )
@@ -365,6 +367,11 @@ _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (
         "a transcript with times",
         re.compile(rf"^[ \t]*(?:{_LINE_IN_SECONDS})", re.MULTILINE),
         _read_lines_in_seconds,
+    ),
+    (
+        "a transcript with times",
+        re.compile(rf"^[ \t]*(?:{_TIME_IN_BRACKETS}|{_EXACT_TIME}(?=[ \t]))", re.MULTILINE),
+        _read_timed_lines,
     ),
     ("MicroDVD or MPL2", re.compile(rf"\A{_FRAMES}"), _read_frame_numbers),
     ("a table of labels", re.compile(rf"\A([^\n]*\n)?{_LABEL}"), _read_labels),

@@ -80,6 +80,48 @@ def test_decodes_a_pipe_like_a_file(
     assert source.remarks == source.notices == []
 
 
+@pytest.mark.parametrize(
+    ("name", "num_zeros", "num_lost"),
+    [("a.mp3", 20_000, 0), ("a.mp3", 0, 700), ("a.flac", 100_000, 0), ("a.m4a", 999, 0)],
+)
+def test_finds_a_format_after_padding_and_within_an_mp3_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, num_zeros: int, num_lost: int
+) -> None:
+    path = tmp_path / name
+    if name == "a.m4a":
+        write_media(path, "aac", SPEECH, RATE_HZ, options={"movflags": "faststart"})
+    else:
+        soundfile.write(path, SPEECH, RATE_HZ)
+    expected, _ = read_audio(path)
+    source = _open(monkeypatch, bytes(num_zeros) + path.read_bytes()[num_lost:])
+    samples = np.concatenate([*source.blocks])[:, 0]
+    assert source.notices == []
+    part = expected[16_000:20_000, 0]  # at another time, if the first frame is missing
+    assert np.correlate(samples, part).max() > 0.99 * float(part @ part)
+
+
+@pytest.mark.parametrize("subtype", ["G721_32", "NMS_ADPCM_32"])
+def test_rejects_wav_codecs_that_ffmpeg_takes_for_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, subtype: str
+) -> None:
+    path = tmp_path / "a.wav"
+    soundfile.write(path, SPEECH, RATE_HZ, subtype=subtype)
+    with pytest.raises(UserError, match=r"ADPCM is not supported; export"):
+        open_audio(path)
+    with pytest.raises(UserError, match=r"ADPCM is not supported; export"):
+        _open(monkeypatch, path.read_bytes())
+
+
+def test_reports_a_caf_file_that_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.caf"
+    soundfile.write(path, SPEECH, RATE_HZ)
+    path.write_bytes(path.read_bytes()[:-32_000])
+    source = open_audio(path)
+    assert sum(map(len, source.blocks)) == 16_000
+    (remark,) = source.remarks
+    assert remark.startswith(f"{path}: the file is cut off after 1.0 s of")
+
+
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "PCM_24", "PCM_U8", "ALAW", "ULAW"])
 def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, subtype: str) -> None:
     file = io.BytesIO()
