@@ -134,8 +134,9 @@ def draw_mouth(
         raise UserError("give either a text or --speech-to-text, not both")
     if text is None and speech_to_text is None and timing is not None:
         raise UserError("--timing needs a text; give the spoken text before the output file")
-    samples = read_mono_16k(source, track)
     inventory = load_inventory(language)
+    with open_progress() as progress:
+        samples = read_mono_16k(source, track, progress)
     if speech_to_text is not None:
         text = Transcriber(speech_to_text).transcribe(samples) or None
         print_message(f"{source}: {text or 'no words were recognized'}")
@@ -143,7 +144,7 @@ def draw_mouth(
     with open_progress() as progress:
         with_progress = partial(progress.track, description="timing")
         timed = _time_phones(source, samples, transcript, timing, inventory, with_progress)
-        with_progress = partial(progress.track, description="finding the lips")
+        with_progress = partial(progress.track, description="finding the width")
         widths = _widths(lips, samples, timed, inventory, with_progress)
     phones = spoken(timed, inventory)
     if not phones:
@@ -173,7 +174,7 @@ def _time_phones(
         is_long = len(transcript.syllables) > MAX_SYLLABLES
         timing = Timing.ALIGN if is_long else Timing.ENDPOINTS
     if transcript is not None and timing is Timing.ENDPOINTS:
-        recording = progress_of(samples), transcript.phones, load_table(inventory)
+        recording = progress_of(samples, with_progress), transcript.phones, load_table(inventory)
         phones = time_text(*recording)
         ratio = speech_ratio(*recording)
         if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
@@ -201,7 +202,7 @@ def _widths(
     recording = analyze_recording(samples, timed, predictor, with_progress=with_progress)
     lip_model = load_lip_model(inventory.language, lips)
     frames = animate_recording(
-        recording, lip_model, SynthesizerConfig(lips=lips, expressiveness=1.0)
+        recording, lip_model, SynthesizerConfig(lips=lips, expressiveness=1.0), with_progress
     )
     stretch = [faps[_STRETCH].sum() / FAP_UNITS_PER_FAPU for _, faps in frames]
     return np.array([time_s for time_s, _ in frames]), 1.0 + np.array(stretch)
@@ -293,10 +294,11 @@ def _label_at(time_s: float, spans: Sequence[Span]) -> str:
 def _write_csv(output: Path, mouth: _Mouth) -> str:
     times_s, openings, widths = mouth.sample()
     symbols = mouth.symbols
-    with open_output(output) as file:
+    with open_output(output) as file, open_progress() as progress:
         table = csv.writer(codecs.getwriter("utf-8")(file), lineterminator="\n")
         table.writerow(CSV_COLUMNS)
-        for first in range(0, len(times_s), _BLOCK_FRAMES):
+        firsts = progress.track(range(0, len(times_s), _BLOCK_FRAMES), description="writing")
+        for first in firsts:
             block = slice(first, first + _BLOCK_FRAMES)
             contours = rounded_contour(openings[block], widths[block], mouth.num_points)
             for time_s, opening, lines in zip(

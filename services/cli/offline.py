@@ -243,12 +243,14 @@ def phones(
     if is_folder:
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
     check_output(*(target for _, target in pairs), inputs=audio, force=force)
-    model = model_of_language(language, acoustic)
+    with open_progress() as progress:
+        progress.add_task("loading", total=None)
+        model = model_of_language(language, acoustic)
 
     def recognize_file(source: Path, target: Path | None) -> None:
-        samples = read_mono_16k(source, track)
-        duration_s = len(samples) / MEDIA_RATE_HZ
         with open_progress() as progress:
+            samples = read_mono_16k(source, track, progress)
+            duration_s = len(samples) / MEDIA_RATE_HZ
             with_progress = partial(progress.track, description="recognizing")
             recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
         if not recognized:
@@ -284,10 +286,12 @@ def align(
 
     style = _format(form, output)
     check_output(output, inputs=[audio, Path(text)], force=force)
-    model = model_of_language(language, acoustic)
-    transcript = read_text(text, load_inventory(language or model.inventory.language))
-    samples = read_mono_16k(audio, track)
     with open_progress() as progress:
+        loading = progress.add_task("loading", total=None)
+        model = model_of_language(language, acoustic)
+        transcript = read_text(text, load_inventory(language or model.inventory.language))
+        progress.remove_task(loading)
+        samples = read_mono_16k(audio, track, progress)
         with_progress = partial(progress.track, description="aligning")
         alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     duration_s = len(samples) / MEDIA_RATE_HZ

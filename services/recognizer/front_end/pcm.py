@@ -1,13 +1,13 @@
 """Conversion of audio bytes to samples and back, and the level and pitch of 20 ms slices."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
-from kouxing.shared.clock import to_seconds
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
@@ -110,6 +110,18 @@ class SliceMeter:
             )
 
 
-def progress_of(samples: NDArray[np.float32]) -> list[Progress]:
-    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does."""
-    return [progress for _, progress in SliceMeter().accept_waveform(samples) if progress]
+def progress_of(
+    samples: NDArray[np.float32],
+    with_progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+) -> list[Progress]:
+    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does.
+
+    ``with_progress`` shows the progress.
+    """
+    meter = SliceMeter()
+    return [
+        progress
+        for start in with_progress(range(0, len(samples), MEDIA_RATE_HZ))
+        for _, progress in meter.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
+        if progress
+    ]
