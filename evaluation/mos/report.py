@@ -35,7 +35,7 @@ class Mean:
     half_width: float | None  # None: there is only one judge
 
     def __str__(self) -> str:
-        return f"{self.value:.2f}" + (f" ± {self.half_width:.2f}" if self.half_width else "")
+        return f"{self.value:.2f}" + (f"±{self.half_width:.2f}" if self.half_width else "")
 
 
 @dataclass(frozen=True, slots=True)
