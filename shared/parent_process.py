@@ -8,7 +8,7 @@ import os
 
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id
 PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
-IDLE_PULSE = b"-"  # the byte for a heartbeat without sessions
+IDLE_PULSE = b"-"  # the byte of a service that sends a heartbeat only every second
 _PARENT = int(os.environ.get(PARENT_VARIABLE, "0"))  # 0: no such process
 
 

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 
 TICK_S = 0.01  # minimum time between ticks
 FOLLOW_UP_S = 0.03  # time between two ticks if a message arrived within ``TICK_S``
-HEARTBEAT_S = 0.25  # interval between heartbeats with sessions
-IDLE_HEARTBEAT_S = 1.0  # interval after a heartbeat without sessions
+HEARTBEAT_S = 0.25  # interval between heartbeats of a worker with sessions
+IDLE_HEARTBEAT_S = 1.0  # interval of other services, whose loss interrupts no session
 SNAPSHOT_S = 1.0  # interval between computations of rates and percentiles for heartbeats
 SESSIONS_PER_HEARTBEAT = 16  # limit for a worker, so that a heartbeat's cost does not grow
 RESYNC_AFTER_S = 0.55  # delay of a heartbeat after which control may have moved the sessions
@@ -355,8 +355,9 @@ class Service(MessageLoop):
         now_s = time.monotonic()
         self._sent_ns = now_ns()
         sessions, load = self.session_inputs(), self.busy.share(now_s)
-        self._heartbeat_due_s = now_s + (HEARTBEAT_S if sessions else IDLE_HEARTBEAT_S)
-        parent_process.send_pulse(is_idle=not sessions)
+        is_idle = not sessions or self.kind.role != "worker"
+        self._heartbeat_due_s = now_s + (IDLE_HEARTBEAT_S if is_idle else HEARTBEAT_S)
+        parent_process.send_pulse(is_idle=is_idle)
         for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
             self.metrics.set(name, value)
         if now_s >= self._snapshot_due_s:

@@ -23,8 +23,8 @@ class ServiceProcess(subprocess.Popen[bytes]):
     """Runs ``python -m kouxing.services.process KIND``. It ends when this process ends.
 
     ``environment`` is complete except for two variables. A loop counts as hung if it sends no
-    heartbeat for ``hang_limit_s``. Without sessions, the limit is 0.75 s longer. Other options are
-    those of ``subprocess.Popen``.
+    heartbeat for ``hang_limit_s``. The limit is 0.75 s longer after ``IDLE_PULSE``. Other options
+    are those of ``subprocess.Popen``.
     """
 
     def __init__(

@@ -30,8 +30,8 @@ class ControlConfig(ServiceConfig):
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which control closes a session."""
     lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9
-    """Seconds without a heartbeat after which control declares a service lost. For a service
-    without sessions, the limit is 0.75 s longer."""
+    """Seconds without a heartbeat after which control declares a service lost. For drivers,
+    gateways and workers without sessions, the limit is 0.75 s longer."""
 
     @property
     def bound_control(self) -> str:

@@ -48,7 +48,7 @@ class Registry:
 
     def __init__(self, lost_after_s: float) -> None:
         self._services: dict[str, ServiceRecord] = {}
-        # services except control, oldest heartbeat first: with and without sessions
+        # services except control, oldest heartbeat first: workers with sessions, and others
         self._busy: OrderedDict[str, ServiceRecord] = OrderedDict()
         self._idle: OrderedDict[str, ServiceRecord] = OrderedDict()
         self._usual_limit_s = self._limit_s = lost_after_s
@@ -123,7 +123,8 @@ class Registry:
         self._busy.pop(instance, None)
         self._idle.pop(instance, None)
         if record.peer != NO_PEER:  # NO_PEER is control itself
-            (self._busy if heartbeat.sessions else self._idle)[instance] = record
+            is_busy = heartbeat.role == "worker" and heartbeat.sessions
+            (self._busy if is_busy else self._idle)[instance] = record
         if heartbeat.role == "worker":
             self.load(instance).measure(heartbeat.load, now_s, num_speaking)
 
@@ -291,7 +292,7 @@ class Registry:
         return overdue
 
     def _max_ages_s(self) -> Iterable[tuple[Mapping[str, ServiceRecord], float]]:
-        """Return services with and without sessions, oldest heartbeat first, and the age limit."""
+        """Return services by the interval of their heartbeats, oldest first, and the age limit."""
         return (
             (self._busy, self._limit_s),
             (self._idle, self._limit_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),
