@@ -24,6 +24,7 @@ const CHINESE = {
   "the sound is damaged or encrypted; nothing can be decoded; export it again": "声音已损坏或加密，无法解码；请重新导出",
   "the file has no audio, only {kinds}; record the sound": "文件里没有声音，请录制带声音的文件",
   "the codec of audio track {track} is unknown; export the sound as wav, flac, mp3 or m4a": "无法识别第 {track} 条音轨的编码，请导出为 wav、flac、mp3 或 m4a",
+  "{codec} is not supported; export the sound as 16-bit PCM": "不支持 {codec}，请导出为 16 位 PCM",
   "{count} audio tracks: {tracks}. This reads track {track}; choose another with --track":
     "有 {count} 条音轨：{tracks}。现在播放第 {track} 条；其他音轨可用 kouxing speak --track 播放",
   "the file is cut off after {read} s of {whole} s": "文件不完整：只有 {read} 秒，应有 {whole} 秒",
