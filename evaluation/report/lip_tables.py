@@ -96,6 +96,12 @@ def better_programs(results: Results) -> list[str]:
             best = min(losses, key=lambda face: losses[face], default=own)
             if own in losses and losses[best] < losses[own]:
                 shown = [_format_measure(measure, values[face]) for face in (best, own)]
+                if "precision" in measure:
+                    recalls = (scores[face][group].get("closure_recall") for face in (best, own))
+                    shown = [
+                        f"{figure}, recall {format_number(recall)}"
+                        for figure, recall in zip(shown, recalls, strict=True)
+                    ]
                 if measure in _LIKE_REAL:
                     shown.append(f"real lips {_format_measure(measure, real[measure])}")
                 sentence = f"{group_title}, {name}: {title_of(best)} ({shown[0]})"

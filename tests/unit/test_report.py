@@ -26,7 +26,9 @@ from kouxing.evaluation.system.page import Drawing
 from kouxing.shared.errors import UserError
 
 SCORES = {"r_opening": 0.5, "closure_f1": 0.6, "mtm_ms": 50.0, "slcc": 0.0}
+SCORES |= {"closure_precision": 0.5, "closure_recall": 0.75}
 BETTER = {"r_opening": 0.7, "closure_f1": 0.4, "mtm_ms": 40.0, "slcc": 0.2}
+BETTER |= {"closure_precision": 1.0, "closure_recall": 0.25}
 
 
 def faces(**by_title: dict[str, float]) -> dict[str, Any]:
@@ -158,6 +160,8 @@ def test_the_page_starts_with_what_others_do_better() -> None:
     assert lip_tables.better_programs({"rivals": rivals()}) == [
         "all clips, correlation of the opening: wawa-lipsync 0.0.2, fitted, 100 ms (0.70);"
         " learnt, 60 ms (0.50)",
+        "all clips, precision of closures: wawa-lipsync 0.0.2, fitted, 100 ms (1.00, recall 0.25);"
+        " learnt, 60 ms (0.50, recall 0.75)",
         "all clips, MTM: wawa-lipsync 0.0.2, fitted, 100 ms (40 ms); learnt, 60 ms (50 ms)",
         "all clips, SLCC: wawa-lipsync 0.0.2, fitted, 100 ms (0.20); learnt, 60 ms (0.00,"
         " real lips 0.30)",
