@@ -44,6 +44,8 @@ _PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean,
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
 _EVIDENCE_SHARE = 0.1  # weight of a new position
 _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
+_MIN_LAUGHTER = 0.3  # smallest probability of a laugh that the ear hears
+_LAUGH_POSITIONS = 50  # laughter ends when this many positions have no laugh
 
 
 class VoiceTraits(NamedTuple):
@@ -83,6 +85,7 @@ class VoiceTraitsStream:
         self._mean = self._feeling
         self._num_voiced = 0  # positions with a voice
         self._evidence = [0.0] * (NUM_TRAITS - 2)  # evidence of laughter and of breath
+        self._since_laugh = _LAUGH_POSITIONS  # positions since a laugh
 
     def accept_position(self, position: EarPosition) -> None:
         """Take the next position of the ear."""
@@ -103,6 +106,8 @@ class VoiceTraitsStream:
             old + _EVIDENCE_SHARE * (new - old)
             for old, new in zip(self._evidence, outputs[2:], strict=True)
         ]
+        is_laugh = position.voice[Voice.LAUGHTER] > _MIN_LAUGHTER
+        self._since_laugh = 0 if is_laugh else self._since_laugh + 1
         arousal, valence = (
             round(min(max(value - mean, -1.0), 1.0), _DIGITS)
             for value, mean in zip(self._feeling, self._mean, strict=True)
@@ -111,6 +116,8 @@ class VoiceTraitsStream:
             evidence > (_STOP if was_on else _START)
             for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
         )
+        # the ear's state remembers laughter for many seconds of silence
+        laughter = laughter and self._since_laugh < _LAUGH_POSITIONS
         self.newest = VoiceTraits(arousal, valence, laughter, breath)
 
 

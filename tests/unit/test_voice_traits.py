@@ -108,6 +108,14 @@ def test_laughter_and_breath_need_evidence_and_do_not_flicker() -> None:
     assert not breath[-1].is_laughter
 
 
+def test_laughter_ends_in_silence_and_speech_although_the_state_remembers_it() -> None:
+    laughs = [0, 0, 0.8, 0]
+    for after in (Voice.NONE, Voice.SPEECH):
+        seen = traits_of((2.0, Voice.LAUGHTER, laughs), (3.0, after, laughs))
+        assert seen[2 * PER_S].is_laughter
+        assert not any(trait.is_laughter for trait in seen[3 * PER_S :])
+
+
 def test_the_shipped_readout_fits_the_ear_and_others_are_rejected(tmp_path: Path) -> None:
     assert load_voice_readout().weights.shape == (load_ear().state_width, NUM_TRAITS)
     READOUT.save(tmp_path / "small.npz")

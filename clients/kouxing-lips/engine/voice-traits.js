@@ -13,10 +13,12 @@ export class VoiceTraits {
   #mean;
   #numVoiced = 0;
   #evidence = [0, 0]; // evidence of laughter and of breath
+  #sinceLaugh; // positions
 
   constructor({ arrays, constants, voices }) {
     this.#c = constants.traits;
     this.#voices = voices;
+    this.#sinceLaugh = this.#c.LAUGH_POSITIONS;
     this.#weights = arrays["traits.weights"];
     this.#bias = arrays["traits.bias"].values;
     this.#feeling = this.#mean = [...arrays["traits.mean"].values];
@@ -39,11 +41,14 @@ export class VoiceTraits {
     }
     this.#evidence = this.#evidence.map((value, i) => value + EVIDENCE_SHARE * (outputs[2 + i] - value));
     const [arousal, valence] = this.#feeling.map((value, i) => this.#rounded(clamp(value - this.#mean[i], -1, 1)));
+    const isLaugh = voice[this.#voices.LAUGHTER] > this.#c.MIN_LAUGHTER;
+    this.#sinceLaugh = isLaugh ? 0 : this.#sinceLaugh + 1;
     const isOn = (evidence, wasOn) => evidence > (wasOn ? this.#c.STOP : this.#c.START);
     this.newest = {
       arousal,
       valence,
-      isLaughter: isOn(this.#evidence[0], this.newest.isLaughter),
+      isLaughter:
+        isOn(this.#evidence[0], this.newest.isLaughter) && this.#sinceLaugh < this.#c.LAUGH_POSITIONS,
       isBreath: isOn(this.#evidence[1], this.newest.isBreath),
     };
   }
