@@ -42,6 +42,33 @@ def new(
 
 
 @app.command()
+def heads(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the study.")],
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOUND...", help="Speech and laughter. Pauses between them fill a minute."
+        ),
+    ],
+    head: Annotated[
+        list[str] | None,
+        typer.Option(help="Name of a built-in head; repeatable. Default: all heads."),
+    ] = None,
+    title: Annotated[str, typer.Option(help="Title of the page.")] = "Heads",
+) -> None:
+    """Create a study of the built-in heads, with a video of a minute for each head."""
+    from kouxing.evaluation.mos.heads import write_head_videos
+    from kouxing.evaluation.mos.study import check_new, new_study
+    from kouxing.services.recognizer.acoustic.load import load_model
+
+    check_new(folder)
+    write_head_videos(folder, load_model(), recordings, head or [])
+    study = new_study(folder, title=title)
+    count = plural(len(study.conditions), "head")
+    print_message(f"created a study of {count}; next: kouxing mos serve {folder}")
+
+
+@app.command()
 def serve(
     folder: Folder,
     port: Annotated[

@@ -40,14 +40,19 @@ class Study:
     files: dict[tuple[str, str], Path] = field(repr=False)  # by sentence and condition
 
 
+def check_new(folder: Path) -> None:
+    """Raise UserError if a folder already contains a study."""
+    file = folder / FILE_NAME
+    if file.exists():
+        raise UserError(f"{file} exists, and answers may refer to it; use another folder")
+
+
 def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str = "") -> Study:
     """Find the videos ``CONDITION/SENTENCE.mp4`` of a folder and write ``study.json``.
 
     Raises UserError if the folder already is a study, lacks videos, or has one without sound.
     """
-    file = folder / FILE_NAME
-    if file.exists():
-        raise UserError(f"{file} exists, and answers may refer to it; use another folder")
+    check_new(folder)
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
     content = {
         "title": title or folder.resolve().name,
@@ -63,9 +68,11 @@ def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str
     for path in study.files.values():
         check_video(path)
     try:
-        file.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        (folder / FILE_NAME).write_text(
+            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
     except OSError as error:
-        raise UserError(f"cannot write {file}: {error.strerror}") from None
+        raise UserError(f"cannot write {folder / FILE_NAME}: {error.strerror}") from None
     return study
 
 

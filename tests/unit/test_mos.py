@@ -12,10 +12,12 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from kouxing.evaluation.mos.commands import app
+from kouxing.evaluation.mos.heads import join_recordings
 from kouxing.evaluation.mos.report import make_report, mean_of, opinion_of, print_report
 from kouxing.evaluation.mos.store import FILE_NAME as ANSWERS
 from kouxing.evaluation.mos.store import Answer, Store, read_answers
 from kouxing.evaluation.mos.study import FILE_NAME, load_study, new_study, williams_design
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 CONDITIONS = ("real", "live", "late", "still")
@@ -41,6 +43,25 @@ def test_every_condition_follows_every_other_equally_often(n: int) -> None:
     pairs = Counter(pair for row in design.tolist() for pair in itertools.pairwise(row))
     assert set(pairs) == set(itertools.permutations(range(n), 2))
     assert len(set(pairs.values())) <= 1
+
+
+def test_recordings_fill_a_minute_with_equal_pauses() -> None:
+    second = np.ones(MEDIA_RATE_HZ, np.float32)
+    joined = join_recordings([np.tile(second, 20), np.tile(second, 10)])
+    starts = np.flatnonzero(np.diff(joined) > 0) + 1
+    ends = np.flatnonzero(np.diff(joined) < 0) + 1
+    assert len(joined) == 60 * MEDIA_RATE_HZ
+    assert (starts / MEDIA_RATE_HZ).tolist() == [10.0, 40.0]
+    assert (ends / MEDIA_RATE_HZ).tolist() == [30.0, 50.0]
+    with pytest.raises(UserError, match=r"the recordings last 59.0 s; give at most 58.8 s"):
+        join_recordings([np.tile(second, 59)])
+
+
+def test_videos_of_heads_do_not_replace_a_study(folder: Path) -> None:
+    new_study(folder)
+    result = CliRunner().invoke(app, ["heads", str(folder), "speech.wav"])
+    assert isinstance(result.exception, UserError)
+    assert "answers may refer to it; use another folder" in str(result.exception)
 
 
 def test_rejects_a_study_with_gaps_or_unknown_conditions(folder: Path) -> None:

@@ -1,0 +1,74 @@
+"""Videos of every built-in head for a listening test: the same minute of listening and speech."""
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from kouxing.services.cli.inputs import read_mono_16k
+from kouxing.services.driver.head.head import ASSETS
+from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video import film
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import CONSOLE
+
+_LENGTH_S = 60.0
+_MIN_PAUSE_S = 0.6  # the face finishes a phrase
+_VIDEO_PX = (640, 640)
+_IMAGES_PER_S = 25.0
+
+
+def write_head_videos(
+    folder: Path, model: AcousticModel, recordings: Sequence[Path], heads: Sequence[str]
+) -> None:
+    """Write ``HEAD/minute.mp4`` for each head, with the frames of the live services.
+
+    ``heads`` are names of built-in heads. By default, all are drawn. Raises ``UserError`` if
+    a file cannot be read or written, or the recordings are too long.
+    """
+    names = heads or sorted(path.stem for path in ASSETS.glob("*.npz"))
+    loaded = {name: scene.load_head(name) for name in names}
+    samples = join_recordings([read_mono_16k(path) for path in recordings])
+    chain = LiveChain(model, load_lip_model(model.inventory.language))
+    frames = []
+    for start in track(
+        range(0, len(samples), MEDIA_RATE_HZ), "recognizing", console=CONSOLE, transient=True
+    ):
+        frames += chain.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
+    frames += chain.input_finished()
+    for name in track(names, "drawing", console=CONSOLE, transient=True):
+        path = folder / name / "minute.mp4"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        head = loaded[name]
+        renderer = Renderer(head, *_VIDEO_PX, camera=scene.camera(head))
+        with contextlib.closing(renderer):
+            film.render_video(frames, path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples)
+
+
+def join_recordings(recordings: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Join recordings (n,), 16 kHz mono, to a minute with equal pauses around them.
+
+    Raises ``UserError`` if the recordings leave no time for pauses.
+    """
+    length = round(_LENGTH_S * MEDIA_RATE_HZ)
+    spoken = sum(map(len, recordings))
+    pause = (length - spoken) // (len(recordings) + 1)
+    if pause < _MIN_PAUSE_S * MEDIA_RATE_HZ:
+        most_s = _LENGTH_S - _MIN_PAUSE_S * (len(recordings) + 1)
+        raise UserError(
+            f"the recordings last {spoken / MEDIA_RATE_HZ:.1f} s; give at most {most_s:.1f} s"
+        )
+    joined = np.zeros(length, np.float32)
+    start = pause
+    for recording in recordings:
+        joined[start : start + len(recording)] = recording
+        start += len(recording) + pause
+    return joined
