@@ -17,11 +17,13 @@ uniform bool cel; // one light and one dark tone, no highlights
 const vec3 KEY = vec3(-0.4067, 0.4842, 0.7747);
 const vec3 FILL = vec3(0.7767, 0.1036, 0.6213);
 const vec3 RIM = vec3(0.5518, 0.4515, -0.7023);
-const vec3 KEY_COLOR = vec3(1.16, 1.06, 0.96);
-const vec3 FILL_COLOR = vec3(0.34, 0.38, 0.44);
-const vec3 RIM_COLOR = vec3(0.45, 0.47, 0.50);
-const vec3 SKY = vec3(0.42, 0.44, 0.48);
-const vec3 GROUND = vec3(0.25, 0.21, 0.19);
+const vec3 KEY_COLOR = vec3(1.42, 1.28, 1.14);
+const vec3 FILL_COLOR = vec3(0.22, 0.25, 0.30);
+const vec3 RIM_COLOR = vec3(0.75, 0.78, 0.84);
+const vec3 SKY = vec3(0.36, 0.38, 0.42);
+const vec3 GROUND = vec3(0.17, 0.14, 0.125);
+const float SHOULDER = 0.22; // how much bright light is compressed, so that it does not clip
+const float GLOSS = 14.0; // of a color per difference of red and green
 const vec3 CROWN = vec3(0.0, 0.97, -0.24);
 // reflections in the eyes; lower than the key light, because the lid would hide them
 const vec3 WINDOW = vec3(-0.36, 0.34, 0.87);
@@ -40,7 +42,7 @@ void light_vertex(vec3 n, vec3 v, vec3 tint, out vec3 light, out float high) {
     + KEY_COLOR * max((key + wrap) / (1.0 + wrap), 0.0) / (1.0 + wrap)
     + FILL_COLOR * max(dot(n, FILL) * 0.7 + 0.3, 0.0)
     + RIM_COLOR * max(dot(n, RIM), 0.0);
-  light *= share * tint;
+  light *= share * tint / (1.0 + SHOULDER * light.g);
   vec3 half_way = normalize(KEY + v);
   float mirrored = max(dot(n, half_way), 0.0);
   if (strands) { // darker strands have higher highlights
@@ -61,12 +63,13 @@ vec3 shaded(vec3 texel, vec3 light, float high) {
     light *= mix(0.70, 0.96, smoothstep(0.60, 0.66, strength)) / max(strength, 0.25);
     high = 0.0;
   }
+  high *= 1.0 + GLOSS * max(texel.r - texel.g - 0.23, 0.0); // lips are wet
   return sqrt(min(texel * texel * light + high, 1.0));
 }
 
 // Reflection in an eye with the normal n: a sharp bright window and a soft ground; `ahead` points from
 // the head to the camera.
 float mirrored(vec3 n, vec3 ahead) {
-  float window = smoothstep(0.988, 0.9935, dot(n, normalize(WINDOW + ahead)));
+  float window = smoothstep(0.9915, 0.9945, dot(n, normalize(WINDOW + ahead)));
   return window + 0.05 * smoothstep(0.980, 0.992, dot(n, normalize(FLOOR + ahead)));
 }

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.shared.errors import UserError
-from kouxing.training.heads import fitted, subdivision
+from kouxing.training.heads import fitted, subdivision, textures
 
 CUBE = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
@@ -87,3 +87,23 @@ def test_a_part_follows_the_head_that_it_is_fitted_to(tmp_path: Path) -> None:
 def test_a_missing_part_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"hair\.obj is missing"):
         fitted.read(tmp_path, "hair")
+
+
+def test_hair_keeps_strands_but_not_the_painted_light() -> None:
+    columns = np.arange(256)
+    strand = 0.1 * np.sin(columns)  # periods of six texels
+    light = np.linspace(0.2, 0.8, 256)[:, None] * (1 + strand)  # much brighter at the bottom
+    texture = np.dstack([light] * 3 + [np.ones_like(light)])
+    gray = textures.strands(texture, 1.0)[..., 0]
+    rows = gray.mean(axis=1)
+    assert rows[-40] / rows[40] < 1.4  # the painted light differs by a factor of 2.4
+    assert gray.max() < 1.0
+    assert np.corrcoef(gray[128], strand)[0, 1] > 0.9
+
+
+def test_triangles_without_texels_are_not_visible() -> None:
+    alpha = np.zeros((8, 8))
+    alpha[:, 4:] = 1.0  # the right half
+    uv = np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
+    triangles = np.array([[0, 1, 2], [1, 3, 4]])
+    np.testing.assert_array_equal(textures.visible(triangles, uv, alpha), [False, True])

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
+from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import fitted, paint, parts, subdivision, textures
 from kouxing.training.heads.makehuman import PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
@@ -52,7 +53,7 @@ _SIDES = ("Left", "Right")
 _PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
 _HAIR_TEXTURES = {"afro01": "afro"}
 # styles with a fringe over the right eye, and its distance from the head's axis at the side, dm
-_FRINGES = {"bob01": 0.73, "bob02": 0.73, "short03": 0.69}
+_FRINGES = {"bob01": 0.73, "bob02": 0.73}
 _COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
 _SWEEP = 0.62  # share of the angle to the right ear by which it is turned
 _BROW_RAISE = 0.006  # how far the inner ends rise, dm
@@ -81,6 +82,11 @@ class Builder:
         self._map = self._face_map()
         self._scalp = paint.scalp(self._map, textures.load(folder, _PAINTED_HAIR))
         self._teeth = fitted.read(folder, "teeth/teeth_base/teeth_base")
+        blink, squint = (
+            [self.reference.carry(source.face_unit(unit + side)) for side in _SIDES]
+            for unit in ("eyeBlink", "eyeSquint")
+        )
+        self._unit_fields = FaceFields(self.reference, self._cavity, blink, squint).fields
 
     def _shaped(self, targets: Shape, face_units: Shape) -> Float:
         """Shape the mesh (19158, 3), and move its pivot to the common place."""
@@ -108,12 +114,9 @@ class Builder:
         vertices = self._shaped(person.targets, person.face_units)
         skin = self._skin(vertices)
         fapu = measure_fapu(skin, vertices, self._mesh)
-        blink, squint = (
-            [self.reference.carry(self._source.face_unit(unit + side)) for side in _SIDES]
-            for unit in ("eyeBlink", "eyeSquint")
-        )
-        face = FaceFields(self.reference, self._cavity, blink, squint, fapu).fields
-        hair = self._hair(vertices, person)
+        face = {fap: field * fapu[FAPS[fap - 1].fapu] for fap, field in self._unit_fields.items()}
+        strands = self._strands(person)
+        hair = self._hair(vertices, person, strands[..., 1])
         pieces = [
             self._skin_piece(skin, face),
             self._garment(vertices),
@@ -128,7 +131,7 @@ class Builder:
         write(
             output,
             pieces,
-            self._textures(person, skin, hair),
+            {"hair": encode(strands)} | self._textures(person, skin, hair),
             skin,
             self._tongue,
             fapu,
@@ -204,19 +207,28 @@ class Builder:
             piece.part.vertices[:, 1] += person.tucked if is_upper else person.raised
         return pieces
 
-    def _hair(self, vertices: Float, person: Person) -> HeadPiece:
+    def _strands(self, person: Person) -> Float:
+        """Return the texture of the hair (H, W, 2); the strands of gray hair differ less."""
+        style = person.hair
+        file = f"hair/{style}/{_HAIR_TEXTURES.get(style, style)}_diffuse.png"
+        contrast = 0.5 if person.look.cel else 1.5 - np.mean(person.look.hair)
+        return textures.strands(textures.load(self._folder, file), float(contrast))
+
+    def _hair(self, vertices: Float, person: Person, alpha: Float) -> HeadPiece:
         """Fit the hair; its triangles run from the inside outward and from the back to the front.
 
-        Outer strands therefore blend over inner ones.
+        Outer strands therefore blend over inner ones. Triangles without strands are removed; they
+        would cast shadows. ``alpha`` (H, W) is that of the texture.
         """
         hair = fitted.read(self._folder, f"hair/{person.hair}/{person.hair}")
-        points = hair.fit(vertices)
+        points = hair.fit(vertices) * [person.hair_width, 1, 1]
         if person.hair in _FRINGES:
             points = self._swept_aside(points, vertices, _FRINGES[person.hair])
         quads, uv, welds = hair.quads, hair.uv, hair.welds
         if len(quads) < _COARSE_HAIR:
             points, quads, uv, welds = subdivision.smooth_strands(points, quads, uv, welds)
         triangles = subdivision.triangles_of(quads)
+        triangles = triangles[textures.visible(triangles, uv, alpha)]
         middle = points[triangles].mean(axis=1) - PIVOT
         order = np.argsort(np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2])
         color = np.tile(textures.tint(person.look.hair), (len(points), 1))
@@ -260,12 +272,18 @@ class Builder:
             if np.abs(shift[rows]).max() > 1e-6
         }
         color = np.tile(textures.tint(person.look.brow), (len(points), 1))
-        part = parts.Geometry(points, brows.triangles, brows.uv, color, brows.welds)
+        # MakeHuman painted both brows differently; the right one mirrors the left one
+        left, right = (np.flatnonzero(side * points[:, 0] > 0) for side in (1, -1))
+        uv = brows.uv.copy()
+        uv[right] = uv[left[spatial.cKDTree(points[left]).query(points[right] * [-1, 1, 1])[1]]]
+        part = parts.Geometry(points, brows.triangles, uv, color, brows.welds)
         return HeadPiece("brows", part, "brows", 0.9, np.ones(len(points)), shifts)
 
     def _lashes(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
-        """Fit the lashes; they follow the face units of the eyelids, and the skin."""
+        """Fit the upper lashes; they follow the face units of the eyelids, and the skin."""
         lashes = fitted.read(self._folder, f"eyelashes/{person.lashes}/{person.lashes}")
+        middle = self._plain[lashes.base[lashes.triangles]].mean(axis=(1, 2))
+        lashes = lashes.only(middle[:, 1] > eye_centers(self._plain, self._mesh)[0, 1])
         points = lashes.fit(vertices)
         shifts = {}
         for unit, faps in (("eyeBlink", (19, 20)), ("eyeSquint", (21, 22))):
@@ -316,8 +334,7 @@ class Builder:
 
         complexion = paint.resample(self._map, load(f"skins/textures/{person.skin}.png"), 3)
         painted = paint.skin(self._map, lid, lips, look, complexion, self._roots(skin, hair))
-        brows, lashes, style = person.brows, person.lashes, person.hair
-        strands = load(f"hair/{style}/{_HAIR_TEXTURES.get(style, style)}_diffuse.png")
+        brows, lashes = person.brows, person.lashes
         return {
             "skin": encode(painted),
             "skin_normal": encode(textures.relief(painted)),
@@ -325,7 +342,6 @@ class Builder:
             "teeth": encode(textures.teeth(load("large/teeth.png", 512))),
             "tongue": encode(textures.tongue()),
             "cloth": encode(textures.cloth(look.cloth)),
-            "hair": encode(textures.strands(strands, 0.5 if look.cel else 1.4)),
             "brows": encode(
                 textures.hairs(load(f"eyebrows/{brows}/{brows}.png"), look.brow_strength)
             ),

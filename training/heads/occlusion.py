@@ -75,7 +75,8 @@ def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> F
         column = np.clip(((place[:, 0] + 1) / 2 * _SIZE).astype(int), 0, _SIZE - 1)
         row = np.clip(((place[:, 1] + 1) / 2 * _SIZE).astype(int), 0, _SIZE - 1)
         visible = (place[:, 2] + 1) / 2 <= depth[row, column] + 0.0015
-        cosine = np.maximum(normals @ way, 0.0)
+        # most light comes from above and from the front
+        cosine = np.maximum(normals @ way, 0.0) * np.exp(1.2 * way[1] + 0.5 * way[2])
         seen += cosine * visible
         total += cosine
     context.release()
@@ -176,7 +177,7 @@ def _along_teeth(part: Geometry) -> Float:
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     normals = subdivision.vertex_normals(part.vertices, part.triangles)
     inside = np.clip(-1.5 * (normals * outward).sum(axis=1, keepdims=True), 0, 1)
-    return np.asarray(np.clip(1.0 - 0.95 * back**1.2, 0.06, 1.0) * (1 - 0.6 * inside))
+    return np.asarray(np.clip(1.15 - 2.2 * back, 0.05, 1.0) * (1 - 0.75 * inside))
 
 
 def _into_mouth(z: Float) -> Float:

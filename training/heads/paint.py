@@ -17,6 +17,7 @@ Float = NDArray[np.float64]
 AXIS_Z = 0.35  # dm, of the vertical axis
 TOP_Y, BOTTOM_Y = 6.85, 4.15  # dm
 SKIN_SIZE = (1280, 832)  # rows, columns
+_SHADE_REMOVED = 0.75  # exponent of the slow changes of MakeHuman's skins
 _ANGLES = np.radians([0.0, 70.0, 110.0, 180.0])
 _COLUMNS = np.array([0.0, 0.80, 0.92, 1.0])
 
@@ -82,7 +83,8 @@ def scalp(face: FaceMap, texture: Float) -> Float:
     largest = np.bincount(groups.ravel())[1:].argmax() + 1
     dark *= ndimage.binary_dilation(groups == largest, iterations=12)
     parting = ndimage.grey_closing(dark, (61, 61))
-    return np.asarray(np.where(face.y > 6.5, parting, dark))
+    high = np.clip((face.y - 6.45) / 0.1, 0, 1)
+    return np.asarray(dark + (parting - dark) * high)
 
 
 def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
@@ -96,7 +98,7 @@ class Look:
     """Colors (sRGB) and their strengths."""
 
     skin: Color = (0.890, 0.725, 0.625)
-    lip: Color = (0.720, 0.405, 0.385)
+    lip: Color = (0.730, 0.430, 0.400)
     lip_strength: float = 0.80
     hair: Color = (0.180, 0.135, 0.115)
     brow: Color = (0.19, 0.140, 0.12)
@@ -109,6 +111,15 @@ class Look:
     lash_line: float = 1.0  # width of the dark edge of the upper lid
     cloth: Color = (0.20, 0.29, 0.38)
     cel: bool = False  # cel shading: plain colors, light and shade
+
+
+def _inpaint(image: Float, hidden: Float) -> Float:
+    """Replace the hidden part (H, W), 0 to 1, of an image (H, W, 3) by its surroundings."""
+    kept = (1 - hidden)[..., None]
+    sigma = (24, 24, 0)
+    around = ndimage.gaussian_filter(image * kept, sigma)
+    around /= ndimage.gaussian_filter(kept, sigma) + 1e-4
+    return np.asarray(image * kept + around * (1 - kept))
 
 
 def skin(
@@ -135,6 +146,13 @@ def skin(
     # the nostrils of MakeHuman's skin are larger than those of the heads
     nose = np.clip(1.5 * _spot(face, 0.10, 5.38, 0.17, 0.13), 0, 1)[..., None]
     tones += (ndimage.gaussian_filter(np.maximum(tones, 0.85), (18, 18, 0)) - tones) * nose
+    # its lips have other outlines, and its tear ducts are folded
+    mouth = _spot(face, 0.0, 5.145, lips[-1, 0] + 0.07, 0.13)
+    duct = _spot(face, lid[0, 0] - 0.025, lid[0, 1] + 0.01, 0.055, 0.075)
+    for hidden in (mouth, duct):
+        tones = _inpaint(tones, np.clip(4 * hidden - 0.8, 0, 1))
+    # its light and shade would not follow the light on the heads
+    tones /= ndimage.gaussian_filter(tones, (36, 36, 0)) ** _SHADE_REMOVED
     image = np.array(look.skin) * tones ** np.where(look.cel, 0.3, 0.85)
     blotch = noise(shape, 26, 1)
     # the texture is squeezed at the thin neck, where grain would become streaks
@@ -150,7 +168,8 @@ def skin(
         image = _paint_age(image, face, look.age)
     image = _paint_lips(image, face, lips, look)
     image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2], look.lash_line)
-    return np.clip(mix(image, look.hair, roots), 0, 1)
+    strands = np.array(look.hair) * (1 + 0.15 * noise(shape, (9, 1.2), 5)[..., None])
+    return np.clip(image + (strands - image) * (0.85 * roots)[..., None], 0, 1)
 
 
 def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
@@ -237,6 +256,6 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, widt
     fold = np.exp(-(((height - 0.052) / 0.010) ** 2)) * inside
     below = np.interp(face.x, lid[:, 0], lower)
     rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
-    image = mix(image, (0.80, 0.55, 0.52), 0.45 * rim)  # the wet line
+    image = mix(image, (0.90, 0.70, 0.66), 0.45 * rim)  # the wet line
     image = mix(image, (0.16, 0.10, 0.09), 0.80 * line)
     return mix(image, (0.60, 0.41, 0.36), 0.32 * fold)

@@ -19,6 +19,9 @@ Color = tuple[float, float, float]
 
 GRAY = 0.75  # mean of the gray textures
 _JPEG_QUALITY = 88
+_SHADE = 24.0  # texels; changes of the brightness over longer distances are shade
+_SHADE_KEPT = 0.25  # exponent of the shade
+_MAX_RISE = -np.log(GRAY)  # at which gray becomes white
 _RELIEF = 8.0  # slope at a relative change of the brightness from one texel to the next
 
 
@@ -56,16 +59,40 @@ def encode(image: Float) -> bytes:
 
 
 def strands(texture: Float, contrast: float) -> Float:
-    """Make a hair texture (H, W, 4) gray with the mean ``GRAY``; return (H, W, 2) with alpha."""
-    opaque = texture[..., 3]
-    alpha = ndimage.grey_closing(opaque, (15, 15))  # the scalp would shine through gaps
+    """Make a hair texture (H, W, 4) gray with the mean ``GRAY``; return (H, W, 2) with alpha.
+
+    MakeHuman painted light and shade into its hair. Only a part of it is kept, because the heads
+    are lit. ``contrast`` is the exponent of the strands' brightness.
+    """
+    # a wide soft edge would look like a veil
+    opaque = np.clip((texture[..., 3] - 0.25) / 0.4, 0, 1)
+    # the scalp would shine through gaps, but strands end at the edge
+    closed = ndimage.grey_closing(opaque, (15, 15))
+    inside = ndimage.distance_transform_edt(closed > 0.5)
+    alpha = opaque + (closed - opaque) * np.clip((inside - 3) / 5, 0, 1)
     light = texture[..., :3].mean(axis=2)
+    weight = opaque + 1e-6
+    near = ndimage.gaussian_filter(light * weight, _SHADE) / ndimage.gaussian_filter(weight, _SHADE)
+    near = np.maximum(near, 1e-3)
     usual = np.average(light, weights=opaque)
-    gray = np.clip(GRAY * (light / usual) ** contrast, 0, 1)
+    change = contrast * np.log(np.maximum(light, 1e-3) / near) + _SHADE_KEPT * np.log(near / usual)
+    gray = GRAY * np.exp(
+        np.where(change > 0, _MAX_RISE, 1.0)
+        * np.tanh(change / np.where(change > 0, _MAX_RISE, 1.0))
+    )
     # the color of transparent texels would shine through at the edges
     near = ndimage.distance_transform_edt(opaque < 0.5, return_indices=True, return_distances=False)
     gray = gray[tuple(near)]
     return np.stack([np.round(gray * 40) / 40, np.round(alpha * 16) / 16], axis=2)
+
+
+def visible(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> NDArray[np.bool_]:
+    """Return which triangles (F,) show texels with alpha; ``uv`` (V, 2) has v downward."""
+    steps = np.linspace(0.05, 0.9, 6)
+    share = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])
+    at = np.einsum("sk,fkd->fsd", share, uv[triangles]) * (alpha.shape[1], alpha.shape[0])
+    column, row = np.clip(at.astype(int), 0, np.array(alpha.shape[::-1]) - 1).transpose(2, 0, 1)
+    return np.asarray((alpha[row, column] > 0.25).any(axis=1))
 
 
 def hairs(texture: Float, strength: float) -> Float:
@@ -114,7 +141,8 @@ def eye(texture: Float, color: Color, iris_size: float = 1.0, size: int = 512) -
     )
     light = image.mean(axis=2)
     within = radius / _EYE_IRIS
-    white = np.clip(image * np.array([1.42, 1.43, 1.45]), 0, 0.97)
+    dark = 1 - 0.30 * np.clip((within - 1) / 0.9, 0, 1) ** 2  # darker toward the corners
+    white = np.clip(image * np.array([1.42, 1.41, 1.41]), 0, 0.90) * dark[..., None]
     # MakeHuman's iris is dark; the light through the cornea brightens its lower half
     detail = light / np.median(light[(within > 0.5) & (within < 0.9)])
     lit = 0.72 + 0.28 * detail + 0.30 * np.clip(y / angle_of_iris, -0.5, 0.7)
@@ -134,7 +162,7 @@ def teeth(texture: Float) -> Float:
     light = colors.mean(axis=2, keepdims=True)
     red = colors[..., :1] - colors[..., 1:2]
     is_gum = np.clip((red - 0.10) / 0.12, 0, 1)
-    enamel = np.array([0.97, 0.94, 0.88]) * np.clip(0.62 + 0.52 * light, 0, 1.02)
+    enamel = np.array([0.92, 0.88, 0.81]) * np.clip(0.62 + 0.52 * light, 0, 1.02)
     gum = np.array([0.80, 0.47, 0.47]) * np.clip(0.55 + 1.0 * light, 0, 1.25)
     return np.asarray(np.clip(enamel + (gum - enamel) * is_gum, 0, 1))
 

@@ -122,7 +122,7 @@ class FaceFields:
     """Computes all fields of the skin.
 
     ``cavity`` (V,) are the vertices that line the mouth. ``blink`` and ``squint`` are displacements
-    (V, 3) of the face units of the left and the right eye. ``fapu`` are lengths in dm.
+    (V, 3) of the face units of the left and the right eye. The fields are for FAPUs of 1 dm.
     """
 
     def __init__(
@@ -131,11 +131,9 @@ class FaceFields:
         cavity: NDArray[np.bool_],
         blink: list[Float],
         squint: list[Float],
-        fapu: dict[str, float],
     ) -> None:
         self.skin = skin
         self.cavity = cavity
-        self.fapu = fapu
         self.fields: Fields = {}
         self._geodesics = surface.Geodesics(skin.vertices, skin.quads)
         self._lips()
@@ -145,7 +143,7 @@ class FaceFields:
         self._zones()
 
     def _add(self, fap: int, weight: Float) -> None:
-        self.fields[fap] = _axis_field(fap, weight) * self.fapu[FAPS[fap - 1].fapu]
+        self.fields[fap] = _axis_field(fap, weight)
 
     def _far(self, names: tuple[str, ...], reach: float) -> NDArray[np.bool_]:
         return self._geodesics.distance(self.skin.points(*names)) > reach
@@ -178,7 +176,7 @@ class FaceFields:
             self.lip_x[name] = single[:, row] + 0.45 * half
             self._add(fap, self.lip_x[name])
             # a corner slides along the curve of the lips, outward and backward
-            self.fields[fap][:, 2] = -CORNER_SLOPE * self.lip_x[name] * self.fapu["MW"]
+            self.fields[fap][:, 2] = -CORNER_SLOPE * self.lip_x[name]
         pushed = smoothest(skin, skin.points("2.3", "2.2", *corners), fixed)[:, :2]
         self.lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
         self._add(16, self.lip_z["2.3"])
@@ -218,7 +216,7 @@ class FaceFields:
             for unit, (fap, name) in zip(units, pairs, strict=True):
                 axis, sign = axis_of(fap)
                 travel = sign * unit[self.skin.point(name), axis]
-                self.fields[fap] = unit / travel * self.fapu["IRISD"]
+                self.fields[fap] = unit / travel
 
     def _brows(self) -> None:
         x, y, z = self.skin.vertices.T
@@ -251,7 +249,7 @@ class FaceFields:
         ):  # fmt: skip
             weight = self._bump(name, reach)
             self._add(fap, weight)
-            self.fields[fap][:, 2] = forward * weight * self.fapu[FAPS[fap - 1].fapu]
+            self.fields[fap][:, 2] = forward * weight
         for fap, name in ((61, "9.1"), (62, "9.2")):
             others = np.setdiff1d(np.concatenate([nose, lips]), self.skin.points(name))
             self._zone(fap, name, 0.03, 0.16, others)

@@ -198,9 +198,9 @@ export class Head {
   /** Add a key light from the front upper left, fill and rim lights, and a studio environment. */
   #addLights() {
     this.#scene.environment = studioEnvironment(this.#renderer);
-    this.#scene.environmentIntensity = 0.8;
+    this.#scene.environmentIntensity = 0.6;
     for (const [color, intensity, x, y, z] of [
-      [0xfff2e4, 2.7, -0.42, 0.5, 0.8],
+      [0xfff2e4, 3.0, -0.42, 0.5, 0.8],
       [0xe6eeff, 0.6, 0.75, 0.1, 0.6],
       [0xffffff, 0.9, 0.55, 0.45, -0.7],
     ]) {
