@@ -13,6 +13,9 @@ from tests.system import wait_until
 
 SIZE_PX = (480, 360)
 IS_CURRENT = "window.kouxing?.state.drawing?.isCurrent ?? true"
+TWO_TICKS = (
+    "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
+)
 READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
 
 
@@ -48,12 +51,20 @@ class Browser(Chromium):
             " prototype.recordDrawn = function (...times) {"
             "   recordDrawn.apply(this, times); this.ratio = 0.5; }; })"
         )
+        for key in ("ArrowLeft", "Home"):  # each turns the head, which draws an image
+            num_before = self.evaluate("window.kouxing.state.drawing.numPictures")
+            self.evaluate(
+                "document.getElementById('head')"
+                f".dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))"
+            )
+            self.wait_for(f"window.kouxing.state.drawing.numPictures > {num_before}")
 
     def steady_image(self) -> NDArray[np.uint8]:
-        """Return the canvas of the gateway's page once every fade and redrawing is over."""
-        images = [self.image()]
+        """Return the canvas once every fade and redrawing is over."""
+        images = [np.zeros(0, np.uint8)]
 
         def is_steady() -> bool:
+            self.evaluate(TWO_TICKS)
             self.wait_for(IS_CURRENT)
             images.append(self.image())
             return bool(self.evaluate(IS_CURRENT)) and np.array_equal(images[-1], images[-2])

@@ -143,7 +143,7 @@ def colorfulness(image: NDArray[np.uint8]) -> NDArray[np.int_]:
 
 def show_controls(page: Browser, share: int) -> None:
     page.evaluate(
-        "for (const part of document.querySelectorAll('header, footer'))"
+        "for (const part of document.querySelectorAll('header, footer, #behind'))"
         f" part.style.opacity = {share}"
     )
 
