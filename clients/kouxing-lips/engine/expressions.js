@@ -88,7 +88,7 @@ export function applyExpressiveness(faps, amount, { constants: { expressiveness:
     const within = Math.min(opening, c.WIDEST / 2);
     return more * within * (1 - within / c.WIDEST);
   };
-  const [uppers, lowers] = c.LIPS;
+  const { UPPER: uppers, LOWER: lowers } = c;
   const gap = -faps[uppers[0]] - faps[lowers[0]];
   let isOpen = 0;
   uppers.forEach((upper, i) => {
