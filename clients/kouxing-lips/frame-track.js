@@ -31,9 +31,13 @@ export class FrameTrack {
 
 function mix(one, other, timeS) {
   const share = (timeS - one.timeS) / (other.timeS - one.timeS);
-  const entries = Object.entries(one).map(([name, value]) => {
-    if (!(value instanceof Float32Array)) return [name, value];
-    return [name, value.map((x, i) => x + share * (other[name][i] - x))];
-  });
-  return { ...Object.fromEntries(entries), timeS };
+  const mixed = { ...one, timeS };
+  for (const name of Object.keys(one)) {
+    const [from, to] = [one[name], other[name]];
+    if (!(from instanceof Float32Array)) continue;
+    const values = new Float32Array(from.length);
+    for (let i = 0; i < values.length; i++) values[i] = from[i] + share * (to[i] - from[i]);
+    mixed[name] = values;
+  }
+  return mixed;
 }

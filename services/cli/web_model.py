@@ -1,13 +1,14 @@
 """Writes the models for lip sync in a browser, which ``clients/kouxing-lips`` reads.
 
-============== =====================================================================
-file           contents
-============== =====================================================================
-``ear.onnx``   the network of the small ear, unchanged
-``model.bin``  arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
-``phones.bin`` arrays: HMMs and phone language model of the light model, needed only for phones
-``model.json`` types, shapes and places of these arrays; constants of the modules
-============== =====================================================================
+=============== ====================================================================
+file            contents
+=============== ====================================================================
+``ear.onnx``    the network of the small ear, unchanged
+``model.bin``   arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
+``phones.bin``  arrays: HMMs and phone language model, needed only for phones
+``blocks.onnx`` the block network, unchanged, needed only for final phones
+``model.json``  types, shapes and places of these arrays; constants of the modules
+=============== ====================================================================
 
 The constants come from the modules that the server runs. The package defines none of its own, so a
 new model or threshold needs only a new export.
@@ -32,14 +33,14 @@ from kouxing.services.recognizer import (
     stream,
     voice_traits,
 )
-from kouxing.services.recognizer.acoustic import model_file, network
+from kouxing.services.recognizer.acoustic import blocks, model_file, network
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.light import light_model_from
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import features, pcm, resample, vad, whisper_mel
 from kouxing.services.recognizer.search import decoder
-from kouxing.services.recognizer.search.output_rule import MODEL_RULES
+from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.learnt import closures, model, rest, track
@@ -55,6 +56,7 @@ _ALIGNMENT_BYTES = 8
 _MAX_CONSTANT_SIZE = 400  # longer lists are arrays
 _MODULES = {  # kouxing-lips and ovrlipsync use the numbers of these modules by name
     "animator": face_animator,
+    "blocks": blocks,
     "clock": clock,
     "closures": closures,
     "decoder": decoder,
@@ -97,7 +99,8 @@ def web_model() -> dict[str, bytes]:
     for name, shape_set in shapes.SHAPE_SETS.items():
         gram, right = shape_set.equation
         arrays |= {f"shapes.{name}.gram": gram, f"shapes.{name}.right": right}
-    light = light_model_from(read_archive(model_path("light")))
+    block_archive = read_archive(model_path("blocks"))
+    light = light_model_from(block_archive)
     topology = light.topology
     phone_arrays: dict[str, NDArray[Any]] = {
         **{
@@ -110,6 +113,7 @@ def web_model() -> dict[str, bytes]:
         "log_leave": topology.log_leave,
         "duration_mean_s": topology.duration_mean_s,
         "log_prior": light.log_prior,
+        "block_log_prior": block_archive.floats("log_prior", topology.num_states),
     }
     blob, places = _pack(arrays)
     phone_blob, phone_places = _pack(phone_arrays)
@@ -131,22 +135,30 @@ def web_model() -> dict[str, bytes]:
         "shapeNames": {name: shape_set.names for name, shape_set in shapes.SHAPE_SETS.items()},
         "expressionNames": list(expression_motion.EXPRESSION_FAPS),
         "constants": {name: _constants(module) for name, module in _MODULES.items()},
-        "phones": _phones_header(topology),
+        "phones": {
+            **_phones_header(topology),
+            "acousticScale": float(block_archive.floats("acoustic_scale")),
+        },
         "arrays": places,
         "phoneArrays": phone_places,
     }
-    network_bytes = read_archive(ear.EAR_PATH).array("network", None).astype(np.uint8).tobytes()
     return {
-        "ear.onnx": network_bytes,
+        "ear.onnx": _network_in(read_archive(ear.EAR_PATH)),
+        "blocks.onnx": _network_in(block_archive),
         "model.bin": blob,
         "phones.bin": phone_blob,
         "model.json": json.dumps(header, separators=(",", ":")).encode(),
     }
 
 
+def _network_in(archive: model_file.Archive) -> bytes:
+    return archive.array("network", None).astype(np.uint8).tobytes()
+
+
 def _phones_header(topology: Topology) -> dict[str, Any]:
     """Return what the package needs about the phones in addition to arrays."""
-    inventory, rule = topology.inventory, MODEL_RULES["light"]
+    inventory = topology.inventory
+    rules = {name: MODEL_RULES.get(name, OutputRuleConfig()) for name in ("light", "blocks")}
     return {
         "symbols": inventory.phones,
         "silence": inventory.silence,
@@ -156,7 +168,10 @@ def _phones_header(topology: Topology) -> dict[str, Any]:
         },
         "lmScale": topology.lm_scale,
         "phonePenalty": topology.phone_penalty,
-        "rule": {"numStableFrames": rule.num_stable_frames, "minConfidence": rule.min_confidence},
+        "rules": {
+            name: {"numStableFrames": rule.num_stable_frames, "minConfidence": rule.min_confidence}
+            for name, rule in rules.items()
+        },
     }
 
 

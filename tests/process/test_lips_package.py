@@ -1,4 +1,4 @@
-"""The package ``kouxing-lips`` makes the faces and finds the phones of the server's light model."""
+"""The package ``kouxing-lips`` makes the faces and finds the phones of the server's models."""
 
 import difflib
 import json
@@ -73,9 +73,9 @@ def output_of(models: Path, file: Path) -> dict[str, Any]:
     return package_output(models, read(file))
 
 
-def server_events(samples: Frames) -> list[SoundEvent]:
-    config = RecognizerConfig(acoustic="light")
-    return sound_events(load_model("light"), samples, load_lip_predictor(), DELAY_S, config)
+def server_events(samples: Frames, acoustic: str = "light") -> list[SoundEvent]:
+    config = RecognizerConfig(acoustic=acoustic)
+    return sound_events(load_model(acoustic), samples, load_lip_predictor(), DELAY_S, config)
 
 
 def server_faps(events: Sequence[SoundEvent], feeling: float = FEELING) -> Frames:
@@ -113,9 +113,17 @@ def assert_equal(ours: Frames, theirs: Frames) -> None:
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_frames_and_phones_equal_the_servers(models: Path, file: Path) -> None:
-    output = output_of(models, file)
-    events = server_events(read(file))
+def test_frames_and_first_phones_equal_the_servers(models: Path, file: Path) -> None:
+    check_frames_and_phones(output_of(models, file), server_events(read(file)))
+
+
+@pytest.mark.parametrize("file", FILES[:2], ids=lambda file: file.stem)
+def test_frames_and_final_phones_equal_the_servers(models: Path, file: Path) -> None:
+    output = package_output(models, read(file), phones="final")
+    check_frames_and_phones(output, server_events(read(file), "blocks"))
+
+
+def check_frames_and_phones(output: dict[str, Any], events: Sequence[SoundEvent]) -> None:
     assert_equal(faps_of(output), server_faps(events))
     ours = [p for p in output["phones"] if p["isFinal"] and p["durationS"] > 0]
     theirs = [e for e in events if isinstance(e, Phone) and e.final and e.duration_s > 0]

@@ -1,5 +1,4 @@
 // Streaming Viterbi search over a loop of phones; services/recognizer/search/decoder.py explains it.
-// All states of a phone have the same score, that of the small ear.
 
 const NO_RECORD = -1;
 const NO_TOKEN = -1;
@@ -50,7 +49,20 @@ export class Decoder {
     this.confidence = 0;
   }
 
-  /** Search the next frame, given the scores of the phones; return the confidence in the last phone. */
+  /** Continue from the state of another search. */
+  copyState(other) {
+    for (let token = 0; token < this.numTokens; token++) this.#tokenOf[this.#context[token]] = NO_TOKEN;
+    const { numFrames, numTokens, lastShared, best, confidence } = other;
+    Object.assign(this, { numFrames, numTokens, lastShared, best, confidence, records: other.records.slice(), shared: other.shared.slice() });
+    const numStates = numTokens * this.#maxStates;
+    this.#context.set(other.#context.subarray(0, numTokens));
+    this.#top.set(other.#top.subarray(0, numTokens));
+    this.#score.set(other.#score.subarray(0, numStates));
+    this.#link.set(other.#link.subarray(0, numStates));
+    for (let token = 0; token < numTokens; token++) this.#tokenOf[this.#context[token]] = token;
+  }
+
+  /** Search the next frame, given the scores of the states; return the confidence in the last phone. */
   advance(scores) {
     this.#prune();
     this.#startPhones();
@@ -148,8 +160,11 @@ export class Decoder {
       this.#tokenOf[this.#context[token]] = NO_TOKEN;
       const last = --this.numTokens;
       if (token < last) {
-        [this.#context[token], this.#top[token]] = [this.#context[last], this.#top[last]];
-        const [from, end, to] = [last * this.#maxStates, (last + 1) * this.#maxStates, token * this.#maxStates];
+        this.#context[token] = this.#context[last];
+        this.#top[token] = this.#top[last];
+        const from = last * this.#maxStates;
+        const end = from + this.#maxStates;
+        const to = token * this.#maxStates;
         this.#score.copyWithin(to, from, end);
         this.#link.copyWithin(to, from, end);
         this.#tokenOf[this.#context[token]] = token;
@@ -207,7 +222,9 @@ export class Decoder {
   #advanceStates(scores) {
     const { IMPOSSIBLE } = this.#c;
     const { firstState, logStay, logLeave } = this.#hmms;
-    let [highest, bestToken, bestState] = [IMPOSSIBLE, 0, 0];
+    let highest = IMPOSSIBLE;
+    let bestToken = 0;
+    let bestState = 0;
     for (let token = 0; token < this.numTokens; token++) {
       const phone = this.#phoneOf(token);
       const first = firstState[phone];
@@ -217,13 +234,21 @@ export class Decoder {
         let value = Math.fround(this.#score[begin + state] + logStay[first + state]);
         let link = this.#link[begin + state];
         const moved = state ? Math.fround(this.#score[begin + state - 1] + logLeave[first + state - 1]) : this.#entry[token];
-        if (moved > value) [value, link] = [moved, state ? this.#link[begin + state - 1] : this.#entryLink[token]];
-        const score = Math.max(Math.fround(value + scores[phone]), IMPOSSIBLE);
+        if (moved > value) {
+          value = moved;
+          link = state ? this.#link[begin + state - 1] : this.#entryLink[token];
+        }
+        const sum = Math.fround(value + scores[first + state]);
+        const score = sum > IMPOSSIBLE ? sum : IMPOSSIBLE;
         this.#score[begin + state] = score;
         this.#link[begin + state] = link;
         if (score > this.#top[token]) {
           this.#top[token] = score;
-          if (score > highest) [highest, bestToken, bestState] = [score, token, state];
+          if (score > highest) {
+            highest = score;
+            bestToken = token;
+            bestState = state;
+          }
         }
       }
     }

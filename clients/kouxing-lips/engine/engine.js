@@ -1,6 +1,8 @@
 // Lip sync of one voice, from PCM to faces. It needs no browser, worker or thread.
 
 import { Face } from "./face.js";
+import { BlockScorer } from "./block-scorer.js";
+import { LightScorer } from "./light-scorer.js";
 import { loadModel } from "./model.js";
 import { PhoneRecognizer } from "./phone-recognizer.js";
 import { Resampler } from "./resampler.js";
@@ -35,7 +37,7 @@ export class LipEngine {
     this.#rateHz = sampleRateHz;
     this.#slice = new Float32Array(constants.pcm.SLICE);
     this.#resampler = new Resampler(sampleRateHz, model);
-    this.#segmenter = new SpeechSegmenter(model, delayS, model.phoneLm ? new PhoneRecognizer(model) : null);
+    this.#segmenter = new SpeechSegmenter(model, delayS, recognizerFor(model));
     this.#face = new Face(model, { delayS, expressiveness: amount, feeling: strength });
     this.#shapes = shapes.map((set) => [set, new ShapeSet(set, model)]);
     /** Names of the weights of each set. */
@@ -63,9 +65,8 @@ export class LipEngine {
   /** Take samples, mono in [-1, 1]; return the frames that are due. */
   push(samples) {
     if (!(samples instanceof Float32Array)) throw new TypeError("samples must be a Float32Array");
-    if (!samples.every(Number.isFinite)) throw new RangeError("some samples are not finite; give values in [-1, 1]");
+    const clipped = clip(samples);
     this.#numIn += samples.length;
-    const clipped = samples.map((sample) => Math.min(Math.max(sample, -1), 1));
     this.newPhones = [];
     return this.#process(this.#resampler.accept(clipped));
   }
@@ -125,13 +126,32 @@ export class LipEngine {
   }
 }
 
+/** Return the phone recognizer for the networks of a model; null without one. */
+function recognizerFor(model) {
+  if (!model.phoneLm) return null;
+  const { light, blocks } = model.phones.rules;
+  return model.blocks ? new PhoneRecognizer(model, new BlockScorer(model), blocks) : new PhoneRecognizer(model, new LightScorer(model), light);
+}
+
 function inRange(name, value, lowest, highest) {
   if (value >= lowest && value <= highest) return value;
   throw new RangeError(`${name} is ${value}; give ${lowest} to ${highest}`);
 }
 
+/** Return samples in [-1, 1]; throws a RangeError if some are not finite. */
+function clip(samples) {
+  const clipped = new Float32Array(samples.length);
+  for (let i = 0; i < samples.length; i++) {
+    const sample = samples[i];
+    if (!(Math.abs(sample) < Infinity)) throw new RangeError("some samples are not finite; give values in [-1, 1]");
+    clipped[i] = sample > 1 ? 1 : sample < -1 ? -1 : sample;
+  }
+  return clipped;
+}
+
 /** Return the RMS level in decibels relative to full scale. */
 function levelDb(samples, { SILENT_DB }) {
-  const power = samples.reduce((sum, sample) => sum + sample * sample, 0) / samples.length;
-  return Math.max(SILENT_DB, 10 * Math.log10(power + 1e-12));
+  let sum = 0;
+  for (let i = 0; i < samples.length; i++) sum += samples[i] * samples[i];
+  return Math.max(SILENT_DB, 10 * Math.log10(sum / samples.length + 1e-12));
 }

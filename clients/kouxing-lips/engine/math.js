@@ -29,3 +29,12 @@ export function frameTimeS(frame, model) {
   const { HOP_S, WINDOW_S } = model.constants.segmenter;
   return wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2, model);
 }
+
+/** Return the number that 16 bits of floating point stand for. */
+export function halfToFloat(half) {
+  const sign = half & 0x8000 ? -1 : 1;
+  const exponent = (half >> 10) & 31;
+  const fraction = (half & 1023) / 1024;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? (1 + fraction) * 2 ** (exponent - 15) : fraction * 2 ** -14);
+}

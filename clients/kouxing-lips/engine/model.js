@@ -1,11 +1,14 @@
 // The files of `kouxing export web`.
 
+import { halfToFloat } from "./math.js";
 import { Network } from "./network.js";
 import { PhoneLm } from "./phone-lm.js";
 
 const FORMAT = "kouxing-lips 1";
+const FINAL = "final"; // value of the option phones
 const FILES = ["ear.onnx", "model.bin", "model.json"];
 const PHONES_FILE = "phones.bin";
+const BLOCKS_FILE = "blocks.onnx"; // for final phones
 const ARRAYS = {
   float16: Uint16Array,
   float32: Float32Array,
@@ -19,13 +22,14 @@ const ARRAYS = {
  * Load the models.
  *
  * @param base URL of the folder with the files; in Node also a file URL
- * @param options { phones: whether to also load the phone recognizer }
- * @returns a promise of { ear: Network, phoneLm: PhoneLm or null, arrays: { values, shape } by name,
- *   constants, ... }; it is rejected if a file is missing or of another version
+ * @param options { phones: whether to also load the phone recognizer; "final": with the block network }
+ * @returns a promise of { ear: Network, phoneLm: PhoneLm or null, blocks: Network or null, arrays:
+ *   { values, shape } by name, constants, ... }; it is rejected if a file is missing or of another version
  */
 export async function loadModel(base, { phones = false } = {}) {
-  const files = phones ? [...FILES, PHONES_FILE] : FILES;
-  const [ear, blob, header, phonesBlob] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
+  if (![true, false, FINAL].includes(phones)) throw new RangeError(`phones is ${phones}; give true, false or "${FINAL}"`);
+  const files = [...FILES, ...(phones ? [PHONES_FILE] : []), ...(phones === FINAL ? [BLOCKS_FILE] : [])];
+  const [ear, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
   const model = JSON.parse(new TextDecoder().decode(header));
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
@@ -37,6 +41,7 @@ export async function loadModel(base, { phones = false } = {}) {
     phoneArrays,
     phoneLm: phones ? new PhoneLm(phoneArrays, model.constants) : null,
     ear: new Network(ear),
+    blocks: blocks ? new Network(blocks) : null,
   };
 }
 
@@ -63,12 +68,4 @@ async function readBytes(url) {
   } catch (error) {
     throw new Error(`cannot load ${url} (${error.message}); write it with: kouxing export web`, { cause: error });
   }
-}
-
-function halfToFloat(half) {
-  const sign = half & 0x8000 ? -1 : 1;
-  const exponent = (half >> 10) & 31;
-  const fraction = (half & 1023) / 1024;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? (1 + fraction) * 2 ** (exponent - 15) : fraction * 2 ** -14);
 }

@@ -1,11 +1,14 @@
 // Reads ONNX files: the fields of Protocol Buffers that a graph needs (onnx.proto3).
 
+import { halfToFloat } from "./math.js";
+
 const FLOAT = 1;
 const UINT8 = 2;
 const INT8 = 3;
 const INT64 = 7;
+const HALF = 10;
 
-/** Return { nodes, tensors: by name, inputs: their last sizes by name } of an ONNX file. */
+/** Return { nodes, tensors: by name, inputs: their shapes by name } of an ONNX file, for one session. */
 export function readGraph(bytes) {
   const graph = fields(bytes)[7]?.[0];
   if (!graph) throw new Error("this is not an ONNX file");
@@ -17,10 +20,11 @@ export function readGraph(bytes) {
   };
 }
 
-/** Return [name, last size] of a ValueInfoProto. */
+/** Return [name, shape] of a ValueInfoProto. An axis without a size counts the sessions. */
 function readInput(bytes) {
-  const inner = (value, ...path) => path.reduce((found, field) => fields(found)[field].at(-1), value);
-  return [text(fields(bytes)[1]), inner(bytes, 2, 1, 2, 1, 1)]; // type, tensor, shape, dimension, size
+  const inner = (value, ...path) => path.reduce((found, field) => fields(found)[field][0], value);
+  const { 1: dimensions } = fields(inner(bytes, 2, 1, 2)); // type, tensor, shape
+  return [text(fields(bytes)[1]), dimensions.map((dimension) => fields(dimension)[1]?.[0] ?? 1)];
 }
 
 function readNode(bytes) {
@@ -34,19 +38,21 @@ function readNode(bytes) {
 }
 
 function readAttribute(bytes) {
-  const { 1: name, 3: integer, 5: tensor } = fields(bytes);
-  return [text(name), tensor ? readTensor(tensor[0]).values : integer?.[0]];
+  const { 1: name, 2: float, 3: integer, 5: tensor, 8: integers } = fields(bytes);
+  return [text(name), tensor ? readTensor(tensor[0]).values : (integers && integersIn(integers)) ?? (float ?? integer)?.[0]];
 }
 
-/** Return { shape, values }. */
+/** Return { shape, length, values }. */
 function readTensor(bytes) {
   const { 1: dimensions = [], 2: [type], 9: [raw] = [] } = fields(bytes);
   const copy = raw?.slice().buffer;
-  const shape = dimensions.flatMap((value) => (value instanceof Uint8Array ? integersOf(value) : [value]));
-  if (type === FLOAT && copy) return { shape, values: new Float32Array(copy) };
-  if (type === UINT8 && copy) return { shape, values: new Uint8Array(copy) };
-  if (type === INT8 && copy) return { shape, values: new Int8Array(copy) };
-  if (type === INT64 && copy) return { shape, values: Array.from(new BigInt64Array(copy), Number) };
+  const shape = integersIn(dimensions);
+  const tensor = (values) => ({ shape, length: values.length, values });
+  if (type === FLOAT && copy) return tensor(new Float32Array(copy));
+  if (type === HALF && copy) return tensor(Float32Array.from(new Uint16Array(copy), halfToFloat));
+  if (type === UINT8 && copy) return tensor(new Uint8Array(copy));
+  if (type === INT8 && copy) return tensor(new Int8Array(copy));
+  if (type === INT64 && copy) return tensor(Array.from(new BigInt64Array(copy), Number));
   throw new Error(`the network has tensors of type ${type}, which this package cannot read; update the package`);
 }
 
@@ -81,6 +87,11 @@ function varint(bytes, at) {
     value |= BigInt(byte & 127) << shift;
     if (!(byte & 128)) return [Number(BigInt.asIntN(64, value)), at];
   }
+}
+
+/** Return the integers of a repeated field, packed or not. */
+function integersIn(field) {
+  return field.flatMap((value) => (value instanceof Uint8Array ? integersOf(value) : [value]));
 }
 
 function integersOf(bytes) {

@@ -1,5 +1,5 @@
-// Recognizes phones from the posteriors of the small ear; services/recognizer explains it in
-// acoustic/light.py, search/output_rule.py and live_decoder.py.
+// Recognizes phones from scores; services/recognizer explains it in live_decoder.py and
+// search/output_rule.py.
 
 import { Decoder } from "./decoder.js";
 import { frameTimeS, wholeSamples } from "./math.js";
@@ -8,29 +8,33 @@ const [FIRST, INSIDE] = [0, 1]; // position of a phone between pauses
 
 export class PhoneRecognizer {
   #model;
+  #scorer;
+  #ruleConfig;
   #symbols;
   #silence;
-  #logPrior;
   #durationsS;
-  #decoder;
+  #settled; // search over settled scores
+  #ahead; // its continuation over provisional scores
+  #decoder; // the one in use
+  #provisional; // the scores last searched
+  #numChecked; // frames that the output rule has had
   #rule; // lastEmitted, candidate, numAgreeing
-  #numEarly; // rows of frames before the speech
-  #numMissing; // frames without scores
-  #lastRow = null;
   #startFrame = 0;
   #done = 0; // frame of the speech up to which phones are final
-  #confidence = []; // confidence of the frames from `done` on
+  #confidence = []; // confidence of the settled frames from `done` on
   #numFinal = 0;
   #lastFinal;
   #open = []; // emitted, not yet final
 
-  constructor(model) {
-    const { phones, phoneArrays } = model;
+  /** @param rule parameters of the output rule */
+  constructor(model, scorer, rule) {
+    const { phones, phoneArrays, phoneLm } = model;
     const values = (name) => phoneArrays[name].values;
     this.#model = model;
+    this.#scorer = scorer;
+    this.#ruleConfig = rule;
     this.#symbols = phones.symbols;
     this.#silence = phones.symbols.indexOf(phones.silence);
-    this.#logPrior = values("log_prior");
     this.#durationsS = phoneArrays.duration_mean_s;
     const hmms = {
       silence: this.#silence,
@@ -40,56 +44,72 @@ export class PhoneRecognizer {
       lmScale: Math.fround(phones.lmScale),
       penalty: Math.fround(phones.phonePenalty),
     };
-    this.#decoder = new Decoder(model.phoneLm, hmms, model);
+    this.#settled = new Decoder(phoneLm, hmms, model);
+    this.#ahead = new Decoder(phoneLm, hmms, model);
   }
 
   /** Start a stretch of speech at a feature frame. */
   start(frame) {
+    this.#scorer.start();
     this.#startFrame = frame;
-    this.#numEarly = this.#model.constants.ear.PHONES_LAG_FRAMES;
-    this.#numMissing = 0;
-    this.#done = 0;
+    this.#done = this.#numChecked = 0;
     this.#confidence = [];
+    this.#provisional = [];
     this.#lastFinal = this.#silence;
     this.#open = [];
-    this.#decoder.reset();
+    this.#settled.reset();
+    this.#decoder = this.#settled;
     this.#rule = { lastEmitted: this.#silence, candidate: this.#silence, numAgreeing: 0 };
   }
 
-  /** Take the ear's rows after the next frames; return new and changed phones. */
-  accept(rows) {
-    this.#numMissing += rows.length;
-    this.#lastRow = rows.at(-1) ?? this.#lastRow;
-    const numEarly = Math.min(rows.length, this.#numEarly);
-    this.#numEarly -= numEarly;
-    this.#numMissing -= rows.length - numEarly;
-    return this.#search(rows.slice(numEarly));
+  /** Take the last frames of some positions; return new and changed phones. */
+  accept(positions, numFrames) {
+    const { settled, provisional } = this.#scorer.accept(positions, numFrames);
+    return this.#decode(settled, provisional);
   }
 
   /** End the speech; return the last phones. */
   finish() {
-    const phones = this.#search(Array(this.#numMissing).fill(this.#lastRow));
-    const rest = this.#decoder.finalPath().filter(({ start }) => start >= this.#done);
+    const phones = this.#decode(this.#scorer.finish(), []);
+    const rest = this.#settled.finalPath().filter(({ start }) => start >= this.#done);
     if (this.#open.length && rest.length > 1 && rest.at(-1).phone === this.#silence) rest.pop();
     phones.push(...this.#revise(rest, 0));
     return phones;
   }
 
-  #search(rows) {
-    const phones = rows.flatMap((row) => {
-      const scores = row.map((value, phone) => value - this.#logPrior[phone]);
-      this.#confidence.push(this.#decoder.advance(scores));
-      return this.#emit();
-    });
-    if (rows.length) {
-      this.#decoder.forgetBefore(this.#done);
-      this.#decoder.dropRecords();
+  #decode(settled, provisional) {
+    if (settled.length === 0 && provisional === this.#provisional) return [];
+    const known = this.#provisional;
+    const continues = settled.length === 0 && known.every((row, i) => isEqual(row, provisional[i]));
+    const numKnown = continues ? known.length : 0; // otherwise the search over provisional scores restarts
+    this.#provisional = provisional;
+    this.#decoder = this.#settled;
+    const phones = this.#search(settled);
+    if (settled.length) {
+      this.#settled.forgetBefore(this.#done);
+      this.#settled.dropRecords();
+    }
+    if (provisional.length) {
+      this.#decoder = this.#ahead;
+      if (numKnown === 0) this.#ahead.copyState(this.#settled);
+      phones.push(...this.#search(provisional.slice(numKnown)));
     }
     return phones;
   }
 
+  /** Continue the search; the output rule gets the frames that it has not had. */
+  #search(rows) {
+    const numChecked = Math.max(0, this.#numChecked - this.#decoder.numFrames);
+    return rows.flatMap((scores, i) => {
+      const confidence = this.#decoder.advance(scores);
+      if (this.#decoder === this.#settled) this.#confidence.push(confidence);
+      return i < numChecked ? [] : this.#emit();
+    });
+  }
+
   /** Return the last phone and corrections, if the output rule emits it at this frame. */
   #emit() {
+    this.#numChecked = this.#decoder.numFrames;
     const { phone, start, confidence } = this.#decoder.lastPhone;
     if (!this.#isDue(phone, confidence)) return [];
     const revised = this.#revise(this.#decoder.pathSince(this.#done), 1);
@@ -108,7 +128,7 @@ export class PhoneRecognizer {
   }
 
   #isDue(phone, confidence) {
-    const { numStableFrames, minConfidence } = this.#model.phones.rule;
+    const { numStableFrames, minConfidence } = this.#ruleConfig;
     const rule = this.#rule;
     if (confidence < minConfidence) rule.numAgreeing = 0;
     else rule.numAgreeing = phone === rule.candidate ? rule.numAgreeing + 1 : 1;
@@ -128,7 +148,7 @@ export class PhoneRecognizer {
       emitted.push({ ...this.#open.shift(), symbol: this.#symbols[this.#silence], durationS: 0, isFinal: true });
       this.#numFinal++;
     }
-    const finalUntil = numFollowing ? this.#decoder.sharedEnd : this.#decoder.numFrames;
+    const finalUntil = numFollowing ? this.#settled.sharedEnd : this.#settled.numFrames;
     const known = this.#open;
     const [firstIndex, firstFrame] = [this.#numFinal, this.#done];
     this.#open = [];
@@ -163,4 +183,8 @@ export class PhoneRecognizer {
 
 function isSame(one, other) {
   return other !== undefined && Object.keys(one).every((key) => one[key] === other[key]);
+}
+
+function isEqual(one, other) {
+  return other !== undefined && one.every((value, i) => value === other[i]);
 }

@@ -20,9 +20,14 @@ const FINISH = {
 export class ShapeSet {
   #gram;
   #right;
-  #scratch; // a matrix
+  // buffers
+  #matrix;
+  #solution;
+  #target;
+  #weights;
   #atOne; // weights that were 1 in the last solution, the first guess for the next
   #free; // weights between 0 and 1 in the last solution
+  #isWrong; // weights that the next solution frees or fixes
   #finish;
   #c; // constants
 
@@ -33,54 +38,70 @@ export class ShapeSet {
     this.#c = constants.shapes;
     this.#gram = rowsOf(arrays[`shapes.${set}.gram`]);
     this.#right = rowsOf(arrays[`shapes.${set}.right`]);
-    this.#scratch = new Float64Array(this.names.length ** 2);
-    this.#atOne = this.names.map(() => false);
-    this.#free = this.names.map(() => false);
+    this.#matrix = new Float64Array(this.names.length ** 2);
+    [this.#solution, this.#target, this.#weights] = [0, 0, 0].map(() => new Float64Array(this.names.length));
+    this.#atOne = new Uint8Array(this.names.length);
+    this.#free = new Uint8Array(this.names.length);
+    this.#isWrong = new Uint8Array(this.names.length);
     this.#finish = FINISH[set] ?? (() => {});
   }
 
   /** Return the weights, 0 to 1, whose face is closest to FAPs (68,). */
   weights(faps) {
-    const right = this.#right.map((row) => dot(row, faps));
-    const weights = Float32Array.from(this.#solve(right));
+    this.#right.forEach((row, i) => (this.#target[i] = dot(row, faps)));
+    const weights = new Float32Array(this.#solve(this.#target));
     this.#finish(weights, this.names);
     return weights;
   }
 
   #solve(right) {
-    const all = [...right.keys()];
-    const [atOne, free] = [this.#atOne, this.#free];
-    let [fewest, patience] = [right.length + 1, this.#c.PATIENCE];
+    const { ROUNDING, PATIENCE } = this.#c;
+    const [atOne, free, isWrong] = [this.#atOne, this.#free, this.#isWrong];
+    const size = right.length;
+    let [fewest, patience] = [size + 1, PATIENCE];
     for (;;) {
-      const weights = atOne.map(Number);
-      const inner = all.filter((i) => free[i]);
-      const solved = this.#solveFor(inner, inner.map((i) => right[i] - dot(this.#gram[i], weights)));
-      inner.forEach((i, row) => (weights[i] = solved[row]));
-      const moves = all.map((i) => {
-        if (free[i]) return { i, isFree: false, isOne: weights[i] > 1 + this.#c.ROUNDING, isWrong: !isWithin(weights[i], this.#c.ROUNDING) };
-        const negativeGradient = right[i] - dot(this.#gram[i], weights);
-        return { i, isFree: true, isOne: false, isWrong: (atOne[i] ? -negativeGradient : negativeGradient) > this.#c.ROUNDING };
-      });
-      let wrong = moves.filter(({ isWrong }) => isWrong);
-      if (wrong.length === 0) return weights.map((weight) => clamp(weight, 0, 1));
-      if (wrong.length < fewest) [fewest, patience] = [wrong.length, this.#c.PATIENCE];
+      const weights = this.#solveForFree(right);
+      let [numWrong, lastWrong] = [0, 0];
+      for (let i = 0; i < size; i++) {
+        if (free[i]) isWrong[i] = weights[i] < -ROUNDING || weights[i] > 1 + ROUNDING ? 1 : 0;
+        else {
+          const negativeGradient = right[i] - dot(this.#gram[i], weights);
+          isWrong[i] = (atOne[i] ? -negativeGradient : negativeGradient) > ROUNDING ? 1 : 0;
+        }
+        if (isWrong[i]) [numWrong, lastWrong] = [numWrong + 1, i];
+      }
+      if (numWrong === 0) {
+        for (let i = 0; i < size; i++) weights[i] = clamp(weights[i], 0, 1);
+        return weights;
+      }
+      let first = 0;
+      if (numWrong < fewest) [fewest, patience] = [numWrong, PATIENCE];
       else if (patience) patience--;
-      else wrong = wrong.slice(-1); // exchanging only the last one guarantees termination
-      for (const { i, isFree, isOne } of wrong) [free[i], atOne[i]] = [isFree, isOne];
+      else first = lastWrong; // exchanging only the last one guarantees termination
+      for (let i = first; i < size; i++) {
+        if (!isWrong[i]) continue;
+        atOne[i] = free[i] && weights[i] > 1 + ROUNDING ? 1 : 0;
+        free[i] = free[i] ? 0 : 1;
+      }
     }
   }
 
-  /** Solve the equations of some shapes; the right side is replaced by the solution. */
-  #solveFor(shapes, right) {
-    let at = 0;
-    for (const i of shapes) for (const j of shapes) this.#scratch[at++] = this.#gram[i][j];
-    solve(this.#scratch, right);
-    return right;
+  /** Return weights: 0, 1, or the solution of the equations of the free shapes. */
+  #solveForFree(right) {
+    const [weights, free, matrix, solution] = [this.#weights, this.#free, this.#matrix, this.#solution];
+    weights.set(this.#atOne);
+    let [row, at] = [0, 0];
+    for (let i = 0; i < free.length; i++) {
+      if (!free[i]) continue;
+      const equation = this.#gram[i];
+      solution[row++] = right[i] - dot(equation, weights);
+      for (let j = 0; j < free.length; j++) if (free[j]) matrix[at++] = equation[j];
+    }
+    solve(matrix, solution, row);
+    row = 0;
+    for (let i = 0; i < free.length; i++) if (free[i]) weights[i] = solution[row++];
+    return weights;
   }
-}
-
-function isWithin(weight, rounding) {
-  return weight >= -rounding && weight <= 1 + rounding;
 }
 
 function rowsOf({ values, shape: [rows, columns] }) {
@@ -98,9 +119,9 @@ function dot(one, other) {
  *
  * @param matrix rows one after the other; its lower half is overwritten
  * @param right replaced by the solution
+ * @param size number of equations
  */
-function solve(matrix, right) {
-  const size = right.length;
+function solve(matrix, right, size) {
   for (let i = 0; i < size; i++) {
     for (let j = 0; j <= i; j++) {
       let sum = matrix[i * size + j];

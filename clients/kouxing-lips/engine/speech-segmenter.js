@@ -62,12 +62,15 @@ export class SpeechSegmenter {
     const { FRAMES_PER_POSITION } = this.#model.constants.segmenter;
     const events = [];
     while (this.#frames.length >= FRAMES_PER_POSITION) {
-      const frames = new Float32Array(this.#frames.splice(0, FRAMES_PER_POSITION).flatMap((frame) => [...frame]));
+      const frames = join(this.#frames.splice(0, FRAMES_PER_POSITION));
       this.#numFrames += FRAMES_PER_POSITION;
-      const { features, phones, voice, new_state: state } = this.#model.ear.run({ frames, state: this.#state });
-      this.#state.set(state);
-      const row = this.#phones ? phones.slice() : null;
-      events.push(...this.#process({ features: new Float32Array([...frames, ...features]), row }, voice));
+      const { ear } = this.#model;
+      ear.values("frames").set(frames);
+      ear.values("state").set(this.#state);
+      ear.run();
+      this.#state.set(ear.values("new_state"));
+      const row = this.#phones ? ear.values("phones").slice() : null;
+      events.push(...this.#process({ features: join([frames, ear.values("features")]), row }, ear.values("voice")));
     }
     return events;
   }
@@ -122,8 +125,7 @@ export class SpeechSegmenter {
 
   /** Return the phones that follow from the last frames of some positions. */
   #recognize(positions, numFrames) {
-    const rows = positions.flatMap(({ row }) => Array(this.#framesPerPosition).fill(row));
-    return (this.#phones?.accept(rows.slice(-numFrames)) ?? []).map(eventOf);
+    return (this.#phones?.accept(positions, numFrames) ?? []).map(eventOf);
   }
 
   #speechChange(active, frame) {
@@ -137,6 +139,16 @@ export class SpeechSegmenter {
     const [timeS, delayS] = [frame.timeS, frame.delayS].map((time) => wholeSamples(time, this.#model));
     return [{ ...frame, type: "lips", timeS, delayS }];
   }
+}
+
+function join(parts) {
+  const joined = new Float32Array(parts.reduce((sum, { length }) => sum + length, 0));
+  let at = 0;
+  for (const part of parts) {
+    joined.set(part, at);
+    at += part.length;
+  }
+  return joined;
 }
 
 function eventOf(phone) {

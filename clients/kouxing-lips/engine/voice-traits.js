@@ -27,12 +27,12 @@ export class VoiceTraits {
   /** Take the next position's state and probabilities of the kinds of voice. */
   accept(state, voice) {
     const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_SHARE } = this.#c;
-    const { values, shape } = this.#weights;
-    const outputs = Array.from(this.#bias, (bias, output) => {
-      let sum = bias;
-      for (let i = 0; i < state.length; i++) sum += state[i] * values[i * shape[1] + output];
-      return sum;
-    });
+    const { values, shape: [, numOutputs] } = this.#weights;
+    const outputs = new Float64Array(this.#bias);
+    for (let i = 0, at = 0; i < state.length; i++) {
+      const value = state[i];
+      for (let output = 0; output < numOutputs; output++, at++) outputs[output] += value * values[at];
+    }
     const towards = (values_, share) => values_.map((value, i) => value + share * (outputs[i] - value));
     if (voice[this.#voices.SPEECH] + voice[this.#voices.SUNG] > MIN_VOICE) {
       this.#numVoiced++;

@@ -1,0 +1,179 @@
+// Scores of the block network, for final phones; services/recognizer/acoustic/blocks.py explains them.
+//
+// The network has the state of one session at a time.
+
+export class BlockScorer {
+  /** Scores of the frames after the settled ones; a change is a new array. */
+  #provisional = [];
+  #c; // constants
+  #network;
+  #logPrior;
+  #scale;
+  #sizes; // block, length, past: positions
+  #rings; // keys and values of each layer
+  #table; // of positions
+  #frames; // from the next block's first on
+  #numFrames; // number of frames of the speech
+  #numSettled;
+  #settled; // not yet returned
+  #loudest; // band of the speech
+  #hasEnded;
+  #row; // row of the table for the next block
+  #numDue; // positions that the next run needs
+  #numCached;
+
+  constructor({ blocks, phoneArrays, phones, constants }) {
+    this.#c = { ...constants.blocks, ...constants.network, floorBands: constants.mel.FLOOR_BANDS };
+    this.#network = blocks;
+    this.#logPrior = phoneArrays.block_log_prior.values;
+    this.#scale = Math.fround(phones.acousticScale);
+    const [, length, width] = blocks.shape("positions");
+    const [, numRings, , block] = blocks.shape("new");
+    const names = ["keys", "values"].flatMap((kind) => Array.from({ length: numRings / 2 }, (_, layer) => `${kind}_${layer}`));
+    this.#rings = names.map((name) => blocks.values(name));
+    this.#sizes = { block, length, past: blocks.shape(names[0])[2] };
+    this.#table = positionTable(width, length, constants.network);
+    this.start();
+  }
+
+  /** Start a stretch of speech. */
+  start() {
+    this.#provisional = [];
+    this.#settled = [];
+    this.#numFrames = this.#numSettled = 0;
+    this.#loudest = -Infinity;
+    this.#frames = Array.from({ length: this.#c.PADDING }, () => new Float32Array(this.#numMels));
+    this.#hasEnded = false;
+    this.#startTable();
+  }
+
+  /** Take the last frames of some positions; return the new settled scores, and the provisional ones. */
+  accept(positions, numFrames) {
+    const size = this.#numMels;
+    const frames = positions.flatMap(({ features }) => [features.slice(0, size), features.slice(size, 2 * size)]);
+    for (const frame of frames.slice(-numFrames)) {
+      this.#numFrames++;
+      this.#loudest = frame.reduce((most, band) => Math.max(most, band), this.#loudest);
+      const floor = Math.fround(this.#loudest - this.#c.floorBands);
+      this.#frames.push(frame.map((band) => Math.max(band, floor)));
+    }
+    while (this.#numPositions >= this.#numDue) this.#run();
+    return { settled: this.#takeSettled(), provisional: this.#provisional };
+  }
+
+  /** End the speech; return the scores of the remaining frames. */
+  finish() {
+    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#c;
+    const numMore = this.#numFrames ? SEEN_AFTER - ((this.#numFrames - 1) % FRAMES_PER_POSITION) : 0;
+    this.#frames.push(...Array(numMore).fill(this.#frames.at(-1)));
+    this.#hasEnded = true;
+    while (this.#numPositions > 0) this.#run();
+    const numLeft = this.#numFrames - this.#numSettled;
+    return this.#takeSettled().slice(0, numLeft);
+  }
+
+  get #numMels() {
+    return this.#network.shape("frames")[2];
+  }
+
+  /** Number of complete positions, from the next block's first on. */
+  get #numPositions() {
+    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#c;
+    return Math.max(0, Math.floor((this.#frames.length - 1 - SEEN_AFTER) / FRAMES_PER_POSITION));
+  }
+
+  #startTable() {
+    const { length, block } = this.#sizes;
+    this.#row = this.#numCached = 0;
+    this.#numDue = length % block || block;
+    this.#network.values("state").fill(0);
+    for (const ring of this.#rings) ring.fill(0);
+  }
+
+  #takeSettled() {
+    const rows = this.#settled;
+    this.#settled = [];
+    this.#numSettled += rows.length;
+    return rows;
+  }
+
+  /** Compute the next block and its right context. */
+  #run() {
+    const { FRAMES_PER_POSITION, PADDING, MAX_POSITIONS } = this.#c;
+    const { block, length } = this.#sizes;
+    const numComplete = this.#numPositions;
+    let numPositions = Math.min(numComplete, this.#numDue);
+    const most = Math.min(length, MAX_POSITIONS - this.#row);
+    if (numPositions < most) {
+      // one run replaces several runs that settle nothing
+      const numMore = Math.min(numComplete, most) - numPositions;
+      numPositions += Math.floor(numMore / block) * block;
+    }
+    const isLast = this.#row + numPositions === MAX_POSITIONS || (this.#hasEnded && numPositions === numComplete);
+    const numKept = isLast ? 0 : Math.max(0, numPositions + block - length);
+    const numSettled = FRAMES_PER_POSITION * (isLast ? numPositions : numKept);
+    const rows = this.#scores(this.#frames.slice(0, FRAMES_PER_POSITION * numPositions + PADDING + 1), numPositions);
+    this.#settled.push(...rows.slice(0, numSettled));
+    this.#provisional = rows.slice(numSettled);
+    this.#frames.splice(0, numSettled);
+    if (isLast) {
+      this.#startTable();
+      return;
+    }
+    if (numKept) this.#keep(numKept);
+    this.#numDue = Math.min(numPositions - numKept + block, MAX_POSITIONS - this.#row);
+  }
+
+  /** Run the network; return the scores of the states, a row for each frame. */
+  #scores(frames, numPositions) {
+    const network = this.#network;
+    const [input, positions] = ["frames", "positions"].map((name) => network.values(name));
+    const [size, width] = [this.#numMels, network.shape("positions")[2]];
+    input.fill(0);
+    frames.forEach((frame, i) => input.set(frame, i * size));
+    positions.set(this.#table.subarray(this.#row * width, this.#row * width + positions.length));
+    network.values("num_positions")[0] = numPositions;
+    network.values("num_cached")[0] = this.#numCached;
+    network.run();
+    const logPosteriors = network.values("log_posteriors");
+    const numStates = this.#logPrior.length;
+    return Array.from({ length: this.#c.FRAMES_PER_POSITION * numPositions }, (_, row) => {
+      const scores = logPosteriors.slice(row * numStates, (row + 1) * numStates);
+      for (let i = 0; i < numStates; i++) scores[i] = this.#scale * Math.fround(scores[i] - this.#logPrior[i]);
+      return scores;
+    });
+  }
+
+  /** Keep the state, and the keys and values, after the first positions of the block. */
+  #keep(numKept) {
+    const { past } = this.#sizes;
+    const [, , numHeads, numNew, size] = this.#network.shape("new");
+    const values = this.#network.values("new");
+    this.#rings.forEach((ring, number) => {
+      for (let head = 0; head < numHeads; head++) {
+        for (let position = 0; position < numKept; position++) {
+          const from = ((number * numHeads + head) * numNew + position) * size;
+          ring.set(values.subarray(from, from + size), (head * past + ((this.#row + position) % past)) * size);
+        }
+      }
+    });
+    this.#numCached = Math.min(this.#numCached + numKept, past);
+    this.#network.values("state").set(this.#network.values("new_state"));
+    this.#row += numKept;
+  }
+}
+
+/** Return Whisper's table of positions, with unused rows at the end. */
+function positionTable(width, numMore, { MAX_POSITIONS, LONGEST_WAVE }) {
+  const half = width / 2;
+  const step = Math.log(LONGEST_WAVE) / (half - 1);
+  const table = new Float32Array((MAX_POSITIONS + numMore) * width);
+  for (let row = 0; row < MAX_POSITIONS; row++) {
+    for (let i = 0; i < half; i++) {
+      const phase = row * Math.exp(-step * i);
+      table[row * width + i] = Math.sin(phase);
+      table[row * width + half + i] = Math.cos(phase);
+    }
+  }
+  return table;
+}

@@ -1,0 +1,221 @@
+;; Products of matrices, with SIMD. All places are bytes of the memory; matrices are stored by rows.
+(module
+  (memory (import "env" "memory") 1)
+
+  ;; sums of the lanes of four vectors
+  (func $byteSums (param $a v128) (param $b v128) (param $c v128) (param $d v128) (result v128)
+    (local $ab v128) (local $cd v128)
+    (local.set $ab (i32x4.add
+      (i8x16.shuffle 0 1 2 3 16 17 18 19 4 5 6 7 20 21 22 23 (local.get $a) (local.get $b))
+      (i8x16.shuffle 8 9 10 11 24 25 26 27 12 13 14 15 28 29 30 31 (local.get $a) (local.get $b))))
+    (local.set $cd (i32x4.add
+      (i8x16.shuffle 0 1 2 3 16 17 18 19 4 5 6 7 20 21 22 23 (local.get $c) (local.get $d))
+      (i8x16.shuffle 8 9 10 11 24 25 26 27 12 13 14 15 28 29 30 31 (local.get $c) (local.get $d))))
+    (i32x4.add
+      (i8x16.shuffle 0 1 2 3 4 5 6 7 16 17 18 19 20 21 22 23 (local.get $ab) (local.get $cd))
+      (i8x16.shuffle 8 9 10 11 12 13 14 15 24 25 26 27 28 29 30 31 (local.get $ab) (local.get $cd))))
+  (func $floatSums (param $a v128) (param $b v128) (param $c v128) (param $d v128) (result v128)
+    (local $ab v128) (local $cd v128)
+    (local.set $ab (f32x4.add
+      (i8x16.shuffle 0 1 2 3 16 17 18 19 4 5 6 7 20 21 22 23 (local.get $a) (local.get $b))
+      (i8x16.shuffle 8 9 10 11 24 25 26 27 12 13 14 15 28 29 30 31 (local.get $a) (local.get $b))))
+    (local.set $cd (f32x4.add
+      (i8x16.shuffle 0 1 2 3 16 17 18 19 4 5 6 7 20 21 22 23 (local.get $c) (local.get $d))
+      (i8x16.shuffle 8 9 10 11 24 25 26 27 12 13 14 15 28 29 30 31 (local.get $c) (local.get $d))))
+    (f32x4.add
+      (i8x16.shuffle 0 1 2 3 4 5 6 7 16 17 18 19 20 21 22 23 (local.get $ab) (local.get $cd))
+      (i8x16.shuffle 8 9 10 11 12 13 14 15 24 25 26 27 28 29 30 31 (local.get $ab) (local.get $cd))))
+
+  ;; four columns of one row
+  (func $oneRow (param $x i32) (param $w0 i32) (param $scales i32) (param $out i32) (param $size i32)
+    (local $w1 i32) (local $w2 i32) (local $w3 i32) (local $at i32)
+    (local $v v128) (local $a0 v128) (local $s00 v128) (local $s01 v128) (local $s02 v128) (local $s03 v128)
+    (local.set $w1 (i32.add (local.get $w0) (local.get $size)))
+    (local.set $w2 (i32.add (local.get $w1) (local.get $size)))
+    (local.set $w3 (i32.add (local.get $w2) (local.get $size)))
+    (loop $block
+      (local.set $a0 (v128.load (i32.add (local.get $x) (i32.shl (local.get $at) (i32.const 1)))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w0) (local.get $at))))
+      (local.set $s00 (i32x4.add (local.get $s00) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w1) (local.get $at))))
+      (local.set $s01 (i32x4.add (local.get $s01) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w2) (local.get $at))))
+      (local.set $s02 (i32x4.add (local.get $s02) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w3) (local.get $at))))
+      (local.set $s03 (i32x4.add (local.get $s03) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $at (i32.add (local.get $at) (i32.const 8)))
+      (br_if $block (i32.lt_u (local.get $at) (local.get $size))))
+    (local.set $v (v128.load (local.get $scales)))
+    (v128.store (local.get $out) (f32x4.mul (local.get $v) (f32x4.convert_i32x4_s
+      (call $byteSums (local.get $s00) (local.get $s01) (local.get $s02) (local.get $s03))))))
+
+  ;; four columns of two rows
+  (func $twoRows (param $x i32) (param $w0 i32) (param $scales i32) (param $out i32) (param $size i32) (param $columns i32)
+    (local $w1 i32) (local $w2 i32) (local $w3 i32) (local $at i32) (local $x1 i32)
+    (local $v v128) (local $a0 v128) (local $a1 v128) (local $s00 v128) (local $s01 v128) (local $s02 v128) (local $s03 v128) (local $s10 v128) (local $s11 v128) (local $s12 v128) (local $s13 v128)
+    (local.set $w1 (i32.add (local.get $w0) (local.get $size)))
+    (local.set $w2 (i32.add (local.get $w1) (local.get $size)))
+    (local.set $w3 (i32.add (local.get $w2) (local.get $size)))
+    (local.set $x1 (i32.add (local.get $x) (i32.shl (local.get $size) (i32.const 1))))
+    (loop $block
+      (local.set $a0 (v128.load (i32.add (local.get $x) (i32.shl (local.get $at) (i32.const 1)))))
+      (local.set $a1 (v128.load (i32.add (local.get $x1) (i32.shl (local.get $at) (i32.const 1)))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w0) (local.get $at))))
+      (local.set $s00 (i32x4.add (local.get $s00) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $s10 (i32x4.add (local.get $s10) (i32x4.dot_i16x8_s (local.get $a1) (local.get $v))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w1) (local.get $at))))
+      (local.set $s01 (i32x4.add (local.get $s01) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $s11 (i32x4.add (local.get $s11) (i32x4.dot_i16x8_s (local.get $a1) (local.get $v))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w2) (local.get $at))))
+      (local.set $s02 (i32x4.add (local.get $s02) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $s12 (i32x4.add (local.get $s12) (i32x4.dot_i16x8_s (local.get $a1) (local.get $v))))
+      (local.set $v (v128.load8x8_s (i32.add (local.get $w3) (local.get $at))))
+      (local.set $s03 (i32x4.add (local.get $s03) (i32x4.dot_i16x8_s (local.get $a0) (local.get $v))))
+      (local.set $s13 (i32x4.add (local.get $s13) (i32x4.dot_i16x8_s (local.get $a1) (local.get $v))))
+      (local.set $at (i32.add (local.get $at) (i32.const 8)))
+      (br_if $block (i32.lt_u (local.get $at) (local.get $size))))
+    (local.set $v (v128.load (local.get $scales)))
+    (v128.store (local.get $out) (f32x4.mul (local.get $v) (f32x4.convert_i32x4_s
+      (call $byteSums (local.get $s00) (local.get $s01) (local.get $s02) (local.get $s03)))))
+    (v128.store (i32.add (local.get $out) (i32.shl (local.get $columns) (i32.const 2))) (f32x4.mul (local.get $v) (f32x4.convert_i32x4_s
+      (call $byteSums (local.get $s10) (local.get $s11) (local.get $s12) (local.get $s13))))))
+
+  ;; Multiply 8-bit integers and scale the columns.
+  ;; x: (rows, size) int16, size a multiple of 8; weights: (columns, size) int8; scales: (columns,)
+  ;; float; out: (rows, columns) float. The last four columns may be computed twice.
+  (func (export "multiplyBytes") (param $x i32) (param $weights i32) (param $scales i32) (param $out i32)
+    (param $rows i32) (param $size i32) (param $columns i32)
+    (local $row i32) (local $column i32) (local $place i32) (local $w i32) (local $s i32) (local $o i32)
+    (loop $next
+      (local.set $place (i32.sub (local.get $columns) (i32.const 4)))
+      (local.set $place (select (local.get $column) (local.get $place)
+        (i32.lt_s (local.get $column) (local.get $place))))
+      (local.set $w (i32.add (local.get $weights) (i32.mul (local.get $place) (local.get $size))))
+      (local.set $s (i32.add (local.get $scales) (i32.shl (local.get $place) (i32.const 2))))
+      (local.set $row (i32.const 0))
+      (loop $rows
+        (local.set $o (i32.add (local.get $out) (i32.shl (i32.add (local.get $place)
+          (i32.mul (local.get $row) (local.get $columns))) (i32.const 2))))
+        (if (i32.lt_s (i32.add (local.get $row) (i32.const 1)) (local.get $rows))
+          (then (call $twoRows
+            (i32.add (local.get $x) (i32.shl (i32.mul (local.get $row) (local.get $size)) (i32.const 1)))
+            (local.get $w) (local.get $s) (local.get $o) (local.get $size) (local.get $columns)))
+          (else (call $oneRow
+            (i32.add (local.get $x) (i32.shl (i32.mul (local.get $row) (local.get $size)) (i32.const 1)))
+            (local.get $w) (local.get $s) (local.get $o) (local.get $size))))
+        (local.set $row (i32.add (local.get $row) (i32.const 2)))
+        (br_if $rows (i32.lt_s (local.get $row) (local.get $rows))))
+      (local.set $column (i32.add (local.get $column) (i32.const 4)))
+      (br_if $next (i32.lt_s (local.get $column) (local.get $columns)))))
+
+  ;; Multiply a, (rows, size), and the transpose of b, (columns, size), both float, size a multiple of 4.
+  ;; out: (rows, columns) float
+  (func (export "multiplyTransposed") (param $a i32) (param $b i32) (param $out i32)
+    (param $rows i32) (param $size i32) (param $columns i32) (param $factor f32)
+    (local $column i32) (local $place i32) (local $at i32) (local $end i32) (local $bytes i32)
+    (local $b0 i32) (local $b1 i32) (local $b2 i32) (local $b3 i32) (local $v v128)
+    (local $s0 v128) (local $s1 v128) (local $s2 v128) (local $s3 v128)
+    (local.set $bytes (i32.shl (local.get $size) (i32.const 2)))
+    (loop $row
+      (local.set $column (i32.const 0))
+      (loop $next
+        (local.set $place (i32.sub (local.get $columns) (i32.const 4)))
+        (local.set $place (select (local.get $column) (local.get $place)
+          (i32.lt_s (local.get $column) (local.get $place))))
+        (local.set $b0 (i32.add (local.get $b) (i32.mul (local.get $place) (local.get $bytes))))
+        (local.set $b1 (i32.add (local.get $b0) (local.get $bytes)))
+        (local.set $b2 (i32.add (local.get $b1) (local.get $bytes)))
+        (local.set $b3 (i32.add (local.get $b2) (local.get $bytes)))
+        (local.set $s0 (v128.const f32x4 0 0 0 0))
+        (local.set $s1 (v128.const f32x4 0 0 0 0))
+        (local.set $s2 (v128.const f32x4 0 0 0 0))
+        (local.set $s3 (v128.const f32x4 0 0 0 0))
+        (local.set $at (i32.const 0))
+        (loop $block
+          (local.set $v (v128.load (i32.add (local.get $a) (local.get $at))))
+          (local.set $s0 (f32x4.add (local.get $s0) (f32x4.mul (local.get $v)
+            (v128.load (i32.add (local.get $b0) (local.get $at))))))
+          (local.set $s1 (f32x4.add (local.get $s1) (f32x4.mul (local.get $v)
+            (v128.load (i32.add (local.get $b1) (local.get $at))))))
+          (local.set $s2 (f32x4.add (local.get $s2) (f32x4.mul (local.get $v)
+            (v128.load (i32.add (local.get $b2) (local.get $at))))))
+          (local.set $s3 (f32x4.add (local.get $s3) (f32x4.mul (local.get $v)
+            (v128.load (i32.add (local.get $b3) (local.get $at))))))
+          (local.set $at (i32.add (local.get $at) (i32.const 16)))
+          (br_if $block (i32.lt_u (local.get $at) (local.get $bytes))))
+        (v128.store (i32.add (local.get $out) (i32.shl (local.get $place) (i32.const 2)))
+          (f32x4.mul (f32x4.splat (local.get $factor))
+            (call $floatSums (local.get $s0) (local.get $s1) (local.get $s2) (local.get $s3))))
+        (local.set $column (i32.add (local.get $column) (i32.const 4)))
+        (br_if $next (i32.lt_s (local.get $column) (local.get $columns))))
+      (local.set $a (i32.add (local.get $a) (local.get $bytes)))
+      (local.set $out (i32.add (local.get $out) (i32.shl (local.get $columns) (i32.const 2))))
+      (local.set $rows (i32.sub (local.get $rows) (i32.const 1)))
+      (br_if $row (local.get $rows))))
+
+  ;; Multiply a, (rows, size), and b, (size, columns), both float, with 16 columns or more.
+  ;; out: (rows, columns) float
+  (func (export "multiply") (param $a i32) (param $b i32) (param $out i32)
+    (param $rows i32) (param $size i32) (param $columns i32)
+    (local $column i32) (local $place i32) (local $left i32) (local $from i32) (local $to i32) (local $bytes i32)
+    (local $v v128) (local $s0 v128) (local $s1 v128) (local $s2 v128) (local $s3 v128)
+    (local.set $bytes (i32.shl (local.get $columns) (i32.const 2)))
+    (loop $row
+      (local.set $column (i32.const 0))
+      (loop $next
+        (local.set $place (i32.sub (local.get $columns) (i32.const 16)))
+        (local.set $place (i32.shl (select (local.get $column) (local.get $place)
+          (i32.lt_s (local.get $column) (local.get $place))) (i32.const 2)))
+        (local.set $from (i32.add (local.get $b) (local.get $place)))
+        (local.set $s0 (v128.const f32x4 0 0 0 0))
+        (local.set $s1 (v128.const f32x4 0 0 0 0))
+        (local.set $s2 (v128.const f32x4 0 0 0 0))
+        (local.set $s3 (v128.const f32x4 0 0 0 0))
+        (local.set $left (local.get $size))
+        (loop $block
+          (local.set $v (v128.load32_splat (local.get $a)))
+          (local.set $s0 (f32x4.add (local.get $s0) (f32x4.mul (local.get $v) (v128.load offset=0 (local.get $from)))))
+          (local.set $s1 (f32x4.add (local.get $s1) (f32x4.mul (local.get $v) (v128.load offset=16 (local.get $from)))))
+          (local.set $s2 (f32x4.add (local.get $s2) (f32x4.mul (local.get $v) (v128.load offset=32 (local.get $from)))))
+          (local.set $s3 (f32x4.add (local.get $s3) (f32x4.mul (local.get $v) (v128.load offset=48 (local.get $from)))))
+          (local.set $a (i32.add (local.get $a) (i32.const 4)))
+          (local.set $from (i32.add (local.get $from) (local.get $bytes)))
+          (local.set $left (i32.sub (local.get $left) (i32.const 1)))
+          (br_if $block (local.get $left)))
+        (local.set $a (i32.sub (local.get $a) (i32.shl (local.get $size) (i32.const 2))))
+        (local.set $to (i32.add (local.get $out) (local.get $place)))
+        (v128.store offset=0 (local.get $to) (local.get $s0))
+        (v128.store offset=16 (local.get $to) (local.get $s1))
+        (v128.store offset=32 (local.get $to) (local.get $s2))
+        (v128.store offset=48 (local.get $to) (local.get $s3))
+        (local.set $column (i32.add (local.get $column) (i32.const 16)))
+        (br_if $next (i32.lt_s (local.get $column) (local.get $columns))))
+      (local.set $a (i32.add (local.get $a) (i32.shl (local.get $size) (i32.const 2))))
+      (local.set $out (i32.add (local.get $out) (local.get $bytes)))
+      (local.set $rows (i32.sub (local.get $rows) (i32.const 1)))
+      (br_if $row (local.get $rows))))
+
+  ;; Divide rows by their scales, round half to even, and clip.
+  ;; x: (rows, size) float, size a multiple of 8; scales: (rows,) float; out: (rows, size) int16
+  (func (export "quantize") (param $x i32) (param $scales i32) (param $out i32) (param $rows i32) (param $size i32)
+    (param $lowest f32) (param $highest f32)
+    (local $left i32) (local $scale v128) (local $least v128) (local $most v128) (local $a v128) (local $b v128)
+    (local.set $least (f32x4.splat (local.get $lowest)))
+    (local.set $most (f32x4.splat (local.get $highest)))
+    (loop $row
+      (local.set $scale (v128.load32_splat (local.get $scales)))
+      (local.set $left (local.get $size))
+      (loop $block
+        (local.set $a (i32x4.trunc_sat_f32x4_s (f32x4.min (local.get $most) (f32x4.max (local.get $least)
+          (f32x4.nearest (f32x4.div (v128.load (local.get $x)) (local.get $scale)))))))
+        (local.set $b (i32x4.trunc_sat_f32x4_s (f32x4.min (local.get $most) (f32x4.max (local.get $least)
+          (f32x4.nearest (f32x4.div (v128.load offset=16 (local.get $x)) (local.get $scale)))))))
+        (v128.store (local.get $out) (i16x8.narrow_i32x4_s (local.get $a) (local.get $b)))
+        (local.set $x (i32.add (local.get $x) (i32.const 32)))
+        (local.set $out (i32.add (local.get $out) (i32.const 16)))
+        (local.set $left (i32.sub (local.get $left) (i32.const 8)))
+        (br_if $block (local.get $left)))
+      (local.set $scales (i32.add (local.get $scales) (i32.const 4)))
+      (local.set $rows (i32.sub (local.get $rows) (i32.const 1)))
+      (br_if $row (local.get $rows))))
+)
