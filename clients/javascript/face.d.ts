@@ -16,7 +16,7 @@ export interface KouxingFaceEventMap extends HTMLElementEventMap {
 }
 
 /**
- * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`, or `local`, or `manual`.
+ * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`, or `local` and `phones`, or `manual`.
  * Events: `load`, `error`, `session`, `phone`, `notice`.
  */
 export class KouxingFace extends HTMLElement {

@@ -18,7 +18,7 @@ const MAX_STEP_S = 0.1; // longest time step of the hair physics
 
 /** The custom element; README.md lists its attributes. */
 export class KouxingFace extends HTMLElement {
-  static observedAttributes = ["src", "gateway", "session", "token", "recording", "local"];
+  static observedAttributes = ["src", "gateway", "session", "token", "recording", "local", "phones"];
   #renderer = null;
   #note = document.createElement("p"); // the last error
   #drawRate = null;
@@ -82,7 +82,7 @@ export class KouxingFace extends HTMLElement {
 
   attributeChangedCallback(name) {
     if (this.#renderer === null) return;
-    if (name === "local") this.#closeLips();
+    if (name === "local" || name === "phones") this.#closeLips();
     if (name === "src") this.#load();
     else this.#connect();
   }
@@ -144,8 +144,8 @@ export class KouxingFace extends HTMLElement {
 
   async #loadLips() {
     const { LipSync } = await import("kouxing-lips");
-    const models = this.getAttribute("local");
-    const lips = await LipSync.create({ shapes: ["arkit", "oculus", "vrm"], ...(models ? { models } : {}) });
+    const [models, phones] = ["local", "phones"].map((name) => this.getAttribute(name));
+    const lips = await LipSync.create({ shapes: ["arkit", "oculus", "vrm"], ...(models && { models }), ...(phones && { phones }) });
     if (this.#renderer === null || !this.hasAttribute("local")) {
       lips.close();
       return lips;

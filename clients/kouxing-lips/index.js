@@ -4,6 +4,7 @@ import { FrameTrack } from "./frame-track.js";
 
 const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
 const DEFAULT_SHAPES = ["arkit"];
+const MAX_LATE_S = 0.5; // from the sound to its face
 const TELEPHONE_HZ = 8000;
 const MODELS = new URL("models/", import.meta.url);
 
@@ -16,6 +17,7 @@ const TEXTS = {
   telephone: "the microphone sends 8 kHz, as a telephone does, so the lips are less accurate; choose another microphone",
   suspended: "the browser has not started the sound yet; click on the page",
   interrupted: "the system paused the sound, for example for a call; it continues afterwards",
+  late: "this device computes the lips too slowly; close other programs, or do without final phones",
   hidden: "the tab is in the background; the lips follow the sound again when it is visible",
 };
 
@@ -31,6 +33,7 @@ export class LipSync extends EventTarget {
   #pending = null; // the request that the worker has not answered: { answer, resolve, reject }
   #isSpeaking = false;
   #isLaughing = false;
+  #isLate = false;
 
   /** Names of the weights of each set. */
   names = {};
@@ -201,6 +204,7 @@ export class LipSync extends EventTarget {
 
   async #open(options, input = null) {
     this.#track = new FrameTrack();
+    this.#isLate = false;
     const session = ++this.#session;
     const message = { type: "open", session, options: { ...this.#options, ...options }, input };
     await this.#request("opened", message, input ? [input] : []);
@@ -249,12 +253,21 @@ export class LipSync extends EventTarget {
     if (frames.length === 0) return;
     this.#track.push(frames);
     const { timeS, isSpeaking, isLaughing } = frames.at(-1);
-    if (this.#source) this.#source.startS = startS;
+    if (this.#source) {
+      this.#source.startS = startS;
+      this.#checkLate(this.#context.currentTime - startS - timeS);
+    }
     if (isSpeaking !== this.#isSpeaking || isLaughing !== this.#isLaughing) {
       [this.#isSpeaking, this.#isLaughing] = [isSpeaking, isLaughing];
       this.dispatchEvent(new CustomEvent("voice", { detail: { timeS, isSpeaking, isLaughing } }));
     }
     this.dispatchEvent(new CustomEvent("frames", { detail: { frames, startS } }));
+  }
+
+  #checkLate(delayS) {
+    const isLate = delayS > (this.#isLate ? SHOW_AFTER_S : MAX_LATE_S);
+    if (isLate !== this.#isLate) this.#report(isLate ? TEXTS.late : "");
+    this.#isLate = isLate;
   }
 
   #onContextState = () => {

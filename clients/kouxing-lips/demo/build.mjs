@@ -13,7 +13,7 @@ const PAGE = join(ROOT, "services/gateway/page");
 const THREE = join(CLIENT, "node_modules/three");
 const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
 // loaded when first used
-const LAZY_FILES = /^heads\/(?!woman)|^modules\/(three\/examples\/jsm\/libs\/draco|headaudio|wlipsync)|^(rivals|visemes|wlipsync)/;
+const LAZY_FILES = /^modules\/kouxing-lips\/models\/blocks|^heads\/(?!woman)|^modules\/(three\/examples\/jsm\/libs\/draco|headaudio|wlipsync)|^(rivals|visemes|wlipsync)/;
 const WAV_HEADER_BYTES = 44;
 
 const [folder] = process.argv.slice(2);
@@ -23,6 +23,7 @@ const copy = (from, to) => cp(from, join(folder, to), { recursive: true });
 
 for (const name of ["index.html", "demo.js", "demo.css", "rivals.js"]) await copy(fileURLToPath(new URL(name, import.meta.url)), name);
 await copy(join(PAGE, "icon.svg"), "icon.svg");
+for (const name of ["LICENSE", "NOTICE"]) await copy(join(ROOT, name), `modules/kouxing-lips/${name}`);
 await copy(join(ROOT, "shared/demo/hello-female.wav"), "sample.wav");
 for (const head of HEADS) {
   await copy(join(PAGE, head === "woman" ? "head.glb" : `head-${head}.glb`), `heads/${head}.glb`);

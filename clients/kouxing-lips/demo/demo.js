@@ -33,6 +33,7 @@ byId("microphone").onclick = () =>
     await lips.listenToMicrophone();
     setMicrophone(true);
   });
+byId("final").onclick = () => act(setFinalPhones);
 byId("compare").onclick = () => act(rivals ? stopComparing : startComparing);
 byId("sample").onclick = () => act((lips) => play(lips, "sample.wav"));
 byId("file").onchange = ({ target }) => {
@@ -54,9 +55,24 @@ document.body.ondrop = (event) => {
 prepare();
 navigator.serviceWorker?.register("service-worker.js");
 
+/** Turn final phones on or off: loads the lip sync again. */
+async function setFinalPhones(lips) {
+  const isOn = byId("final").ariaPressed !== "true";
+  if (rivals) stopComparing();
+  lips.stop();
+  setMicrophone(false);
+  byId("final").ariaPressed = String(isOn);
+  note.textContent = "Loading";
+  if (isOn) face.setAttribute("phones", "final");
+  else face.removeAttribute("phones");
+  await prepare();
+  note.textContent = "";
+}
+
 /** Load the lip sync, and show its visemes and the state of the voice. */
 async function prepare() {
-  const lips = await face.lips;
+  const loading = face.lips;
+  const lips = await loading;
   lips.addEventListener("voice", ({ detail: { isSpeaking, isLaughing } }) => {
     note.textContent = isLaughing ? "Laughter" : isSpeaking ? "Speech" : "Silence";
   });
@@ -67,7 +83,9 @@ async function prepare() {
     note.textContent = [...phones.values()].slice(-NUM_PHONES).join(" ");
   });
   const items = [];
+  byId("visemes").replaceChildren();
   const show = () => {
+    if (face.lips !== loading) return; // others are in use now
     requestAnimationFrame(show);
     const weights = lips.current?.oculus;
     if (!weights) return;

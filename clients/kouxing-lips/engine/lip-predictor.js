@@ -1,6 +1,7 @@
 // The lip predictor; services/recognizer/lip_predictor.py has the formulas.
 
 import { sigmoid } from "./math.js";
+import { ProductMemory, roomFor } from "./products.js";
 
 /** The lip frames of one session. */
 export class LipPredictor {
@@ -9,7 +10,10 @@ export class LipPredictor {
   #numMouthFaps;
   #delayS;
   #state;
-  #entry; // product of the matrices of x and u: nothing is between them
+  // Multiply buffers by matrices. The first multiplies those of x and u: nothing is between them.
+  #enter;
+  #multiplyInput;
+  #multiplyState;
   #outputs; // weights at the used delay: an array for each output, and a bias
   #buffers; // buffers of a step
 
@@ -23,18 +27,28 @@ export class LipPredictor {
     const delaysS = Array.from(this.#weights.delays.values, (value) => Math.round(1e6 * value) / 1e6);
     const inTime = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
     this.#delayS = inTime.at(-1) ?? delaysS[0];
-    const { projection, entry_weights, state_weights, output_bias } = this.#weights;
-    this.#entry = product(projection, entry_weights);
+    const { projection, entry_weights, input_weights, state_weights, output_bias } = this.#weights;
     this.#outputs = this.#outputsAt(delaysS.indexOf(this.#delayS));
-    const gates = state_weights.shape[1];
-    const sizes = [...this.#entry.shape, gates, gates, output_bias.shape[1]];
-    this.#buffers = sizes.map((size) => new Float64Array(size));
+    const matrices = [product(projection, entry_weights), input_weights, state_weights];
+    const [[numFeatures, width], [, gates]] = matrices.map(({ shape }) => shape);
+    const sizes = [...matrices.map(({ values }) => values.length), numFeatures, width, gates, width, gates];
+    const memory = new ProductMemory(sizes.reduce((sum, size) => sum + roomFor(Float32Array, size), 0));
+    const buffers = sizes.map((size) => memory.array(Float32Array, size));
+    matrices.forEach(({ values }, i) => buffers[i].set(values));
+    const [entry, input, state, centered, entered, fromInput, lastState, fromState] = buffers;
+    const multiply = (vector, matrix, out) => () =>
+      memory.multiply(...[vector, matrix, out].map(({ byteOffset }) => byteOffset), 1, vector.length, out.length);
+    this.#enter = multiply(centered, entry, entered);
+    this.#multiplyInput = multiply(entered, input, fromInput);
+    this.#multiplyState = multiply(lastState, state, fromState);
+    this.#state = lastState;
+    this.#buffers = [centered, entered, fromInput, fromState, new Float64Array(output_bias.shape[1])];
     this.reset();
   }
 
   /** Start a new segment of speech. */
   reset() {
-    this.#state = new Float32Array(this.#weights.state_weights.shape[0]);
+    this.#state.fill(0);
   }
 
   /**
@@ -58,10 +72,14 @@ export class LipPredictor {
     const w = this.#weights;
     const [centered, entered, fromInput, fromState, outputs] = this.#buffers;
     for (let i = 0; i < centered.length; i++) centered[i] = features[i] - w.feature_mean.values[i];
-    times(entered, centered, this.#entry, w.entry_bias);
-    for (let i = 0; i < entered.length; i++) entered[i] = Math.max(entered[i], 0);
-    times(fromInput, entered, w.input_weights, w.input_bias);
-    times(fromState, this.#state, w.state_weights, w.state_bias);
+    this.#enter();
+    for (let i = 0; i < entered.length; i++) entered[i] = Math.max(entered[i] + w.entry_bias.values[i], 0);
+    this.#multiplyInput();
+    this.#multiplyState();
+    for (let i = 0; i < fromInput.length; i++) {
+      fromInput[i] += w.input_bias.values[i];
+      fromState[i] += w.state_bias.values[i];
+    }
     const size = this.#state.length;
     for (let i = 0; i < size; i++) {
       const reset = sigmoid(fromInput[i] + fromState[i]);
@@ -95,22 +113,16 @@ export class LipPredictor {
 
 /** Return the product of two matrices. */
 export function product(one, other) {
-  const [rows, columns] = [one.shape[0], other.shape[1]];
+  const [rows, size, columns] = [...one.shape, other.shape[1]];
   const values = new Float32Array(rows * columns);
   const row = new Float64Array(columns);
-  const zeros = { values: new Float32Array(columns) };
   for (let i = 0; i < rows; i++) {
-    times(row, one.values.subarray(i * one.shape[1], (i + 1) * one.shape[1]), other, zeros);
+    row.fill(0);
+    for (let k = 0, at = 0; k < size; k++) {
+      const factor = one.values[i * size + k];
+      for (let column = 0; column < columns; column++, at++) row[column] += factor * other.values[at];
+    }
     values.set(row, i * columns);
   }
   return { values, shape: [rows, columns] };
-}
-
-/** Compute the product of a vector (rows,) and a matrix (rows, columns), plus a bias. */
-function times(out, vector, { values, shape: [rows, columns] }, bias) {
-  for (let column = 0; column < columns; column++) out[column] = bias.values[column];
-  for (let row = 0; row < rows; row++) {
-    const factor = vector[row];
-    for (let column = 0, at = row * columns; column < columns; column++, at++) out[column] += factor * values[at];
-  }
 }

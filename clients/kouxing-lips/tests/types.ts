@@ -20,6 +20,7 @@ if (face?.vrm) console.log(face.vrm[lips.names.vrm!.indexOf("aa")]);
 lips.close();
 
 const engine = await LipEngine.load({ sampleRateHz: 48000, shapes: ["oculus"], phones: false });
+await LipEngine.load({ phones: "final" });
 const symbols: string[] = engine.newPhones.map(({ symbol }) => symbol);
 console.log(symbols);
 for (const { timeS, oculus } of engine.push(new Float32Array(480))) console.log(timeS, oculus?.[0]);
@@ -31,6 +32,8 @@ headAudio.update(16);
 const { volume, weights } = await createWLipSyncNode(lips.context);
 console.log(volume * weights.A!);
 
+// @ts-expect-error: unknown kind of phones
+await LipEngine.load({ phones: "first" });
 // @ts-expect-error: unknown shapes
 await LipEngine.load({ shapes: ["apple"] });
 // @ts-expect-error: unknown expression
