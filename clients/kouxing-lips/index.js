@@ -17,7 +17,7 @@ const TEXTS = {
   telephone: "the microphone sends 8 kHz, as a telephone does, so the lips are less accurate; choose another microphone",
   suspended: "the browser has not started the sound yet; click on the page",
   interrupted: "the system paused the sound, for example for a call; it continues afterwards",
-  late: "this device computes the lips too slowly; close other programs, or do without final phones",
+  slow: "this device is too slow for final phones; turn them off",
   hidden: "the tab is in the background; the lips follow the sound again when it is visible",
 };
 
@@ -33,7 +33,7 @@ export class LipSync extends EventTarget {
   #pending = null; // the request that the worker has not answered: { answer, resolve, reject }
   #isSpeaking = false;
   #isLaughing = false;
-  #isLate = false;
+  #mayBeSlow = false; // with final phones
 
   /** Names of the weights of each set. */
   names = {};
@@ -54,6 +54,7 @@ export class LipSync extends EventTarget {
   static async create({ models = MODELS, phones = true, context = null, shapes = DEFAULT_SHAPES, ...options } = {}) {
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
     const lips = new LipSync(worker, context, { shapes, ...options });
+    lips.#mayBeSlow = phones === "final";
     worker.onerror = () => lips.#fail("cannot start the worker; serve the package from the page's own origin");
     await lips.#request("loaded", { type: "load", models: new URL(models, location.href).href, phones });
     return lips;
@@ -204,7 +205,6 @@ export class LipSync extends EventTarget {
 
   async #open(options, input = null) {
     this.#track = new FrameTrack();
-    this.#isLate = false;
     const session = ++this.#session;
     const message = { type: "open", session, options: { ...this.#options, ...options }, input };
     await this.#request("opened", message, input ? [input] : []);
@@ -255,19 +255,16 @@ export class LipSync extends EventTarget {
     const { timeS, isSpeaking, isLaughing } = frames.at(-1);
     if (this.#source) {
       this.#source.startS = startS;
-      this.#checkLate(this.#context.currentTime - startS - timeS);
+      if (this.#mayBeSlow && this.#context.currentTime - startS - timeS > MAX_LATE_S) {
+        this.#mayBeSlow = false; // one notice is enough
+        this.#report(TEXTS.slow);
+      }
     }
     if (isSpeaking !== this.#isSpeaking || isLaughing !== this.#isLaughing) {
       [this.#isSpeaking, this.#isLaughing] = [isSpeaking, isLaughing];
       this.dispatchEvent(new CustomEvent("voice", { detail: { timeS, isSpeaking, isLaughing } }));
     }
     this.dispatchEvent(new CustomEvent("frames", { detail: { frames, startS } }));
-  }
-
-  #checkLate(delayS) {
-    const isLate = delayS > (this.#isLate ? SHOW_AFTER_S : MAX_LATE_S);
-    if (isLate !== this.#isLate) this.#report(isLate ? TEXTS.late : "");
-    this.#isLate = isLate;
   }
 
   #onContextState = () => {
