@@ -15,8 +15,8 @@ export type ExpressionName =
 
 export interface EngineOptions {
   /**
-   * Whether to recognize phones, which also improve the closures of the lips; default: true. "final" also loads the
-   * server's block network, which corrects them: 19 MB more, and about ten times the processor time.
+   * Whether to recognize phones, which also improve the closures of the lips; default: true. "final" loads the
+   * server's block network, which makes fewer errors: 19 MB more, and about ten times the processor time.
    */
   phones?: boolean | "final";
   /** Sets of weights to compute; default: `["arkit"]`. */
