@@ -217,6 +217,7 @@ export const OPERATORS = {
       for (let row = 0; row < size; row++) {
         for (let column = 0; column < columns; column++) matrix.values[column * size + row] = weights.values[row * columns + column];
       }
+      weights.values = null; // frees the copy from the file
       for (let column = 0; column < columns; column++) scales.values[column] = xScale.values[0] * columnScales.values[column];
       const places = [x, matrix, scales, out].map(placeOf);
       return () => memory.multiplyBytes(...places, x.rows, size, columns);
