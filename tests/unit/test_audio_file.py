@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.shared.audio_file import open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
@@ -30,6 +31,16 @@ def test_reads_a_long_file_in_little_memory(tmp_path: Path) -> None:
     tracemalloc.stop()
     assert (num_samples, source.duration_s) == (600 * 8000, 600)
     assert peak_bytes < 1e6
+
+
+def test_holds_the_samples_of_a_recording_only_once(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "long.wav", np.zeros(300 * 16_000, np.float32), 16_000)
+    tracemalloc.start()
+    samples = read_mono_16k(tmp_path / "long.wav")
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(samples) == 300 * 16_000
+    assert peak_bytes < 1.3 * samples.nbytes
 
 
 def test_rejects_a_file_without_samples(tmp_path: Path) -> None:
