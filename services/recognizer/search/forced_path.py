@@ -128,7 +128,7 @@ def viterbi_path(
     num_first = int((graph.phone_number == 0).sum())
     for node in (0, num_first):  # the first pause is optional
         first[node] = scores[0, columns[node]]
-    step = 2 * math.isqrt(num_frames) + 1  # a row has 8 bytes per node, a block 1
+    step = math.isqrt(num_frames) + 1
     starts = range(0, num_frames - 1, step)  # the frame before each block
 
     def block_of(start: int, low: int, end: int) -> _Block:
