@@ -30,7 +30,6 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
 def write_error(path: Path, error: OSError) -> UserError:
     """Return the error for a file that cannot be written."""
     if isinstance(error, FileNotFoundError):
-        return UserError(
-            f"cannot write {path}: the folder does not exist; run: mkdir -p {path.parent}"
-        )
+        folder = (path.resolve() if path.is_symlink() else path).parent
+        return UserError(f"cannot write {path}: the folder does not exist; run: mkdir -p {folder}")
     return UserError(f"cannot write {path}: {error.strerror}")

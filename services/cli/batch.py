@@ -29,15 +29,15 @@ def pair_outputs(
             output.mkdir()
         except OSError as error:
             raise write_error(output, error) from None
-    pairs: dict[Path, Path] = {}
+    pairs: dict[Path, tuple[Path, Path]] = {}  # by the real path of the output
     for source in sources:
         target = (output or source.parent) / source.with_suffix(suffix).name
-        if target in pairs:
+        if other := pairs.get(target.resolve()):
             raise UserError(
-                f"{pairs[target]} and {source} would both be written to {target}; rename one"
+                f"{other[0]} and {source} would both be written to {target}; rename one"
             )
-        pairs[target] = source
-    return [(source, target) for target, source in pairs.items()]
+        pairs[target.resolve()] = source, target
+    return [*pairs.values()]
 
 
 def process_all(pairs: Sequence[tuple[Path, T]], process: Callable[[Path, T], None]) -> None:

@@ -27,6 +27,13 @@ def test_an_error_names_the_folder_to_create(tmp_path: Path) -> None:
         pass
 
 
+def test_an_error_names_the_folder_that_a_link_needs(tmp_path: Path) -> None:
+    link = tmp_path / "head.glb"
+    link.symlink_to(tmp_path / "new" / "head.glb")
+    with pytest.raises(UserError, match=f"mkdir -p {tmp_path}/new"), open_output(link):
+        pass
+
+
 def test_a_device_is_not_deleted() -> None:
     with pytest.raises(UserError, match="No space left"), open_output(Path("/dev/full")) as file:
         file.write(b"text")
