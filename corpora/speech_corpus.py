@@ -21,7 +21,7 @@ are cut into pieces that overlap by 0.48 s, and so are their texts.
 
 ``languages.tsv`` lists recordings in several languages, by speakers that no model was trained on,
 and their phones. No setting of the universal model was chosen on these recordings, except for those
-of two native speakers of English (``en-native``).
+of two native speakers of English (``en-native``) and of one of Korean.
 """
 
 import math

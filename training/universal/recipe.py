@@ -29,7 +29,7 @@ from kouxing.training.universal.features import LAYERS, FeatureStore
 from kouxing.training.universal.recordings import TrainingSet, read_training_set
 from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
 
-_ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE = 0.7, 6.0, 1.0  # chosen on held-out recordings
+_ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE = 0.6, 6.0, 1.0  # chosen on held-out recordings
 _LM_ORDER, _LM_NGRAMS = 3, 20_000
 
 
