@@ -22,7 +22,7 @@ from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.conftest import Command
 from tests.e2e.following import Stream, samples_of_file
 from tests.receivers import read_osc
-from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python
+from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python, wait_until
 
 SENTENCE = VOWELS_FILE
 
@@ -189,6 +189,16 @@ def test_status_shows_services_and_sessions_and_writes_json(system: System, tmp_
     figures = tmp_path / "status.json"
     with Client(system.control) as client:
         session = client.open_session("live")
+
+        def push() -> None:
+            session.push(bytes(640))  # 20 ms
+            time.sleep(0.02)
+
+        def has_lateness() -> bool:
+            sessions = client.status().sessions
+            return any(state.session == "live" and state.lateness for state in sessions)
+
+        wait_until(has_lateness, step=push)
         with ThreadPoolExecutor() as executor:
             running = executor.submit(
                 kouxing,
@@ -197,8 +207,7 @@ def test_status_shows_services_and_sessions_and_writes_json(system: System, tmp_
                 environment={"COLUMNS": "80"},
             )
             while not running.done():
-                session.push(bytes(640))  # 20 ms
-                time.sleep(0.02)
+                push()
         result = running.result()
     assert result.returncode == 0, result.stderr
     instances = [line.split()[0] for line in result.stdout.splitlines() if " ready " in line]
