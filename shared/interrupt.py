@@ -26,12 +26,17 @@ def install_interrupt() -> None:
 
 def is_interrupted() -> bool:
     """Return whether Ctrl-C was pressed and is not yet handled."""
-    return signal.getitimer(signal.ITIMER_REAL)[0] > 0.0
+    return _is_installed() and signal.getitimer(signal.ITIMER_REAL)[0] > 0.0
 
 
 def end_interrupt() -> None:
     """Stop repeating the exception: it is handled."""
-    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    if _is_installed():
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def _is_installed() -> bool:
+    return signal.getsignal(signal.SIGALRM) is _repeat  # else the timer belongs to another program
 
 
 @contextlib.contextmanager
