@@ -96,22 +96,20 @@ def recognizer(
 
 @app.command()
 def languages(
-    audio: Annotated[
-        Path, typer.Option(help="Folder of the audio files; the manifest's paths start there.")
-    ],
+    audio: Annotated[Path, typer.Option(help="Folder of the audio files that the manifest lists.")],
     manifest: Annotated[
         Path | None,
-        typer.Option(help="Manifest with the column language. Default: corpora/languages.tsv."),
+        typer.Option(help="Manifest with a language column. Default: corpora/languages.tsv."),
     ] = None,
     hama: Annotated[
-        bool, typer.Option("--hama", help="Also run the package hama on recordings of English.")
+        bool, typer.Option("--hama", help="Also run the package hama on the English recordings.")
     ] = False,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure feature and viseme errors of universal phones by language, live.
+    """Measure live feature and viseme errors of universal phones by language.
 
-    Each recording is recognized without a choice of language, and as its language.
+    Each recording is recognized twice: with no language chosen, and with its own language.
     """
     from kouxing.corpora.speech_corpus import LANGUAGES, RowErrors
     from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
@@ -296,7 +294,7 @@ def report(
     corpus: Annotated[Path | None, typer.Option(help="Corpus of read speech.")] = None,
     natural: Annotated[Path | None, typer.Option(help="Folder of conversation.")] = None,
     languages: Annotated[
-        Path | None, typer.Option(help="Folder of the recordings in corpora/languages.tsv.")
+        Path | None, typer.Option(help="Folder of the recordings listed in corpora/languages.tsv.")
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Use parts of the data; ten minutes.")

@@ -24,10 +24,10 @@ from kouxing.shared.media_file import (
 from kouxing.shared.sound_formats import (
     MAX_ZERO_BYTES,
     NUM_BEGIN_BYTES,
+    find_sound_start,
     needs_more,
     needs_whole_file,
     non_audio_kind,
-    sound_place,
     stated_bytes,
 )
 from kouxing.shared.user_file import check_content, open_file
@@ -134,7 +134,7 @@ def _open_pipe(
     begin = pipe.peek()
     if not begin:
         raise UserError(f"{name}: no sound arrived; check the command that writes it")
-    place = sound_place(begin)
+    place = find_sound_start(begin)
     if place is None:
         if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")

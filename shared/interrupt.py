@@ -29,7 +29,7 @@ def is_interrupted() -> bool:
     return _is_installed() and signal.getitimer(signal.ITIMER_REAL)[0] > 0.0
 
 
-def end_interrupt() -> None:
+def clear_interrupt() -> None:
     """Stop repeating the exception: it is handled."""
     if _is_installed():
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -45,7 +45,7 @@ def catch_interrupt() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        end_interrupt()
+        clear_interrupt()
 
 
 def _print_error(kind: type[BaseException], *rest: Any) -> None:

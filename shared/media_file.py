@@ -19,9 +19,9 @@ from kouxing.shared.sound_formats import (
     is_cut_ogg,
     is_sound,
     is_transport_stream,
+    misread_wav_codec,
     unprobed_format,
     why_unreadable,
-    wrong_codec_of_wav,
 )
 
 _MAX_STREAMS = 64
@@ -80,7 +80,7 @@ class MediaSound:
         self._mixers: dict[tuple[str, str, int], list[Any]] = {}
         if begin.startswith(b"RIFX"):  # FFmpeg reads its samples in the wrong byte order
             raise UserError(f"{name}: this is a big-endian WAV file; export it as wav or flac")
-        if codec := wrong_codec_of_wav(begin):
+        if codec := misread_wav_codec(begin):
             raise UserError(f"{name}: {codec} is not supported; export the sound as 16-bit PCM")
         options = OPTIONS
         if is_pipe:

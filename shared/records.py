@@ -1,6 +1,6 @@
-"""Immutable records that are made hundreds of times a second.
+"""Immutable records that are created hundreds of times a second.
 
-Making a record takes a twentieth of the time of a frozen dataclass, because no Python code runs.
+Creating a record takes a twentieth of the time of a frozen dataclass, because no Python code runs.
 """
 
 from msgspec import Struct

@@ -99,7 +99,7 @@ class Service(MessageLoop):
         self._ticked_s = self._tick_due_s = 0.0
         self._heartbeat_due_s = time.monotonic()
         self._num_reported = 0  # sessions in earlier heartbeats
-        self._snapshot: dict[str, float] = {}  # of the metrics
+        self._snapshot: dict[str, float] = {}  # newest rates and percentiles
         self._snapshot_due_s = -math.inf
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
         self._reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S

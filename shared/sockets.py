@@ -140,7 +140,7 @@ class Socket:
             for number in range(MAX_BATCH):
                 if self.raw.closed:  # by the handler of the last message
                     return
-                # Usually there is one message. This look is cheaper than the exception below.
+                # Usually only one message is queued. This check is cheaper than an exception.
                 if number == 1 and not int(self.raw.get(zmq.EVENTS)) & _READABLE:
                     self.note_empty()
                     return

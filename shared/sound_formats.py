@@ -7,7 +7,7 @@ from typing import Literal
 import av
 
 NUM_BEGIN_BYTES = 16_384  # enough for all of this module; three frames of the largest size
-_MAX_LEADING_ZEROS = 4  # in a format
+_MAX_LEADING_ZEROS = 4  # that are part of a format
 MAX_ZERO_BYTES = 131_072  # padding before a format
 _NUM_FRAMED_BYTES = 8192  # size of the checked start of a stream that may begin within a frame
 _NUM_HEADER_BYTES = 4096  # size of the checked start of a WAV or MP4 file
@@ -40,7 +40,7 @@ _FRAMED = (
     ("aac_latm", 0xFFE0, 0x56E0),
     ("sbc", 0xFF00, 0x9C00),
 )
-# Without free and invalid bit rates, which quiet samples often look like.
+# Free and invalid bit rates are excluded, because quiet samples often look like them.
 _MP3_FRAME = re.compile(rb"\xff[\xe2\xe3\xf2\xf3\xfa\xfb][\x10-\xef]")
 _TS_SYNC = 0x47
 _TS_PACKETS = ((0, 188), (4, 192))  # the place of the first byte, and the packet's size
@@ -54,7 +54,7 @@ _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
     b"RF64": (20, 8, "little", 8),
     b"riff": (16, 8, "little", 0),
 }
-_WRONG_WAV_CODECS = {0x38: "NMS ADPCM", 0x40: "G.721 ADPCM"}  # FFmpeg takes them for others
+_MISREAD_WAV_CODECS = {0x38: "NMS ADPCM", 0x40: "G.721 ADPCM"}  # decoded wrongly by FFmpeg
 _ASF_PROPERTIES = b"\xa1\xdc\xab\x8c\x47\xa9\xcf\x11"  # its size of the file follows
 _OTHER = {
     b"PK\3\4": "a zip archive; unpack it first",
@@ -80,10 +80,10 @@ def is_sound(begin: bytes) -> bool:
     )
 
 
-def sound_place(begin: bytes) -> int | None:
-    """Return where a format of sound starts in the first bytes of a pipe; None: nowhere.
+def find_sound_start(begin: bytes) -> int | None:
+    """Return the offset at which sound starts in the first bytes of a pipe; None if not found.
 
-    Zeros may come before it. An MP3 stream may begin within a frame.
+    Zeros may precede it. An MP3 stream may begin within a frame.
     """
     num_zeros = len(begin) - len(begin.lstrip(b"\0"))
     places = [0, *range(max(1, num_zeros - _MAX_LEADING_ZEROS), num_zeros + 1)]
@@ -110,7 +110,7 @@ def needs_more(begin: bytes) -> bool:
     content = begin.lstrip(b"\0")
     may_be = _TS_SYNC in (begin[0], begin[4]) or begin.startswith(b"\x80\0")
     may_be |= len(content) < _NUM_FRAMED_BYTES or _framed_codec(content) is not None
-    return may_be and sound_place(begin) is None
+    return may_be and find_sound_start(begin) is None
 
 
 def non_audio_kind(begin: bytes) -> str:
@@ -180,11 +180,11 @@ def codec_of_padded_wav(begin: bytes) -> str | None:
     return f"pcm_s{bits}le" if begin[8:12] == b"WAVE" and is_padded else None
 
 
-def wrong_codec_of_wav(begin: bytes) -> str | None:
-    """Return the codec of a WAV file, if FFmpeg takes it for another."""
+def misread_wav_codec(begin: bytes) -> str | None:
+    """Return the codec of a WAV file if FFmpeg mistakes it for another one."""
     place = begin.find(b"fmt ") + 8
     kind = int.from_bytes(begin[place : place + 2], "little")
-    return _WRONG_WAV_CODECS.get(kind) if begin[8:12] == b"WAVE" else None
+    return _MISREAD_WAV_CODECS.get(kind) if begin[8:12] == b"WAVE" else None
 
 
 def needs_whole_file(begin: bytes) -> bool:

@@ -37,7 +37,7 @@ class Browser(Chromium):
         self.wait_for(READY)
 
     def restart(self, address: str) -> None:
-        """Load a page of another origin, without the complaints of the page before."""
+        """Load a page of another origin, without the errors of the previous page."""
         self.command("Page.navigate", url="about:blank")
         self.wait_for("location.href === 'about:blank'")
         self.complaints.clear()

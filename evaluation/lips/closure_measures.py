@@ -35,7 +35,7 @@ def class_precision(takes: Takes, name: str) -> float | None:
 
 
 def closure_class(reference: Reference, time_s: float) -> str:
-    """Return the class of the phones at a closure. A b p m within 40 ms comes first."""
+    """Return the class of the phones at a closure. A b, p or m within 40 ms takes precedence."""
     for phone in reference.labials():
         if phone.onset_s - WINDOW_S <= time_s <= phone.onset_s + phone.duration_s + WINDOW_S:
             return "bpm"

@@ -105,7 +105,7 @@ def contacts(made: Mouth, real: Mouth) -> list[Contact]:
 
 
 def closures(made: Mouth, real: Mouth) -> Detections:
-    """Compare closures: a real one is reproduced if made lips close within 40 ms.
+    """Compare closures. A real closure is reproduced if the made lips also close within 40 ms.
 
     Adapted from the closure accuracy of Electronic Arts, which measures only recall.
 

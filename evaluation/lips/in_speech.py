@@ -19,7 +19,7 @@ def correlation_in_speech(takes: Takes, curve: str) -> float | None:
 
 
 def turns_per_s(takes: Takes) -> float | None:
-    """Return how often the opening changes its direction, per second of speech."""
+    """Return the number of times per second of speech that the opening changes direction."""
     turns, seconds = 0, 0.0
     for take in takes:
         opening = take.opening_in_speech

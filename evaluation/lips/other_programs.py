@@ -21,7 +21,7 @@ from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mo
 
 Array = NDArray[np.float64]
 MouthOf = Callable[[LipClip], Mouth]
-FapsOf = Callable[[LipClip, Array], Array]  # of a clip at times (n,), seconds: FAPs (n, 68)
+FapsOf = Callable[[LipClip, Array], Array]  # clip, times (n,) in s; FAPs (n, 68)
 
 _DELAYS_S = tuple(step / 50.0 for step in range(16))  # 0 to 0.3 s
 _TAIL_S = 0.5  # frames after the end of a clip's audio

@@ -1,4 +1,4 @@
-"""Measures of the opening within a phone: a real mouth differs each time it speaks the phone."""
+"""Measures of the opening within a phone, which varies between repetitions in real speech."""
 
 from collections import defaultdict
 

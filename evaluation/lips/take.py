@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Take:
-    """A clip and the mouth to judge. Cached figures serve several groups of clips."""
+    """A clip and the mouth to judge. Figures are cached, because groups of clips share takes."""
 
     reference: Reference
     made: Mouth

@@ -47,7 +47,7 @@ def heads(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SOUND...", help="Speech and laughter. Pauses between them fill a minute."
+            metavar="SOUND...", help="Speech and laughter. Pauses fill the rest of a minute."
         ),
     ],
     head: Annotated[
@@ -56,12 +56,12 @@ def heads(
     ] = None,
     title: Annotated[str, typer.Option(help="Title of the page.")] = "Heads",
 ) -> None:
-    """Create a study of the built-in heads, with a video of a minute for each head."""
+    """Create a study of the built-in heads, with a one-minute video of each head."""
     from kouxing.evaluation.mos.heads import write_head_videos
-    from kouxing.evaluation.mos.study import check_new, new_study
+    from kouxing.evaluation.mos.study import check_no_study, new_study
     from kouxing.services.recognizer.acoustic.load import load_model
 
-    check_new(folder)
+    check_no_study(folder)
     write_head_videos(folder, load_model(), recordings, head or [])
     study = new_study(folder, title=title)
     count = plural(len(study.conditions), "head")

@@ -21,7 +21,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import CONSOLE
 
 _LENGTH_S = 60.0
-_MIN_PAUSE_S = 0.6  # the face finishes a phrase
+_MIN_PAUSE_S = 0.6  # long enough for the face to finish a phrase
 _VIDEO_PX = (640, 640)
 _IMAGES_PER_S = 25.0
 
@@ -62,9 +62,9 @@ def join_recordings(recordings: Sequence[NDArray[np.float32]]) -> NDArray[np.flo
     spoken = sum(map(len, recordings))
     pause = (length - spoken) // (len(recordings) + 1)
     if pause < _MIN_PAUSE_S * MEDIA_RATE_HZ:
-        most_s = _LENGTH_S - _MIN_PAUSE_S * (len(recordings) + 1)
+        max_s = _LENGTH_S - _MIN_PAUSE_S * (len(recordings) + 1)
         raise UserError(
-            f"the recordings last {spoken / MEDIA_RATE_HZ:.1f} s; give at most {most_s:.1f} s"
+            f"the recordings last {spoken / MEDIA_RATE_HZ:.1f} s; use at most {max_s:.1f} s"
         )
     joined = np.zeros(length, np.float32)
     start = pause

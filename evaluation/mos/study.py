@@ -40,7 +40,7 @@ class Study:
     files: dict[tuple[str, str], Path] = field(repr=False)  # by sentence and condition
 
 
-def check_new(folder: Path) -> None:
+def check_no_study(folder: Path) -> None:
     """Raise UserError if a folder already contains a study."""
     file = folder / FILE_NAME
     if file.exists():
@@ -52,7 +52,7 @@ def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str
 
     Raises UserError if the folder already is a study, lacks videos, or has one without sound.
     """
-    check_new(folder)
+    check_no_study(folder)
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
     content = {
         "title": title or folder.resolve().name,

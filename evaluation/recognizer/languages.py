@@ -1,4 +1,4 @@
-"""Error rates of universal phones by language, live, next to another recognizer of English.
+"""Live error rates of universal phones by language, compared with another recognizer.
 
 ======  ============================================================================================
 name    recognizer
@@ -9,7 +9,7 @@ own     the model of the recording's language: the universal model restricted to
 hama    hama, whole recordings of English only
 ======  ============================================================================================
 
-All recognizers get the same recordings, and the same measures: phonetic feature errors, phone
+All recognizers get the same recordings. The measures are phonetic feature errors, phone
 errors and viseme errors. The final hypothesis is that of an offline search.
 """
 
@@ -115,7 +115,7 @@ def _phone(symbol: str) -> Phone:
 
 
 def _run_hama(references: Sequence[Reference]) -> Iterator[tuple[str, ...]]:
-    """Yield the phones of each recording. hama's letters without a universal phone are an error."""
+    """Yield the phones of each recording. Raises UserError if hama's output has unknown letters."""
     with tempfile.TemporaryDirectory() as name:
         for number, reference in enumerate(references):
             reference.read_audio().astype("<f4").tofile(Path(name) / f"{number:06}.f32")

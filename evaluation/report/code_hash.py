@@ -1,7 +1,7 @@
 """The hash of the code that a step of the report depends on.
 
-Python files count with all modules of this package that they import. Their comments, docstrings and
-layout do not count.
+The hash of a Python file includes all modules of this package that the file imports. Comments,
+docstrings and layout of Python files do not affect it.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""Tables in Markdown, and the physical floor that several of them have."""
+"""Tables in Markdown, and the physical floor that several of them show."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 Results = Mapping[str, Any]  # result of each measured step, by its name
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # columns and rows
 
-_FRAME_MS, _TICK_MS = 20, 17  # of the face; of a display at 60 Hz
+_FRAME_MS, _TICK_MS = 20, 17  # frame of the face; tick of a display at 60 Hz
 
 
 def markdown(table: Table) -> str:
@@ -27,5 +27,5 @@ def join_values(values: Iterable[str]) -> str:
 
 
 def display_floor_ms(look_ahead_ms: int) -> int:
-    """Return the least time from a sound to its picture: look-ahead, frame and display tick."""
+    """Return the minimum time from a sound to its image: look-ahead, frame and display tick."""
     return look_ahead_ms + _FRAME_MS + _TICK_MS

@@ -4,7 +4,7 @@ from kouxing.evaluation.recognizer.disturbances import CLEAN
 from kouxing.evaluation.report.markdown import Results, Table, join_values
 from kouxing.evaluation.tables import format_number, percent
 
-_RECOGNIZERS = {  # of the languages
+_RECOGNIZERS = {  # in the rows by language
     "auto": "`universal`, no language chosen",
     "own": "the language's own phones",
     "hama": "hama 1.7.0, offline",
@@ -52,7 +52,7 @@ def recognition(results: Results) -> Table:
 
 
 def better_recognizers(results: Results) -> list[str]:
-    """Return a sentence for each error rate of a language in which hama is better."""
+    """Return a line for each error rate of a language in which hama is better."""
     sentences = []
     for group, scores in _by_language(results).items():
         for unit, name in _ERRORS.items() if "hama" in scores else ():

@@ -113,7 +113,7 @@ def _run(commands: Iterable[str], folders: Mapping[str, Path | None]) -> dict[st
 
 
 def _cpu_s() -> float:
-    """Return the processor time of all programs that have ended, seconds."""
+    """Return the processor time of all finished child processes, seconds."""
     times = os.times()
     return times.children_user + times.children_system
 

@@ -16,7 +16,7 @@ _DELAYS = " ".join(f"--delay-ms {delay}" for delay in DELAYS_MS)
 _ALL_LIPS = "--lips learnt --lips dynamic-visemes --lips ferguson"
 _TABLES = " ".join(f"--from-csv {{rivals}}/{name}" for name in PROGRAMS)
 
-# A change of these files makes a result out of date, and so does a change of imported modules.
+# A result is out of date if one of these files, or a module that it imports, has changed.
 _RECOGNIZER = (
     "evaluation/recognizer/error_rates.py",
     "shared/phones/mandarin",

@@ -48,7 +48,7 @@ def _chain(results: Results) -> Iterator[list[str]]:
         yield [title, format_number(drawing["pictures_per_s"], ".0f"), "60", "display"]
         if drawing["voice_to_picture_ms"]:
             yield [
-                "sound to its picture on the page, ms",
+                "sound to its image on the page, ms",
                 format_number(drawing["voice_to_picture_ms"], ".0f"),
                 str(display_floor_ms(_LOOK_AHEAD_MS)),
                 "look-ahead + frame + display tick",
@@ -117,7 +117,7 @@ def _browser(results: Results) -> Iterator[list[str]]:
 
 
 def better_packages(results: Results) -> list[str]:
-    """Return a sentence for each figure in the browser in which another package is better."""
+    """Return a line for each figure in the browser in which another package is better."""
     browser = results.get("browser")
     if not browser:
         return []

@@ -102,7 +102,7 @@ def _run(program: str, clips: Sequence[LipClip], tables: Path, profile: Any = No
 
 
 def find_installed(name: str) -> Path:
-    """Return an installed file or folder of the programs; UserError if it is missing."""
+    """Return an installed file or folder of the programs. Raises UserError if it is missing."""
     if not (FOLDER / name).exists():
         raise UserError("this program is not installed; run 'make report' to install it")
     return FOLDER / name

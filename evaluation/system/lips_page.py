@@ -53,7 +53,7 @@ _LOWER_LIP = 4  # FAP 5
 _PACKAGES = "packages"
 _HEAD_AUDIO = f"{_PACKAGES}/@met4citizen/headaudio/dist"
 _DOWNLOADS = {  # patterns of files
-    OURS: ("*.js", "engine/*.js", "models/[!b]*"),  # without the block network, an option
+    OURS: ("*.js", "engine/*.js", "models/[!b]*"),  # without the optional block network
     "HeadAudio": (f"{_HEAD_AUDIO}/*",),
     "wLipSync": (f"{_PACKAGES}/wlipsync/dist/wlipsync-single.js", "wlipsync-profile.json"),
     "wawa-lipsync": (f"{_PACKAGES}/wawa-lipsync/dist/wawa-lipsync.es.js",),

@@ -29,7 +29,7 @@ def pair_outputs(
             output.mkdir()
         except OSError as error:
             raise write_error(output, error) from None
-    pairs: dict[Path, tuple[Path, Path]] = {}  # by the real path of the output
+    pairs: dict[Path, tuple[Path, Path]] = {}  # key: resolved path of the output
     for source in sources:
         target = (output or source.parent) / source.with_suffix(suffix).name
         if other := pairs.get(target.resolve()):

@@ -18,7 +18,7 @@ from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
-from kouxing.shared.interrupt import end_interrupt, is_interrupted
+from kouxing.shared.interrupt import clear_interrupt, is_interrupted
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.terminal import CONSOLE
 
@@ -148,7 +148,7 @@ def main() -> None:
             raise
         sys.exit(130)
     finally:
-        end_interrupt()
+        clear_interrupt()
 
 
 def _run_command() -> None:

@@ -27,7 +27,7 @@ from kouxing.services.kinds import (
 from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.errors import UserError, naming_option
-from kouxing.shared.interrupt import end_interrupt, install_interrupt
+from kouxing.shared.interrupt import clear_interrupt, install_interrupt
 from kouxing.shared.keys import check_keys, control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 
@@ -133,7 +133,7 @@ def run(
 
 
 def _stop_at_interrupt() -> None:
-    end_interrupt()
+    clear_interrupt()
     print_message("stopping")
 
 

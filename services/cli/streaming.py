@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from kouxing.shared.audio_file import AudioSource, clipping_remarks, num_clipped
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
-from kouxing.shared.interrupt import end_interrupt
+from kouxing.shared.interrupt import clear_interrupt
 from kouxing.shared.terminal import plural
 
 PUSH_TIMEOUT_S = 30.0
@@ -151,7 +151,7 @@ class _Streaming:
         except KeyboardInterrupt:
             if not source.is_live:
                 raise
-            end_interrupt()
+            clear_interrupt()
             self._console.print("stopping; press Ctrl-C again to drop the last words")
         self._duration_s = num_sent / source.sample_rate_hz
         self._clipped = num_clipping / max(1, num_sent * source.num_channels)

@@ -7,7 +7,7 @@ file            contents
 ``model.bin``   arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
 ``phones.bin``  arrays: HMMs and phone language model, needed only for phones
 ``blocks.onnx`` the block network, unchanged, needed only for final phones
-``model.json``  types, shapes and places of these arrays; constants of the modules
+``model.json``  types, shapes and offsets of these arrays; constants of the modules
 =============== ====================================================================
 
 The constants come from the modules that the server runs. The package defines none of its own, so a

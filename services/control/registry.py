@@ -292,7 +292,7 @@ class Registry:
         return overdue
 
     def _max_ages_s(self) -> Iterable[tuple[Mapping[str, ServiceRecord], float]]:
-        """Return services by the interval of their heartbeats, oldest first, and the age limit."""
+        """Return services by heartbeat interval, oldest heartbeat first, and their age limit."""
         return (
             (self._busy, self._limit_s),
             (self._idle, self._limit_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),

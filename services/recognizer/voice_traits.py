@@ -44,8 +44,8 @@ _PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean,
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
 _EVIDENCE_SHARE = 0.1  # weight of a new position
 _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
-_MIN_LAUGHTER = 0.3  # smallest probability of a laugh that the ear hears
-_LAUGH_POSITIONS = 50  # laughter ends when this many positions have no laugh
+_MIN_LAUGHTER = 0.3  # minimum probability of a laugh
+_LAUGH_POSITIONS = 50  # laughter ends after this many positions without a laugh
 
 
 class VoiceTraits(NamedTuple):
@@ -116,7 +116,7 @@ class VoiceTraitsStream:
             evidence > (_STOP if was_on else _START)
             for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
         )
-        # the ear's state remembers laughter for many seconds of silence
+        # the ear's state contains past laughter for many seconds of silence
         laughter = laughter and self._since_laugh < _LAUGH_POSITIONS
         self.newest = VoiceTraits(arousal, valence, laughter, breath)
 

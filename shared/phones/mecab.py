@@ -22,8 +22,8 @@ def has_mecab() -> bool:
 def split_words(texts: Sequence[str]) -> list[list[tuple[str, str]]]:
     """Return the words of each text, each with its pronunciation in kana.
 
-    A word without a known pronunciation is its own. Texts have no line breaks. Raises ``UserError``
-    if MeCab or its dictionary IPADIC is missing.
+    If the pronunciation of a word is unknown, the word replaces it. Texts have no line breaks.
+    Raises ``UserError`` if MeCab or its dictionary IPADIC is missing.
     """
     program = shutil.which("mecab")
     if program is None:

@@ -31,7 +31,12 @@ from kouxing.shared.phones.espeak import transcribe_phrases
 from kouxing.shared.phones.mecab import has_mecab, split_words
 from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
-from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone, read_ipa, remove_flags
+from kouxing.shared.phones.universal.segments import (
+    ipa_of,
+    nearest_phone,
+    read_ipa,
+    remove_language_flags,
+)
 
 SETTINGS = "language.toml"
 _SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words
@@ -85,7 +90,7 @@ class TableLanguage:
         return Transcript(tuple(words), tuple(dropped))
 
     def _phrases_of(self, text: str) -> tuple[list[list[tuple[str, str]]], list[str]]:
-        """Return the words between punctuation, and what cannot be read. A number is a phrase.
+        """Return phrases of words between punctuation, and unreadable words. A number is a phrase.
 
         A word has its text, and the text for espeak-ng.
         """
@@ -127,7 +132,7 @@ class TableLanguage:
 
     def _phones_of(self, ipa: str) -> tuple[str, ...]:
         """Return a word in the language's phones; empty if it has unknown symbols."""
-        ipa = remove_flags(ipa)
+        ipa = remove_language_flags(ipa)
         for pattern, replacement in self.rules:
             ipa = re.sub(pattern, replacement, ipa)
         phones, unknown = read_ipa(ipa)

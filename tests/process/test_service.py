@@ -179,7 +179,7 @@ def run_until(worker: Worker, condition: Callable[[], object]) -> None:
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a service wait for a control that runs on a busy machine."""
+    """Let a service wait longer for control on a busy machine."""
     monkeypatch.setattr("kouxing.shared.service.REPLY_TIMEOUT_S", LIMIT_S)
 
 

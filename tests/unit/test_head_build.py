@@ -106,4 +106,4 @@ def test_triangles_without_texels_are_not_visible() -> None:
     alpha[:, 4:] = 1.0  # the right half
     uv = np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
     triangles = np.array([[0, 1, 2], [1, 3, 4]])
-    np.testing.assert_array_equal(textures.visible(triangles, uv, alpha), [False, True])
+    np.testing.assert_array_equal(textures.visible_triangles(triangles, uv, alpha), [False, True])

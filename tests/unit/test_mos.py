@@ -53,7 +53,7 @@ def test_recordings_fill_a_minute_with_equal_pauses() -> None:
     assert len(joined) == 60 * MEDIA_RATE_HZ
     assert (starts / MEDIA_RATE_HZ).tolist() == [10.0, 40.0]
     assert (ends / MEDIA_RATE_HZ).tolist() == [30.0, 50.0]
-    with pytest.raises(UserError, match=r"the recordings last 59.0 s; give at most 58.8 s"):
+    with pytest.raises(UserError, match=r"the recordings last 59.0 s; use at most 58.8 s"):
         join_recordings([np.tile(second, 59)])
 
 

@@ -253,7 +253,7 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
     assert rows["end of a chunk to its frame, p50 / p95, ms"] == ["4.9 / 9.2", "0"]
     assert rows["processor time of all services, s per s of audio"] == ["0.30", "0.10"]
     assert rows["page in headless Chromium, microphone, pictures per s"] == ["20", "60"]
-    assert rows["sound to its picture on the page, ms"] == ["140", "97"]
+    assert rows["sound to its image on the page, ms"] == ["140", "97"]
     assert rows["sessions on 2 cores, all speaking"] == ["15", "50"]
     assert rows["2 busy programs: largest lateness, s / frames missing, %"] == ["0.04 / 1", "0"]
     assert rows["kouxing-lips in the browser: download, MB / share of a core, %"] == [

@@ -228,7 +228,7 @@ class Builder:
         if len(quads) < _COARSE_HAIR:
             points, quads, uv, welds = subdivision.smooth_strands(points, quads, uv, welds)
         triangles = subdivision.triangles_of(quads)
-        triangles = triangles[textures.visible(triangles, uv, alpha)]
+        triangles = triangles[textures.visible_triangles(triangles, uv, alpha)]
         middle = points[triangles].mean(axis=1) - PIVOT
         order = np.argsort(np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2])
         color = np.tile(textures.tint(person.look.hair), (len(points), 1))

@@ -18,7 +18,7 @@ class Person:
     hair: str
     brows: str
     lashes: str = "eyelashes01"
-    hair_width: float = 1.0  # factor on the hair's own width
+    hair_width: float = 1.0  # factor on the width of MakeHuman's hair
     raised: float = 0.0  # offset of tongue and lower teeth, dm
     tucked: float = 0.0  # offset of the upper teeth, dm, so that f meets them and u and o differ
 

@@ -21,7 +21,7 @@ GRAY = 0.75  # mean of the gray textures
 _JPEG_QUALITY = 88
 _SHADE = 24.0  # texels; changes of the brightness over longer distances are shade
 _SHADE_KEPT = 0.25  # exponent of the shade
-_MAX_RISE = -np.log(GRAY)  # at which gray becomes white
+_MAX_RISE = -np.log(GRAY)  # makes gray white
 _RELIEF = 8.0  # slope at a relative change of the brightness from one texel to the next
 
 
@@ -86,7 +86,7 @@ def strands(texture: Float, contrast: float) -> Float:
     return np.stack([np.round(gray * 40) / 40, np.round(alpha * 16) / 16], axis=2)
 
 
-def visible(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> NDArray[np.bool_]:
+def visible_triangles(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> NDArray[np.bool_]:
     """Return which triangles (F,) show texels with alpha; ``uv`` (V, 2) has v downward."""
     steps = np.linspace(0.05, 0.9, 6)
     share = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])

@@ -55,7 +55,7 @@ document.body.ondrop = (event) => {
 prepare();
 navigator.serviceWorker?.register("service-worker.js");
 
-/** Turn final phones on or off: loads the lip sync again. */
+/** Turn final phones on or off, which reloads the lip sync. */
 async function setFinalPhones(lips) {
   const isOn = byId("final").ariaPressed !== "true";
   if (rivals) stopComparing();
@@ -85,7 +85,7 @@ async function prepare() {
   const items = [];
   byId("visemes").replaceChildren();
   const show = () => {
-    if (face.lips !== loading) return; // others are in use now
+    if (face.lips !== loading) return; // replaced in the meantime
     requestAnimationFrame(show);
     const weights = lips.current?.oculus;
     if (!weights) return;

@@ -1,6 +1,6 @@
 // Scores of the block network, for final phones; services/recognizer/acoustic/blocks.py explains them.
 //
-// The network has the state of one session at a time.
+// The network holds the state of one session at a time.
 
 export class BlockScorer {
   /** Scores of the frames after the settled ones; a change is a new array. */

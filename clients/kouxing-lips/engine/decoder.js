@@ -62,7 +62,7 @@ export class Decoder {
     for (let token = 0; token < numTokens; token++) this.#tokenOf[this.#context[token]] = token;
   }
 
-  /** Search the next frame, given the scores of the states; return the confidence in the last phone. */
+  /** Search the next frame with the scores of its states; return the confidence in the last phone. */
   advance(scores) {
     this.#prune();
     this.#startPhones();

@@ -38,7 +38,7 @@ export class LightScorer {
     return Array(this.#numMissing).fill(this.#last);
   }
 
-  /** Return the scores of the states: all states of a phone have the same. */
+  /** Return the scores of the states. All states of a phone have the same score. */
   #scoresOf(row) {
     const scores = new Float32Array(this.#firstState.at(-1));
     for (let phone = 0; phone < row.length; phone++) {

@@ -1,7 +1,7 @@
 // The lip predictor; services/recognizer/lip_predictor.py has the formulas.
 
 import { sigmoid } from "./math.js";
-import { ProductMemory, roomFor } from "./products.js";
+import { ProductMemory, alignedBytes } from "./products.js";
 
 /** The lip frames of one session. */
 export class LipPredictor {
@@ -32,7 +32,7 @@ export class LipPredictor {
     const matrices = [product(projection, entry_weights), input_weights, state_weights];
     const [[numFeatures, width], [, gates]] = matrices.map(({ shape }) => shape);
     const sizes = [...matrices.map(({ values }) => values.length), numFeatures, width, gates, width, gates];
-    const memory = new ProductMemory(sizes.reduce((sum, size) => sum + roomFor(Float32Array, size), 0));
+    const memory = new ProductMemory(sizes.reduce((sum, size) => sum + alignedBytes(Float32Array, size), 0));
     const buffers = sizes.map((size) => memory.array(Float32Array, size));
     matrices.forEach(({ values }, i) => buffers[i].set(values));
     const [entry, input, state, centered, entered, fromInput, lastState, fromState] = buffers;

@@ -30,7 +30,7 @@ export function frameTimeS(frame, model) {
   return wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2, model);
 }
 
-/** Return the number that 16 bits of floating point stand for. */
+/** Convert the bits of a 16-bit floating-point number to a number. */
 export function halfToFloat(half) {
   const sign = half & 0x8000 ? -1 : 1;
   const exponent = (half >> 10) & 31;

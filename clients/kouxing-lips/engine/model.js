@@ -22,7 +22,7 @@ const ARRAYS = {
  * Load the models.
  *
  * @param base URL of the folder with the files; in Node also a file URL
- * @param options { phones: whether to also load the phone recognizer; "final": with the block network }
+ * @param options { phones: true also loads the phone recognizer, "final" also the block network }
  * @returns a promise of { ear: Network, phoneLm: PhoneLm or null, blocks: Network or null, arrays:
  *   { values, shape } by name, constants, ... }; it is rejected if a file is missing or of another version
  */

@@ -6,7 +6,7 @@
 
 import { readGraph } from "./onnx-file.js";
 import { OPERATORS } from "./operators.js";
-import { ProductMemory, roomFor } from "./products.js";
+import { ProductMemory, alignedBytes } from "./products.js";
 
 export class Network {
   #tensors; // { shape, values } by name
@@ -26,13 +26,13 @@ export class Network {
       stored.push(...outputs.filter(({ values, of }) => !values && !of), ...constants);
       return start;
     });
-    const memory = new ProductMemory(stored.reduce((sum, { Type = Float32Array, length }) => sum + roomFor(Type, length), 0));
+    const memory = new ProductMemory(stored.reduce((sum, { Type = Float32Array, length }) => sum + alignedBytes(Type, length), 0));
     for (const tensor of stored) tensor.values = memory.array(tensor.Type ?? Float32Array, tensor.length);
     for (const tensor of Object.values(this.#tensors)) resolve(tensor);
     this.#steps = starts.flatMap((start) => start?.(memory) ?? []);
   }
 
-  /** Return the values of an input or of an output: an array that stays the same. */
+  /** Return the values of an input or of an output, always in the same array. */
   values(name) {
     return this.#tensors[name].values;
   }
@@ -48,7 +48,7 @@ export class Network {
   }
 }
 
-/** Return a tensor that is to be allocated. */
+/** Return a tensor without memory, which is allocated later. */
 function tensorOf(shape) {
   return { shape, length: shape.reduce((a, b) => a * b, 1), values: null };
 }

@@ -200,7 +200,7 @@ export const OPERATORS = {
   },
   QuantizeLinear(_node, [x, scale, zero]) {
     const [rows, size] = [scale.length, x.length / scale.length];
-    if (size % LANES) throw new Error(`the network has rows of ${size} values, which are no multiple of ${LANES}`);
+    if (size % LANES) throw new Error(`the network has rows of ${size} values, which is not a multiple of ${LANES}`);
     const out = { shape: x.shape, rows, size, length: x.length, Type: Int16Array }; // without the zero point
     const start = (memory) => {
       const places = [x, scale, out].map(placeOf);

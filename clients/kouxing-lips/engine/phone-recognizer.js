@@ -14,8 +14,8 @@ export class PhoneRecognizer {
   #silence;
   #durationsS;
   #settled; // search over settled scores
-  #ahead; // its continuation over provisional scores
-  #decoder; // the one in use
+  #ahead; // continues the settled search over provisional scores
+  #decoder; // the search in use: settled or ahead
   #provisional; // the scores last searched
   #numChecked; // frames that the output rule has had
   #rule; // lastEmitted, candidate, numAgreeing

@@ -25,7 +25,7 @@ export const BINARY =
   "/QsEACAAQSBqIQAgAkEQaiECIAdBCGshByAHDQALIAFBBGohASADQQFrIQMgAw0ACws=";
 
 /** Number of bytes that an array needs in a memory. */
-export function roomFor(Type, length) {
+export function alignedBytes(Type, length) {
   return Math.ceil((Type.BYTES_PER_ELEMENT * length) / ALIGNMENT_BYTES) * ALIGNMENT_BYTES;
 }
 
@@ -34,7 +34,7 @@ export class ProductMemory {
   #memory;
   #end = 0;
 
-  /** Allocate a number of bytes, the sum of roomFor() of all arrays. */
+  /** Allocate a number of bytes, the sum of alignedBytes() of all arrays. */
   constructor(numBytes) {
     this.#memory = new WebAssembly.Memory({ initial: Math.ceil(numBytes / PAGE_BYTES) });
     const code = Uint8Array.from(atob(BINARY), (character) => character.charCodeAt(0));
@@ -44,7 +44,7 @@ export class ProductMemory {
   /** Return a new array of zeros. */
   array(Type, length) {
     const array = new Type(this.#memory.buffer, this.#end, length);
-    this.#end += roomFor(Type, length);
+    this.#end += alignedBytes(Type, length);
     return array;
   }
 }

@@ -18,7 +18,7 @@ function stored(memory, Type, values) {
   return array;
 }
 
-test("the binary code is that of products.wat", async () => {
+test("the binary code equals products.wat", async () => {
   const text = await readFile(new URL("../engine/products.wat", import.meta.url), "utf8");
   const { buffer } = (await wabt()).parseWat("products.wat", text, { simd: true }).toBinary({});
   assert.equal(Buffer.from(buffer).toString("base64"), BINARY);

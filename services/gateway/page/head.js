@@ -164,8 +164,10 @@ export class Head {
   }
 
   /**
-   * How it is drawn: { isCoarse: by the processor, width, height: pixels, numPictures: drawn since
-   * the start, pictureMs: duration of drawing, isCurrent }. isCurrent is true if the newest face is drawn.
+   * How it is drawn: { isCoarse, width, height, numPictures, pictureMs, isCurrent }.
+   *
+   * isCoarse is true if the processor draws. The size is in pixels. numPictures counts images since
+   * the start, and pictureMs is the duration of drawing. isCurrent is true if the newest face is drawn.
    */
   get drawing() {
     const { width, height } = this.#renderer.domElement;

@@ -135,7 +135,7 @@ class Decoder:
     def advance_until(
         self, scores: NDArray[np.float32], known_phone: int, min_confidence: float
     ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """Search the next frames until another phone than a known one is confidently the last.
+        """Search the next frames until the last phone is confident and is not ``known_phone``.
 
         Returns the last phone and the confidence in it after each frame, (frames,) each.
         """

@@ -25,7 +25,7 @@ def read_ipa(ipa: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     (('ch', 'a', 'ih', 'n', 'i', 'z'), ())
     """
     letters = unicodedata.normalize("NFD", ipa).translate(_OTHER_TIES)
-    rest = _IGNORED.sub("", remove_flags(letters))
+    rest = _IGNORED.sub("", remove_language_flags(letters))
     spellings = _spellings()
     phones: list[str] = []
     unknown: list[str] = []
@@ -40,7 +40,7 @@ def read_ipa(ipa: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(phones), tuple(unknown)
 
 
-def remove_flags(ipa: str) -> str:
+def remove_language_flags(ipa: str) -> str:
     """Remove espeak-ng's marks for words of another language."""
     return _FLAG.sub("", ipa)
 
