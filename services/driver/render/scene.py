@@ -19,7 +19,7 @@ COLORS = {
 
 # height of the picture's center above the eyes, and distance of the camera, in FAPU ES
 _FRAMINGS = {
-    Framing.FACE: (-0.267, 20.0), Framing.HEAD: (-0.25, 26.0), Framing.MOUTH: (-1.20, 6.0),
+    Framing.FACE: (-0.267, 20.0), Framing.HEAD: (-0.25, 26.0), Framing.MOUTH: (-1.20, 6.6),
 }  # fmt: skip
 _RISE = 0.0114  # height of the camera above the center, as a share of its distance
 
