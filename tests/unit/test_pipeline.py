@@ -6,7 +6,7 @@ import pytest
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.search import decoder
+from kouxing.services.recognizer.search import decoder, path_records
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.live_streams import recognize_live
@@ -33,6 +33,6 @@ def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
     Recognizer(load_model()).warm_up()
     assert decoder._steps.signatures
-    assert decoder._count_paths.signatures
-    assert decoder._compact.signatures
+    assert path_records.count_paths.signatures
+    assert path_records.compact.signatures
     assert hello_phones() == expected

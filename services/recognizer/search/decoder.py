@@ -34,11 +34,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
+from kouxing.services.recognizer.search.path_records import (
+    IMPOSSIBLE,
+    NO_RECORD,
+    Tokens,
+    compact,
+    count_paths,
+)
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, Graph
 
-_NO_RECORD = -1
 _NO_TOKEN = -1
-_IMPOSSIBLE = np.float32(-1e30)
 _BEAM = np.float32(20.0)  # in log scores; a wider beam changes nothing on development data
 _MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
 _MIN_RECORDS = 4 * _MAX_TOKENS
@@ -73,15 +78,6 @@ class _Hmms(NamedTuple):
     phone_penalty: np.float32
 
 
-class _Tokens(NamedTuple):
-    """The tokens; only the first ones are in use."""
-
-    context: NDArray[np.int32]  # (tokens,)
-    top: NDArray[np.float32]  # (tokens,)
-    score: NDArray[np.float32]  # (tokens, states)
-    link: NDArray[np.int32]  # (tokens, states)
-
-
 class Decoder:
     """Viterbi search, frame by frame, over the HMMs and the phone language model of a topology."""
 
@@ -97,7 +93,7 @@ class Decoder:
         self._graph = topology.phone_lm.graph
         max_states = int(np.diff(topology.first_state).max())
         self._records = np.empty((_MIN_RECORDS, 3), dtype=np.int32)
-        self._tokens = _Tokens(
+        self._tokens = Tokens(
             context=np.empty(_MAX_TOKENS, dtype=np.int32),
             top=np.empty(_MAX_TOKENS, dtype=np.float32),
             score=np.empty((_MAX_TOKENS, max_states), dtype=np.float32),
@@ -109,7 +105,7 @@ class Decoder:
         """Start a new stretch of speech at frame 0."""
         self.num_frames = 0
         self._shared: list[Segment] = []  # phones that no later frame can change; the latest
-        self._last_shared = _NO_RECORD  # record of the last of them
+        self._last_shared = NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # confidence in the phone
         self._num_records = self._num_tokens = 0
@@ -203,7 +199,7 @@ class Decoder:
         ends = self._tokens.score[tokens, end - first - 1] + log_leave[end - 1]
         best = int(ends.argmax())
         state = int((end - first - 1)[best])
-        if ends[best] <= _IMPOSSIBLE:  # no phone has reached its last state
+        if ends[best] <= IMPOSSIBLE:  # no phone has reached its last state
             best, state = self._best
         link = int(self._tokens.link[best, state])
         last = Segment(int(phones[best]), self._end(link), self.num_frames)
@@ -212,9 +208,9 @@ class Decoder:
     def drop_records(self) -> None:
         """Store the phones that all paths share, and drop records that no path needs."""
         paths = np.zeros(self._num_records, dtype=np.int32)
-        shared = _count_paths(self._num_tokens, self._tokens, self._records, paths)
+        shared = count_paths(self._num_tokens, self._tokens, self._records, paths)
         self._shared += self._trace(shared)
-        num_kept, self._last_shared = _compact(
+        num_kept, self._last_shared = compact(
             shared, paths, self._num_tokens, self._tokens, self._records
         )
         if num_kept + _MAX_TOKENS > len(self._records) // 2:
@@ -226,7 +222,7 @@ class Decoder:
     def _trace(self, record: int) -> list[Segment]:
         """Return the phones after the shared ones, up to the one of a record."""
         segments: list[Segment] = []
-        while record not in (_NO_RECORD, self._last_shared):
+        while record not in (NO_RECORD, self._last_shared):
             end, phone, before = self._records[record].tolist()
             segments.append(Segment(phone, self._end(before), end))
             record = before
@@ -234,7 +230,7 @@ class Decoder:
 
     def _end(self, record: int) -> int:
         """First frame after the phone of a record."""
-        return 0 if record == _NO_RECORD else int(self._records[record, 0])
+        return 0 if record == NO_RECORD else int(self._records[record, 0])
 
 
 _tables = threading.local()
@@ -260,7 +256,7 @@ def _steps(
     known_phone: int,
     min_confidence: float,
     num_tokens: int,
-    tokens: _Tokens,
+    tokens: Tokens,
     token_of: NDArray[np.int16],
     records: NDArray[np.int32],
     num_records: int,
@@ -294,7 +290,7 @@ def _steps(
 
 
 @numba.njit(cache=True, nogil=True)
-def _prune(num_tokens: int, tokens: _Tokens, token_of: NDArray[np.int16]) -> int:
+def _prune(num_tokens: int, tokens: Tokens, token_of: NDArray[np.int16]) -> int:
     """Drop the tokens outside the beam; return the number of tokens."""
     context, top, score, link = tokens
     token = 0
@@ -315,7 +311,7 @@ def _prune(num_tokens: int, tokens: _Tokens, token_of: NDArray[np.int16]) -> int
 def _start_phones(
     frame: int,
     num_tokens: int,
-    tokens: _Tokens,
+    tokens: Tokens,
     token_of: NDArray[np.int16],
     records: NDArray[np.int32],
     num_records: int,
@@ -328,8 +324,8 @@ def _start_phones(
     record, (tokens,) each.
     """
     num_phones, max_tokens = len(hmms.first_state) - 1, len(tokens.context)
-    entry = np.full(max_tokens, _IMPOSSIBLE)
-    entry_link = np.full(max_tokens, np.int32(_NO_RECORD))
+    entry = np.full(max_tokens, IMPOSSIBLE)
+    entry_link = np.full(max_tokens, np.int32(NO_RECORD))
     log_prob = np.empty(num_phones, np.float32)
     next_context = np.empty(num_phones, np.int32)
     for token in range(num_tokens if frame else 1):
@@ -346,7 +342,7 @@ def _start_phones(
             records[record, 2] = tokens.link[token, last]
             num_records += 1
         else:  # speech starts after a pause
-            here, leaving, record = graph.arc_context[hmms.silence], np.float32(0.0), _NO_RECORD
+            here, leaving, record = graph.arc_context[hmms.silence], np.float32(0.0), NO_RECORD
         _look_up_phones(here, graph, log_prob, next_context)
         if frame == 0:  # before speech there is silence
             log_prob[hmms.silence] = 0.0
@@ -362,7 +358,7 @@ def _start_phones(
                 num_tokens += 1
                 tokens.context[following] = next_context[phone]
                 token_of[next_context[phone]] = following
-                tokens.score[following], tokens.link[following] = _IMPOSSIBLE, _NO_RECORD
+                tokens.score[following], tokens.link[following] = IMPOSSIBLE, NO_RECORD
             if candidate > entry[following]:
                 entry[following] = candidate
                 entry_link[following] = record
@@ -394,7 +390,7 @@ def _look_up_phones(
 def _advance_states(
     observed: NDArray[np.float32],
     num_tokens: int,
-    tokens: _Tokens,
+    tokens: Tokens,
     entry: NDArray[np.float32],
     entry_link: NDArray[np.int32],
     hmms: _Hmms,
@@ -402,11 +398,11 @@ def _advance_states(
 ) -> tuple[int, int]:
     """Advance the paths within the phones by one frame; return the best token and its state."""
     context, top, score, link = tokens
-    best, best_token, best_state = _IMPOSSIBLE, 0, 0
+    best, best_token, best_state = IMPOSSIBLE, 0, 0
     for token in range(num_tokens):
         phone = graph.last_phone[context[token]]
         first = hmms.first_state[phone]
-        top[token] = _IMPOSSIBLE
+        top[token] = IMPOSSIBLE
         for state in range(hmms.first_state[phone + 1] - first - 1, -1, -1):
             value = score[token, state] + hmms.log_stay[first + state]
             from_link = link[token, state]
@@ -417,7 +413,7 @@ def _advance_states(
                 moved, moved_link = entry[token], entry_link[token]
             if moved > value:
                 value, from_link = moved, moved_link
-            score[token, state] = max(value + observed[first + state], _IMPOSSIBLE)
+            score[token, state] = max(value + observed[first + state], IMPOSSIBLE)
             link[token, state] = from_link
             if score[token, state] > top[token]:
                 top[token] = score[token, state]
@@ -431,7 +427,7 @@ def _normalize_scores(
     best_token: int,
     best_state: int,
     num_tokens: int,
-    tokens: _Tokens,
+    tokens: Tokens,
     records: NDArray[np.int32],
     graph: Graph,
 ) -> float:
@@ -441,64 +437,17 @@ def _normalize_scores(
     best_phone = graph.last_phone[context[best_token]]
     share, total = 0.0, 0.0
     for token in range(num_tokens):
-        before = _NO_RECORD
+        before = NO_RECORD
         for state in range(score.shape[1]):
             if score[token, state] == top[token]:
                 before = link[token, state]
-            if score[token, state] > _IMPOSSIBLE:
+            if score[token, state] > IMPOSSIBLE:
                 score[token, state] -= best
         top[token] -= best
         if top[token] > -_BEAM:
             total += np.exp(top[token])
             if graph.last_phone[context[token]] == best_phone or (
-                before != _NO_RECORD and records[before, 1] == best_phone
+                before != NO_RECORD and records[before, 1] == best_phone
             ):
                 share += np.exp(top[token])
     return share / total
-
-
-@numba.njit(cache=True)
-def _count_paths(
-    num_tokens: int, tokens: _Tokens, records: NDArray[np.int32], paths: NDArray[np.int32]
-) -> int:
-    """Count the paths through each record, (records,); return the last one that all paths share."""
-    num_paths, shared = 0, _NO_RECORD
-    for token in range(num_tokens):
-        for state in range(tokens.score.shape[1]):
-            if tokens.score[token, state] > _IMPOSSIBLE:
-                num_paths += 1
-                if tokens.link[token, state] != _NO_RECORD:
-                    paths[tokens.link[token, state]] += 1
-    for record in range(len(paths) - 1, -1, -1):  # a record comes after the one before it
-        if paths[record] and records[record, 2] != _NO_RECORD:
-            paths[records[record, 2]] += paths[record]
-        if paths[record] == num_paths:
-            shared = max(shared, record)
-    return shared
-
-
-@numba.njit(cache=True)
-def _compact(
-    shared: int,
-    paths: NDArray[np.int32],
-    num_tokens: int,
-    tokens: _Tokens,
-    records: NDArray[np.int32],
-) -> tuple[int, int]:
-    """Drop the records without paths, and those before the shared one.
-
-    Returns the number of records, and the new index of the shared one.
-    """
-    new = np.full(len(paths) + 1, np.int32(_NO_RECORD))  # the last one is for _NO_RECORD
-    num_kept = 0
-    for record in range(max(shared, 0), len(paths)):
-        if paths[record]:
-            new[record] = num_kept
-            records[num_kept, 0], records[num_kept, 1] = records[record, 0], records[record, 1]
-            records[num_kept, 2] = new[records[record, 2]]
-            num_kept += 1
-    for token in range(num_tokens):
-        for state in range(tokens.score.shape[1]):
-            if tokens.score[token, state] > _IMPOSSIBLE:
-                tokens.link[token, state] = new[tokens.link[token, state]]
-    return num_kept, new[shared]
