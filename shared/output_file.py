@@ -1,9 +1,10 @@
 """Writes the files that a user asked for, completely or not at all."""
 
 import contextlib
+import errno
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from kouxing.shared.errors import UserError
 
@@ -27,9 +28,11 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
         raise write_error(path, error) from error
 
 
-def write_error(path: Path, error: OSError) -> UserError:
-    """Return the error for a file that cannot be written."""
+def write_error(path: Path, error: Any) -> UserError:
+    """Return the error for a file that cannot be written, from an ``OSError`` or FFmpeg's error."""
     if isinstance(error, FileNotFoundError):
         folder = (path.resolve() if path.is_symlink() else path).parent
         return UserError(f"cannot write {path}: the folder does not exist; run: mkdir -p {folder}")
-    return UserError(f"cannot write {path}: {error.strerror}")
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return UserError(f"cannot write {path}: the disk is full; free some space")
+    return UserError(f"cannot write {path}: {error.strerror or error}")

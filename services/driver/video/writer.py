@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.shared.errors import UserError
+from kouxing.shared.output_file import write_error
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -113,7 +114,7 @@ def check_name(path: Path) -> None:
             " or a name with a number such as face%05d.png"
         )
     if not path.parent.is_dir():
-        raise _write_error(path, FileNotFoundError(errno.ENOENT, "no such folder"))
+        raise write_error(path, FileNotFoundError())
 
 
 def is_sequence(path: Path) -> bool:
@@ -175,7 +176,7 @@ class VideoWriter:
                 str(self._unfinished), "w", format=container, options=form.options
             )
         except OSError as error:
-            raise _write_error(self._path, error) from error
+            raise write_error(self._path, error) from error
         rate = Fraction(frame_rate_hz).limit_denominator(1001)
         video: Any = self._container.add_stream(codec.name, rate=rate, options=codec.options)
         self._video = video
@@ -256,7 +257,7 @@ class VideoWriter:
             yield
         except (OSError, av.FFmpegError) as error:
             self.discard()
-            raise _write_error(self._path, error) from error
+            raise write_error(self._path, error) from error
 
     def close(self) -> Path:
         """Finish the file under its final name; return its path."""
@@ -292,7 +293,7 @@ class PictureSequence:
             try:
                 path.mkdir(exist_ok=True)
             except OSError as error:
-                raise _write_error(path, error) from error
+                raise write_error(path, error) from error
             self._pattern = path / "%05d.png"
 
     def write_image(self, image: UInt8) -> None:
@@ -320,7 +321,7 @@ def write_picture(path: Path, image: UInt8) -> None:
     try:
         path.write_bytes(picture.encode(image))
     except OSError as error:
-        raise _write_error(path, error) from error
+        raise write_error(path, error) from error
 
 
 def remove_unfinished(folder: Path) -> None:
@@ -352,12 +353,3 @@ def _create_unique(path: Path) -> Path:
             free = path.with_stem(f"{path.stem}-{number}")
         else:
             return free
-
-
-def _write_error(path: Path, error: OSError | av.FFmpegError) -> UserError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UserError(f"cannot write {path}: the disk is full; free some space")
-    return UserError(
-        f"cannot write {path} ({error.strerror or error}); give a path in an existing, writable"
-        " folder"
-    )
