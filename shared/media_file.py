@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
+from kouxing.shared.interrupt import is_interrupted
 from kouxing.shared.sound_formats import (
     MAX_OGG_PAGE_BYTES,
     MIN_UNKNOWN_BYTES,
@@ -340,6 +341,8 @@ class _GuardedFile:
 
     def check(self) -> None:
         """Raise the exception, if any; ``UserError`` if the system cannot read the file."""
+        if is_interrupted():
+            raise KeyboardInterrupt
         if isinstance(self._failure, OSError):
             raise UserError(f"{self.name}: cannot be read to its end: {self._failure.strerror}")
         if self._failure is not None:

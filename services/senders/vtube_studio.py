@@ -7,7 +7,6 @@ what they move.
 """
 
 import asyncio
-import contextlib
 import json
 import math
 import os
@@ -257,8 +256,7 @@ class VTubeStudioConnection(Connection):
             finally:
                 if writer is not None:
                     writer.cancel()
-                    with contextlib.suppress(asyncio.CancelledError, ConnectionError, TimeoutError):
-                        await writer
+                    await asyncio.gather(writer, return_exceptions=True)
 
     async def _write(
         self, vtube_studio: aiohttp.ClientWebSocketResponse, protocol: VTubeStudioProtocol

@@ -1,5 +1,6 @@
 """Senders over real sockets: receivers that are missing, return, are delayed, or deny access."""
 
+import asyncio
 import contextlib
 import socket
 import threading
@@ -18,6 +19,7 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.senders import MAX_SENDERS, Senders
+from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -173,6 +175,27 @@ def test_vtube_studio_asks_once(senders: Senders) -> None:
         wait_until(lambda: bool(stub.frames))
         assert stub.requests == ["AuthenticationRequest", "InputParameterListRequest"]
         assert problem(senders, url) == ""
+
+
+def test_a_sender_can_be_stopped_while_its_connection_ends(
+    senders: Senders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_writing, is_ending = threading.Event(), threading.Event()
+
+    async def write(*_: object) -> None:
+        is_writing.set()
+        try:
+            await asyncio.sleep(LIMIT_S)
+        finally:
+            is_ending.set()
+            await asyncio.sleep(LIMIT_S)
+
+    monkeypatch.setattr(VTubeStudioConnection, "_write", write)
+    with VTubeStudioStub() as stub:
+        senders.start(parse_target(f"vts://127.0.0.1:{stub.port}"))
+        assert is_writing.wait(LIMIT_S)
+    assert is_ending.wait(LIMIT_S)
+    senders.close()
 
 
 def test_does_not_ask_again_after_denial(senders: Senders) -> None:
