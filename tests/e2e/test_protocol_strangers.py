@@ -252,7 +252,11 @@ def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[l
         sent.send(SAMPLES[16000:], paced=True)
         sent.finish()
         assert session.info["epoch"] > 1
-        outputs = [process.communicate(timeout=60)[0].splitlines() for process in running]
+        outputs = []
+        for process in running:
+            assert process.stdout is not None
+            outputs.append(process.stdout.read().splitlines())  # not communicate, after readline
+            process.wait()
     assert [process.returncode for process in running] == [0, 0, 0]
     for lines in outputs:
         times_s, jaw = zip(*(map(float, line.split()) for line in lines), strict=True)
