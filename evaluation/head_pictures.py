@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from kouxing.services.driver.config import Framing
-from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Head
+from kouxing.services.driver.config import HEAD_NAMES, Framing
+from kouxing.services.driver.head.head import DEFAULT_HEAD, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -35,8 +35,7 @@ _SCALE = 2  # pictures are drawn larger and reduced, for smooth edges
 
 def _head_names() -> list[str]:
     """Return the names of the package's heads, the default one first."""
-    names = (path.stem for path in ASSETS.glob("*.npz"))
-    return sorted(names, key=lambda name: (name != DEFAULT_HEAD, name))
+    return sorted(HEAD_NAMES, key=lambda name: (name != DEFAULT_HEAD, name))
 
 
 def sheets(folder: Path) -> dict[Path, Callable[[], Image.Image]]:

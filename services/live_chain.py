@@ -12,6 +12,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline import WithProgress
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -106,6 +107,18 @@ class LiveChain:
         """End the audio and return the remaining frames, until the face is at rest."""
         self._stream.input_finished()
         return self._animate()
+
+    def animate(
+        self, samples: NDArray[np.float32], with_progress: WithProgress = iter
+    ) -> list[Frame]:
+        """Process a whole recording, shape (n,), a second at a time; return all frames.
+
+        The sample rate is 16 kHz. ``with_progress`` shows the progress.
+        """
+        frames: list[Frame] = []
+        for start in with_progress(range(0, len(samples), MEDIA_RATE_HZ)):
+            frames += self.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
+        return frames + self.input_finished()
 
     def _animate(self) -> list[Frame]:
         events = _decode(self._recognizer, self._stream)

@@ -8,4 +8,4 @@ from msgspec.structs import replace as replace  # noqa: PLC0414 - the public nam
 
 
 class Record(Struct, frozen=True):
-    """Base class of records; ``replace`` returns a changed copy."""
+    """Base class of records; ``replace`` returns a changed copy, of messages too."""

@@ -10,9 +10,10 @@ from collections.abc import Callable
 from itertools import islice
 
 from kouxing.shared.keys import NO_PEER, Peer
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import combine
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5

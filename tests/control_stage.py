@@ -11,10 +11,11 @@ from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.endpoints import key_of, with_key
 from kouxing.shared.keys import load_key
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, OpenSession
 from tests.system import wait_until
 

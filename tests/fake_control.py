@@ -8,11 +8,12 @@ from typing import Any, Self, TypeVar
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import NO_PEER, Peer
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Poller, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.services.cli.inputs import read_mono_16k
-from kouxing.services.driver.head.head import ASSETS
+from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video import film
@@ -34,16 +35,12 @@ def write_head_videos(
     ``heads`` are names of built-in heads. By default, all are drawn. Raises ``UserError`` if
     a file cannot be read or written, or the recordings are too long.
     """
-    names = heads or sorted(path.stem for path in ASSETS.glob("*.npz"))
+    names = heads or HEAD_NAMES
     loaded = {name: scene.load_head(name) for name in names}
     samples = join_recordings([read_mono_16k(path) for path in recordings])
     chain = LiveChain(model, load_lip_model(model.inventory.language))
-    frames = []
-    for start in track(
-        range(0, len(samples), MEDIA_RATE_HZ), "recognizing", console=CONSOLE, transient=True
-    ):
-        frames += chain.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
-    frames += chain.input_finished()
+    show = partial(track, description="recognizing", console=CONSOLE, transient=True)
+    frames = chain.animate(samples, show)
     for name in track(names, "drawing", console=CONSOLE, transient=True):
         path = folder / name / "minute.mp4"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -122,7 +122,8 @@ def animate(
             LiveChain(model, lip_model, synthesizer=config, lip_predictor=predictor)
             for lip_model, config in zip(models, settings, strict=True)
         ]
-        faces = [_stream(chain, samples, progress) for chain in chains]
+        with_progress = partial(progress.track, description="recognizing")
+        faces = [chain.animate(samples, with_progress) for chain in chains]
         events = chains[-1].events
     else:
         if transcript is None:
@@ -166,14 +167,6 @@ def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipP
     """Load the models once for all files of a command."""
     model = model_of_language(language)
     return model, _load_lip_predictor(mouth)
-
-
-def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) -> list[film.Frame]:
-    """Pass sound through a live chain, a second at a time."""
-    frames: list[film.Frame] = []
-    for start in progress.track(range(0, len(samples), MEDIA_RATE_HZ), description="recognizing"):
-        frames += chain.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
-    return frames + chain.input_finished()
 
 
 def _load_lip_predictor(mouth: Path | None) -> LipPredictor:

@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from kouxing.services.cli.options import DEFAULT_HEAD, HeadName
+from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.shared.errors import UserError
 from kouxing.shared.page_heads import page_heads_folder
 from kouxing.shared.terminal import Force, check_output, print_message
@@ -103,8 +104,7 @@ def ensure_page_heads() -> None:
 
 def _page_files() -> dict[str, str]:
     """Return the name of each head's file."""
-    names = sorted(path.stem for path in (_DRIVER_HEADS / "assets").glob("*.npz"))
-    return {name: "head.glb" if name == DEFAULT_HEAD else f"head-{name}.glb" for name in names}
+    return {name: "head.glb" if name == DEFAULT_HEAD else f"head-{name}.glb" for name in HEAD_NAMES}
 
 
 def _has_current_heads(folder: Path) -> bool:

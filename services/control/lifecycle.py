@@ -12,9 +12,10 @@ from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.sessions import Sessions
 from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import Metrics
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Event, EventName
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode
 
 START_TIMEOUT_S = 5.0

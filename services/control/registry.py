@@ -15,9 +15,9 @@ from kouxing.services.kinds import PROVIDERS
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Peer
+from kouxing.shared.records import replace
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 from kouxing.shared.wire.control import Heartbeat
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
 MAX_SERVICES = 2000

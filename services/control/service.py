@@ -28,10 +28,11 @@ from kouxing.shared.endpoints import with_key
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
+from kouxing.shared.records import replace
 from kouxing.shared.service import Service
 from kouxing.shared.wire.control import Event, EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,

@@ -37,6 +37,7 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
+from kouxing.shared.records import replace
 from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.sockets import Socket
@@ -44,7 +45,7 @@ from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import phone_of
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Acoustic, Phone, Speech
 

@@ -39,7 +39,6 @@ class Recognizer:
     def __init__(self, model: AcousticModel, rule: OutputRuleConfig | None = None) -> None:
         self.model = model
         self._models = {model.inventory.language: model}
-        self._block_models = [model] if isinstance(model, BlockModel) else []
         self._rule = rule or OutputRuleConfig()
 
     def model_of(self, language: str | None) -> AcousticModel:
@@ -51,9 +50,7 @@ class Recognizer:
         if language is None:
             return self.model
         if language not in self._models:
-            self._models[language] = model = model_of_language(language)
-            if isinstance(model, BlockModel):
-                self._block_models.append(model)
+            self._models[language] = model_of_language(language)
         return self._models[language]
 
     def create_stream(
@@ -99,7 +96,8 @@ class Recognizer:
     @property
     def network_s(self) -> float:
         """Processor time spent in block networks so far, seconds."""
-        return sum([session.run_s for session in {model.session for model in self._block_models}])
+        models = [model for model in self._models.values() if isinstance(model, BlockModel)]
+        return sum(session.run_s for session in {model.session for model in models})
 
     def is_ready(self, stream: SpeechStream) -> bool:
         """Return whether a stream has audio to score."""

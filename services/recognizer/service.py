@@ -33,13 +33,14 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
 from kouxing.shared.phones.events import Progress, Waveform
+from kouxing.shared.records import replace
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge, Speech
 

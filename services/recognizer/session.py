@@ -19,13 +19,14 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, Overload
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
+from kouxing.shared.records import replace
 from kouxing.shared.replay import Replay
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import (
     Acknowledge,

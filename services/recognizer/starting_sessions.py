@@ -6,9 +6,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.shared.records import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import replace
 
 
 class StartingSessions:

@@ -39,6 +39,7 @@ from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
+from kouxing.shared.records import replace
 from kouxing.shared.service import Service
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import (
@@ -49,7 +50,7 @@ from kouxing.shared.wire.events import (
     separate,
 )
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import (
     AudioState,

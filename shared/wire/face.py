@@ -14,13 +14,13 @@ from kouxing.shared.face.expressions import (
     MIN_EXPRESSIVENESS,
 )
 from kouxing.shared.face.shape_names import MAX_SHAPES
+from kouxing.shared.records import replace
 from kouxing.shared.wire.message import (
     FapMask,
     FapValues,
     Message,
     Name,
     SessionName,
-    replace,
 )
 
 Strength = Annotated[float, Meta(ge=0, le=1)]

@@ -12,7 +12,6 @@ import re
 from typing import Annotated, ClassVar
 
 from msgspec import Meta, Struct
-from msgspec.structs import replace as replace  # noqa: PLC0414 - messages cannot be changed
 
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.names import NAME_OR_EMPTY

@@ -50,6 +50,34 @@ def test_the_readme_has_six_figures_of_the_report(readme: str) -> None:
             assert value.startswith(figure(RESULTS[step]["result"])), step
 
 
+ENGLISH = "Mandarin {zh} %, German {de} %, English {en} %, Italian {it} %, Korean {ko} %"
+CHINESE = "普通话 {zh}%，德语 {de}%，英语 {en}%，意大利语 {it}%，韩语 {ko}%"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "to"),
+    [
+        ("README.md", ENGLISH, " to "),
+        ("README.zh.md", CHINESE, "% 至 "),
+        ("services/gateway/page/texts.js", ENGLISH, " to "),
+        ("services/gateway/page/texts.js", CHINESE, "% 至 "),
+        (
+            "services/cli/options.py",
+            "zh {zh} %, de {de} %, en {en} %, it {it} %, ko {ko} %",
+            " to ",
+        ),
+    ],
+)
+def test_the_errors_by_language_are_those_of_the_report(file: str, text: str, to: str) -> None:
+    shown: dict[str, list[str]] = {}
+    for group, score in RESULTS["languages"]["result"]["own"]["speech"].items():
+        language = group.removeprefix("language ").partition("-")[0]
+        rate = f"{100 * score['final']['feature_error_rate']:.0f}"
+        shown[language] = sorted([*shown.get(language, []), rate], key=int)
+    ranges = {name: to.join(dict.fromkeys((r[0], r[-1]))) for name, r in shown.items()}
+    assert text.format(**ranges) in (ROOT / file).read_text("utf-8")
+
+
 def test_the_page_was_written_from_these_results() -> None:
     text = (ROOT / "docs" / "results.md").read_text("utf-8")
     for step in RESULTS.values():

@@ -16,10 +16,11 @@ from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
 from kouxing.shared.bus import Bus, Reach
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionInput
-from kouxing.shared.wire.message import Message, replace
+from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
 from tests.e2e.following import Stream, samples_of_file

@@ -16,10 +16,11 @@ from kouxing.services.recognizer.service import MAX_UNPACED_S, RecognizerService
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
+from kouxing.shared.records import replace
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, replace
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES
 from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START

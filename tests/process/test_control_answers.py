@@ -11,10 +11,10 @@ import zmq
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import add_key, read_key, revoke_key, user_key
+from kouxing.shared.records import replace
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
 from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage

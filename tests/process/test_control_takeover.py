@@ -5,10 +5,10 @@ import time
 import pytest
 
 from kouxing.services.control import lifecycle, move_repeats, takeover
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,

@@ -13,6 +13,7 @@ from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.keys import Peer, key_folder, revoke_key
+from kouxing.shared.records import replace
 from kouxing.shared.service import (
     EXIT_AFTER_S,
     HEARTBEAT_S,
@@ -24,7 +25,6 @@ from kouxing.shared.service import (
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake

@@ -10,9 +10,9 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED, SynthesizerService
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
+from kouxing.shared.records import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port

@@ -21,11 +21,12 @@ from kouxing.services.synthesizer.service import SynthesizerService
 from kouxing.shared import connections, sockets
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
+from kouxing.shared.records import replace
 from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message, replace
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
 from tests.control_stage import LOCAL, PROVIDED, beat
 from tests.samples import SAMPLES

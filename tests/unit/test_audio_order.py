@@ -3,8 +3,8 @@
 import pytest
 
 from kouxing.services.recognizer.audio_order import MAX_HELD_BYTES, WAIT_S, AudioOrder
+from kouxing.shared.records import replace
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.message import replace
 
 
 def chunk(sequence: int, num_bytes: int = 2) -> AudioChunk:

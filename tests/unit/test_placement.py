@@ -5,7 +5,7 @@ import pytest
 from kouxing.services.control.load import MIN_SESSIONS, RETRY_AFTER_S, WorkerLoad
 from kouxing.services.control.refusal import Refusal
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.message import replace
+from kouxing.shared.records import replace
 from kouxing.shared.wire.session import OpenSession
 from tests.unit.test_sessions import System, worker
 

@@ -19,10 +19,10 @@ from kouxing.services.recognizer.session import (
 )
 from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.phones.events import LipPositions
+from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import AcousticModelName, Progress
 from tests.e2e.following import samples_of_file

@@ -13,9 +13,9 @@ from kouxing.services.control.registry import Registry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.sessions import Sessions
 from kouxing.shared.keys import Peer
+from kouxing.shared.records import replace
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import replace
 from kouxing.shared.wire.session import OpenSession, SessionFacts
 
 CLIENT = Peer(b"client", "its key")
