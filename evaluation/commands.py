@@ -413,8 +413,9 @@ def schemes(
             recognized, recognizers, names, videos, programs=from_csv or (), **options
         )
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
-        if any(sentence.aligned is None for sentence in recognized):
-            print_message("no videos of scheme 1: some sentences have no text")
+        unaligned = [one.sentence.clip.name for one in recognized if one.aligned is None]
+        if unaligned:
+            print_message(f"no videos of scheme 1: no usable text for {', '.join(unaligned)}")
 
 
 @app.command()

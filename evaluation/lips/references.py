@@ -1,5 +1,6 @@
 """Clips with tracked lips, their phones, and when somebody speaks in them."""
 
+import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +19,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.terminal import plural, print_message
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -26,6 +28,7 @@ PAUSE = "pause"
 _SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
 _MIN_PAUSE_S = 0.3
 _POWER_STEP_S = 0.01
+_MAX_NAMES_LENGTH = 200  # characters in a message
 _LABIAL = "b"  # viseme of b p m
 
 
@@ -143,18 +146,22 @@ def _held_out(
     folder: Path, clips: list[LipClip], parameters: Collection[Path | None]
 ) -> list[LipClip]:
     seen = {name for path in {None, *parameters} for name in clips_seen(path)}
-    filters: dict[str, Callable[[LipClip], bool]] = {
-        "no clip is held out; list clips or speakers in held.txt": lambda clip: clip.part == "held",
-        "the parameters were trained on all clips; use other clips": lambda clip: (
-            clip.name not in seen
-        ),
-        "the audio of every clip is out of sync; use other clips": lambda clip: clip.is_in_sync,
-        "no clip contains the lip opening; add columns for FAP 4 and 5": lambda clip: (
-            not np.isnan(CURVES["opening"](real_faps(clip))).all()
+    clips = [clip for clip in clips if clip.part == "held"]
+    if not clips:
+        raise UserError(f"{folder}: no clip is held out; list clips or speakers in held.txt")
+    faults: dict[str, Callable[[LipClip], bool]] = {
+        "that the parameters were trained on": lambda clip: clip.name in seen,
+        "whose audio is out of sync": lambda clip: not clip.is_in_sync,
+        "without a lip opening (FAP 4 and 5)": lambda clip: bool(
+            np.isnan(CURVES["opening"](real_faps(clip))).all()
         ),
     }
-    for message, is_kept in filters.items():
-        clips = [clip for clip in clips if is_kept(clip)]
+    for fault, has_fault in faults.items():
+        omitted = [clip.name for clip in clips if has_fault(clip)]
+        clips = [clip for clip in clips if clip.name not in omitted]
+        if omitted:
+            names = textwrap.shorten(", ".join(omitted), _MAX_NAMES_LENGTH, placeholder=" ...")
+            print_message(f"omitted {plural(len(omitted), 'clip')} {fault}: {names}")
         if not clips:
-            raise UserError(f"{folder}: {message}")
+            raise UserError(f"{folder}: no clip can be scored; use other clips")
     return clips

@@ -23,6 +23,8 @@ from kouxing.shared.terminal import print_message
 _DROPPED = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
 _DROPPED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
+# The report itself writes these files, so changes of them do not make a commit dirty.
+_WRITTEN = (":!docs/results", ":!docs/results.md", ":!docs/*.png")
 
 
 def run_steps(
@@ -72,18 +74,26 @@ def describe_run() -> dict[str, Any]:
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
     models = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],  # noqa: S607
+    commit = _git("describe", "--always")
+    if commit and _git("status", "--porcelain", "--", ".", *_WRITTEN):
+        commit += "-dirty"
+    return {
+        "machine": f"{models[0] if models else platform.processor()}, {os.cpu_count()} cores",
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "commit": commit or "unknown",
+    }
+
+
+def _git(*arguments: str) -> str:
+    """Return the output of a git command; empty outside a repository."""
+    done = subprocess.run(  # noqa: S603
+        ["git", *arguments],  # noqa: S607
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
     )
-    return {
-        "machine": f"{models[0] if models else platform.processor()}, {os.cpu_count()} cores",
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "commit": commit.stdout.strip() or "unknown",
-    }
+    return done.stdout.strip()
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """The commands that compare lips with real ones, and their measures."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
 from kouxing.evaluation.lips.lip_scores import groups_of
+from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.evaluation.lips.speaking_rates import accuracy_of
 from kouxing.evaluation.recognizer.disturbances import CLEAN, MUSIC
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
@@ -50,6 +52,17 @@ def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
         assert {*results[title][CLEAN]["all"]} == {"clips", *MEASURES}
     assert results["learnt, 0 ms"][CLEAN]["all"] != results["learnt, 60 ms"][CLEAN]["all"]
     assert "A: learnt, 0 ms, B: learnt, 60 ms" in result.output
+
+
+def test_omitted_clips_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_clip(tmp_path)
+    for suffix in (".flac", ".json"):
+        shutil.copy(tmp_path / f"cam_1{suffix}", tmp_path / f"cam_2{suffix}")
+    (tmp_path / "cam_2.csv").write_text("t,F16_push_b_lip\n0.00,10\n0.04,20")
+    assert [clip.name for clip in clips_to_score(tmp_path)] == ["cam_1"]
+    assert capsys.readouterr().err == (
+        "omitted 1 clip without a lip opening (FAP 4 and 5): cam_2\n"
+    )
 
 
 def test_groups_clips_by_language_speaker_and_source() -> None:
