@@ -5,6 +5,7 @@ import signal
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 from kouxing_client import Client, KouxingError
@@ -22,11 +23,9 @@ from kouxing.shared.wire.control import AllowedKey
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Joined, StatusRequest
-from tests.system import LIMIT_S, start_python
+from tests.system import LIMIT_S, start_python, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
-
-
 pytestmark = pytest.mark.usefixtures("new_keys")
 
 
@@ -67,13 +66,6 @@ def hidden(message: Message, shift: int) -> bytes:
         frames += head + bytes([part is not parts[-1]]) + part
     head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://evil.example\r\n\r\n"
     return head + b"\x01" * (600 + shift) + b"\x01\x00" + frames
-
-
-def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
-    found = []
-    while there.wait(timeout_s):
-        found += [item.message for item in there.receive() if isinstance(item.message, Message)]
-    return found
 
 
 @pytest.mark.parametrize(
@@ -165,13 +157,19 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
         for session in (None, "theirs"):
             subscriber.subscribe(FapFrame, session)
         subscriber.subscribe_session([FapFrame], "mine")
-        assert publisher.wait(LIMIT_S)
-        while publisher.wait(0.2):
+        received: list[tuple[type, str]] = []
+
+        def exchange() -> None:
+            publisher.wait(0.01)
             list(publisher.receive())
+            messages = [cast(Message, item.message) for item in subscriber.receive()]
+            received.extend((type(message), message.session) for message in messages)
+
+        wait_until(lambda: received, step=exchange)  # then the subscriptions are in effect
         for session in ("theirs", "mine"):
             publisher.send(FapFrame(session=session, values=bytes(272), mask=bytes(9)))
-        kinds = [(type(item), item.session) for item in messages_of(subscriber)]
-        assert kinds == [(Joined, "mine"), (FapFrame, "mine")]
+        wait_until(lambda: len(received) > 1, step=exchange)
+        assert received == [(Joined, "mine"), (FapFrame, "mine")]
 
 
 class Recognizer(Service):

@@ -10,7 +10,7 @@ import pytest
 from kouxing.evaluation.system.attackers import connected, frame
 from kouxing.shared import connections, peer_quota, tarpit
 from kouxing.shared.bus import Bus
-from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS
+from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
 from kouxing.shared.sockets import MAX_DROPPED, Poller, Received, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
@@ -56,14 +56,25 @@ def wire_bytes(message: Message) -> bytes:
     return frame(topic, more=True) + frame(body)
 
 
-def test_fast_senders_wait_while_nothing_is_received(bus: Bus) -> None:
+def test_fast_senders_wait_while_nothing_is_received(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks: list[float] = []
+    enforce_limits = ConnectionLimiter.enforce_limits
+
+    def count_and_enforce(limiter: ConnectionLimiter, now_s: float) -> None:
+        enforce_limits(limiter, now_s)
+        checks.append(now_s)
+
+    monkeypatch.setattr(ConnectionLimiter, "enforce_limits", count_and_enforce)
     audio = bus.bind_router(LOCAL, "audio")
     senders = [bus.connect_dealer(audio.endpoint) for _ in range(16)]
     num_chunks = 30
     for name, sender in enumerate(senders):
         for number in range(num_chunks):
             assert sender.send(chunk(number, session=str(name)))
-    time.sleep(0.5)  # as when a service pauses a socket
+    num_before = len(checks)
+    wait_until(lambda: len(checks) > num_before + 20)  # a service may pause a socket
     received = collect(bus, audio, lambda all_: len(all_) == len(senders) * num_chunks)
     numbers: dict[str, list[int]] = {}
     for item in received:

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -198,12 +197,19 @@ def test_a_sender_can_be_stopped_while_its_connection_ends(
     senders.close()
 
 
-def test_does_not_ask_again_after_denial(senders: Senders) -> None:
+def test_does_not_ask_again_after_denial(senders: Senders, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, has_ended = VTubeStudioConnection.run, threading.Event()
+
+    async def run_to_its_end(self: VTubeStudioConnection) -> None:
+        await run(self)
+        has_ended.set()
+
+    monkeypatch.setattr(VTubeStudioConnection, "run", run_to_its_end)
     with VTubeStudioStub(user_allows=False) as stub:
         url = f"vts://127.0.0.1:{stub.port}"
         senders.start(parse_target(url))
-        wait_until(lambda: "denied" in problem(senders, url))
-        time.sleep(0.5)  # ten times the pause between connection attempts
+        assert has_ended.wait(LIMIT_S)
+        assert "denied" in problem(senders, url)
         assert stub.requests == ["AuthenticationTokenRequest"]
 
 

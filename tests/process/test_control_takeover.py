@@ -1,7 +1,5 @@
 """A restarted control learns the sessions from the services."""
 
-import time
-
 import pytest
 
 from kouxing.services.control import lifecycle, move_repeats, takeover
@@ -26,6 +24,7 @@ PLACED = {
     "phone_input": "tcp://127.0.0.1:1",
     "faps": "tcp://127.0.0.1:1",
 }
+ELSEWHERE = {**PLACED, "audio": "tcp://127.0.0.1:2"}
 
 
 @pytest.fixture(autouse=True)
@@ -69,11 +68,12 @@ def test_only_the_recognizer_of_a_session_may_report_it(
     stage: Stage, client: Socket, sender: str
 ) -> None:
     recognizer, synthesizer = stage.services
-    if sender == "synthesizer":
-        synthesizer.send(report())
-    else:
-        recognizer.send(report({**PLACED, "audio": "tcp://127.0.0.1:2"}))
-    stage.control._takeover.end_s = time.monotonic() + 0.5
+    service = synthesizer if sender == "synthesizer" else recognizer
+    stage.receive(service)
+    service.send(report() if service is synthesizer else report(ELSEWHERE))
+    service.send(beat(sender.partition(" ")[0]))
+    stage.receive(service)  # the report was read before the heartbeat
+    stage.control._takeover.end_s = 0.0
     client.send(CloseSession(session="mine", token="t", request="1"))
     (answer,) = stage.receive(client)
     assert isinstance(answer, Error)
@@ -83,7 +83,8 @@ def test_only_the_recognizer_of_a_session_may_report_it(
 def test_moves_a_session_without_synthesizer_at_the_deadline(stage: Stage) -> None:
     recognizer, synthesizer = stage.services
     recognizer.send(report({**PLACED, "faps": "tcp://127.0.0.1:3"}))
-    stage.control._takeover.end_s = time.monotonic() + 0.5
+    stage.step_until(lambda: stage.control._takeover._reported)
+    stage.control._takeover.end_s = 0.0
     starts: list[StartSession] = []
     while not starts or starts[-1].epoch == 4:
         told = stage.receive(synthesizer)
