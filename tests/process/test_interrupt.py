@@ -96,3 +96,11 @@ def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) 
     printed, log = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, printed) == (130, "")
     assert "Traceback" not in log
+
+
+def test_onnxruntime_stores_no_usage_data(tmp_path: Path) -> None:
+    program = "import kouxing.services.recognizer.onnx_session"
+    without_ci = {"CI": "", "ORT_DISABLE_TELEMETRY": ""}
+    process = start_python("-c", program, PYTHONPATH=str(ROOT), HOME=str(tmp_path), **without_ci)
+    assert process.communicate(timeout=LIMIT_S) == ("", "")
+    assert [*tmp_path.iterdir()] == []
