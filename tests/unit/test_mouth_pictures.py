@@ -1,4 +1,4 @@
-"""Mouths can be distinguished in pictures; light on teeth and tongue."""
+"""The mouths of the built-in heads: visemes, differences in pictures, and light on the teeth."""
 
 from itertools import combinations
 
@@ -10,7 +10,10 @@ from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer, mouth_light
 from kouxing.services.driver.render.scene import camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.dynamic_visemes import visemes
 from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.shared.face import high_level
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from tests import heads
 from tests.lips import viseme_faps
 
@@ -28,13 +31,13 @@ def spoken(viseme: str) -> NDArray[np.float32]:
 
 
 @pytest.fixture(scope="module", params=heads.NAMES)
-def head(request: pytest.FixtureRequest) -> Head:
+def coarse_head(request: pytest.FixtureRequest) -> Head:
     name: str = request.param
     return heads.load(name, "coarse")
 
 
-def test_any_two_mouths_differ(head: Head) -> None:
-    renderer = Renderer(head, *SIZE_PX, samples=0, camera=camera(head))
+def test_any_two_mouths_differ(coarse_head: Head) -> None:
+    renderer = Renderer(coarse_head, *SIZE_PX, samples=0, camera=camera(coarse_head))
     pictures = {viseme: renderer.draw(spoken(viseme)).astype(np.int32) for viseme in VISEMES}
     renderer.close()
     for one, other in combinations(VISEMES, 2):
@@ -54,3 +57,52 @@ def test_small_mouths_and_protruding_lips_admit_little_light(
     faps = np.zeros(68, np.float32)
     faps[[3, 4, 15, 16]] = upper, lower, pushed, pushed
     assert mouth_light(faps) == pytest.approx(light, abs=1e-4)
+
+
+def read_visemes() -> dict[str, NDArray[np.float32]]:
+    faps = np.zeros((len(visemes.VISEMES), NUM_FAPS), np.float32)
+    faps[:, np.array(MOUTH_FAPS) - 1] = visemes.static_targets()
+    return dict(zip(visemes.VISEMES, faps, strict=True))
+
+
+VISEME_FAPS = read_visemes()
+PAIRS = (("2.2", "2.3"), ("2.6", "2.8"), ("2.7", "2.9"))
+
+
+@pytest.fixture(scope="module", params=heads.NAMES)
+def head(request: pytest.FixtureRequest) -> Head:
+    name: str = request.param
+    return heads.load(name)
+
+
+def place_mm(head: Head, faps: NDArray[np.float32], *points: str) -> NDArray[np.float64]:
+    """Return feature point positions, mm."""
+    places = head.deform(faps)[[head.feature_points[point] for point in points]]
+    return 1000 * places.astype(np.float64)
+
+
+def gaps_mm(head: Head, faps: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the mouth opening in the middle and halfway to both corners, mm."""
+    places = place_mm(head, faps, *(point for pair in PAIRS for point in pair))
+    return places[::2, 1] - places[1::2, 1]
+
+
+def test_lips_do_not_cross_and_close_in_b_p_m(head: Head) -> None:
+    assert gaps_mm(head, VISEME_FAPS["b"]).max() <= 0.1
+    for name, faps in VISEME_FAPS.items():
+        assert gaps_mm(head, faps).min() > -0.7, name  # at rest they overlap by 0.4 mm
+
+
+@pytest.mark.parametrize("name", ["u", "v"])
+def test_u_is_rounded_and_protruded(head: Head, name: str) -> None:
+    points = ("2.4", "2.5", "2.2", "2.3")
+    rest, rounded = (place_mm(head, VISEME_FAPS[shape], *points) for shape in ("rest", name))
+    assert rounded[0, 0] - rounded[1, 0] < 0.72 * (rest[0, 0] - rest[1, 0])
+    assert (rounded - rest)[2:, 2].min() > 1.4
+
+
+@pytest.mark.parametrize("faps", [VISEME_FAPS["f"], high_level.viseme_faps(2, 0, 63)])
+def test_lower_lip_meets_the_upper_teeth_in_f(head: Head, faps: NDArray[np.float32]) -> None:
+    upper_lip, lower_lip, edge = place_mm(head, faps, "2.2", "2.3", "9.10")[:, 1]
+    assert -0.5 < lower_lip - edge < 2.0  # it covers the cutting edge,
+    assert upper_lip - lower_lip > 1.0  # and the teeth show above it

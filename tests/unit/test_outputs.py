@@ -1,5 +1,6 @@
-"""Commands refuse options without effect, and never overwrite an input."""
+"""Outputs are complete or absent; commands refuse useless options, and overwrite no input."""
 
+import errno
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from kouxing.evaluation.commands import plot_heads
 from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.main import app
 from kouxing.shared.errors import UserError
+from kouxing.shared.output_file import open_output
 from kouxing.shared.terminal import check_output
 
 
@@ -141,3 +143,34 @@ def test_refuses_an_option_without_effect(
     error = CliRunner().invoke(app, arguments.split()).exception
     assert isinstance(error, UserError), error
     assert message in str(error)
+
+
+def fill_the_disk(path: Path) -> None:
+    with open_output(path) as file:
+        file.write(b"glTF")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
+    path = tmp_path / "head.glb"
+    with pytest.raises(UserError, match="the disk is full"):
+        fill_the_disk(path)
+    assert not path.exists()
+
+
+def test_an_error_names_the_folder_to_create(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="mkdir -p"), open_output(tmp_path / "new/head.glb"):
+        pass
+
+
+def test_an_error_names_the_folder_that_a_link_needs(tmp_path: Path) -> None:
+    link = tmp_path / "head.glb"
+    link.symlink_to(tmp_path / "new" / "head.glb")
+    with pytest.raises(UserError, match=f"mkdir -p {tmp_path}/new"), open_output(link):
+        pass
+
+
+def test_a_device_is_not_deleted() -> None:
+    with pytest.raises(UserError, match="the disk is full"), open_output(Path("/dev/full")) as file:
+        file.write(b"text")
+    assert Path("/dev/full").exists()

@@ -1,4 +1,4 @@
-"""A session of the recognizer service: the audio that it accepts, and its messages."""
+"""A session of the recognizer: the audio that it accepts, the order of messages, its sound."""
 
 from typing import Any, cast
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.audio_order import MAX_HELD_BYTES, WAIT_S, AudioOrder
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.recognizer.recognizer import Recognizer
@@ -189,3 +190,47 @@ def test_unpaced_audio_is_taken_in_order_up_to_a_duration() -> None:
     queue.drop(two, keep_end=True)
     assert take(1.0) == [("two", None)]
     assert not queue
+
+
+def acknowledged(number: int, num_bytes: int = 2) -> AudioChunk:
+    return chunk(number, pcm=bytes(num_bytes), acknowledge=True)
+
+
+def push(order: AudioOrder, *sequences: int) -> list[list[int]]:
+    return [
+        [message.sequence for message in order.push(acknowledged(number), 0.0)]
+        for number in sequences
+    ]
+
+
+def test_starts_with_the_first_message_and_waits_for_missing_ones() -> None:
+    assert push(AudioOrder(), 7, 8, 9) == [[7], [8], [9]]
+    order = AudioOrder()
+    assert push(order, 1, 4, 5, 4, 2, 3) == [[1], [], [], [], [2], [3, 4, 5]]
+    assert order.last == 5
+
+
+def test_does_not_wait_for_a_client_that_resends_nothing() -> None:
+    order = AudioOrder()
+    push(order, 1)
+    message = chunk(4)
+    assert order.push(message, 0.0) == [message]
+
+
+def test_continues_after_each_gap_that_is_not_filled_in_time() -> None:
+    order = AudioOrder()
+    push(order, 1, 4, 6)
+    assert order.tick(WAIT_S * 0.9) == []
+    assert [message.sequence for message in order.tick(WAIT_S)] == [4]
+    assert order.tick(1.9 * WAIT_S) == []
+    assert [message.sequence for message in order.tick(2 * WAIT_S)] == [6]
+
+
+@pytest.mark.parametrize("num_bytes", [0, MAX_HELD_BYTES // 2])
+def test_holds_limited_memory(num_bytes: int) -> None:
+    order = AudioOrder()
+    push(order, 1)
+    num_held = 0
+    while not order.push(acknowledged(3 + num_held, num_bytes), 0.0):
+        num_held += 1
+    assert num_held * (num_bytes + 200) < MAX_HELD_BYTES

@@ -1,5 +1,7 @@
-"""Rendering without a display: framings, backgrounds, windows and errors."""
+"""Rendering without a display: framings, backgrounds, windows, the virtual camera and errors."""
 
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import moderngl
@@ -9,10 +11,12 @@ import pytest
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render import renderer as render
-from kouxing.services.driver.render.renderer import BACKGROUND
+from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
 from kouxing.services.driver.render.scene import background, camera, load_head
 from kouxing.services.driver.render.window import Window
+from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
+from tests.heads import neutral_faps
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +72,49 @@ def test_parses_backgrounds_and_rejects_others() -> None:
 def test_error_of_an_unknown_head(name: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         load_head(name)
+
+
+class Device:
+    """Replaces the library's camera."""
+
+    device = "/dev/video0"
+
+    def __init__(self, width: int, height: int, fps: float) -> None:
+        self.shape = (height, width, 3)
+        self.sent: list[np.ndarray] = []
+
+    def send(self, image: np.ndarray) -> None:
+        assert image.shape == self.shape
+        assert image.dtype == np.uint8
+        assert image.flags.c_contiguous
+        self.sent.append(image)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(Head.load(detail="coarse"), 64, 48, samples=0)
+
+
+def test_sends_pictures_at_the_frame_rate(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", SimpleNamespace(Camera=Device))
+    camera = VirtualCamera(renderer, 25.0)
+    for tick in range(101):
+        camera.draw(neutral_faps(), 100 + tick * 0.01)
+    assert 25 <= len(camera._camera.sent) <= 26
+
+
+def test_errors_name_missing_requirements(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", None)
+    with pytest.raises(UserError, match=r"kouxing\[camera\]"):
+        VirtualCamera(renderer, 25.0)
+
+    def no_device(*_: Any) -> None:
+        raise RuntimeError("no v4l2 loopback device found")
+
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", SimpleNamespace(Camera=no_device))
+    with pytest.raises(UserError, match="modprobe v4l2loopback"):
+        VirtualCamera(renderer, 25.0)

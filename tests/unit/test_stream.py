@@ -1,4 +1,4 @@
-"""A session's audio and its events: gaps, flushes, chunks, and times in whole samples."""
+"""A session's audio and its events: gaps, flushes, chunks, silence, and times in whole samples."""
 
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -10,8 +10,11 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.search import decoder, path_records
 from kouxing.services.recognizer.stream import MAX_JITTER
+from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,
@@ -25,7 +28,7 @@ from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.message import Message
 from tests.e2e.following import samples_of_file
 from tests.live_streams import LiveStream, recognize_live, recognize_together
-from tests.system import VOWELS_FILE
+from tests.system import DEMO, VOWELS_FILE
 
 MODEL = load_model()
 SAMPLES = samples_of_file(VOWELS_FILE)
@@ -200,3 +203,29 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
         for results in (outputs, expected)
     ]
     assert symbols[0] == symbols[1]
+
+
+HELLO = read_audio(DEMO / "hello-female.wav")[0][:, 0]
+
+
+def hello_phones() -> list[Phone]:
+    outputs = recognize_live(load_model(), HELLO, 320)
+    return [output for output in outputs if isinstance(output, Phone)]
+
+
+@pytest.mark.slow
+def test_silence_and_noise_have_no_phones() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
+    outputs = recognize_live(load_model(), noise, 320)
+    assert not any(isinstance(output, Phone | SpeechChange) for output in outputs)
+    assert recognize(load_model(), noise, 16_000) == []
+
+
+@pytest.mark.slow
+def test_warm_up_compiles_everything_and_changes_no_result() -> None:
+    expected = hello_phones()
+    Recognizer(load_model()).warm_up()
+    assert decoder._steps.signatures
+    assert path_records.count_paths.signatures
+    assert path_records.compact.signatures
+    assert hello_phones() == expected

@@ -1,0 +1,195 @@
+"""Ferguson lips: live, from a known text, and the training of their table."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableSegmenter, segment_speech
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.records import replace
+from kouxing.training.ferguson.recipe import fit_openings, relative_openings, travel_of
+from tests.lips import clip_of, phone, utterance
+from tests.live_streams import LiveStream
+from tests.system import DEMO
+
+LIPS = load_lip_model(name="ferguson")
+INVENTORY = load_inventory()
+TABLE = load_table(INVENTORY)
+LOWER_LIP = 4  # column of FAP 5
+WIDEST = float(faps_of([5.0])[0, MOUTH_FAPS.index(5)])
+DELAY_S = 0.16
+
+
+def progress(start_s: float, end_s: float, *, loud: bool) -> list[SoundEvent]:
+    return [
+        Progress(time_s=round(number * 0.02, 2), level_db=-20.0 if loud else -70.0)
+        for number in range(round(start_s / 0.02) + 1, round(end_s / 0.02) + 1)
+    ]
+
+
+def openings(events: Sequence[SoundEvent], face: FaceAnimator | None = None) -> NDArray[np.float64]:
+    """Return R of the frames at 50 Hz."""
+    face = face or FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    frames = [faps for event in events for _, faps in face.process(event)]
+    return 5.0 * np.array(frames, dtype=np.float64)[:, LOWER_LIP] / WIDEST
+
+
+SAID: list[SoundEvent] = [
+    *progress(0.0, 0.5, loud=False),
+    SpeechChange(active=True, time_s=0.5),
+    *progress(0.5, 0.6, loud=True),
+    phone(0, "m", 0.5, 0.1),
+    *progress(0.6, 0.7, loud=True),
+    phone(1, "a", 0.6, 0.4),
+    *progress(0.7, 1.0, loud=True),
+    *progress(1.0, 2.0, loud=False),
+]
+
+
+def test_openings_of_phones_and_rest_in_silence() -> None:
+    made = openings(SAID)
+    assert made[:15].max() == 0.0
+    assert made[25] == pytest.approx(TABLE.opening["m"], abs=0.7)
+    assert made[31] == pytest.approx(TABLE.opening["a"], abs=0.7)
+    assert np.argmax(made) < 36
+    assert made[60:].max() < 0.05  # energy shows the end long before voice activity does
+
+
+def test_no_jump_at_revisions_and_interruptions() -> None:
+    phones = [event for event in SAID if isinstance(event, Phone)]
+    made = openings([*SAID[:-60], phones[0], replace(phones[1], symbol="u")])
+    assert np.abs(np.diff(made)).max() < 2.0
+    face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    before = openings(SAID[:42], face)
+    assert before[-1] > 2.0
+    face.flush()
+    after = openings(progress(0.74, 1.2, loud=False), face)
+    assert np.abs(np.diff([before[-1], *after])).max() < 2.0
+    assert after[8:].max() < 0.05
+
+
+def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
+    samples = to_16_khz(*read_audio(DEMO / "hello-female.wav"))[:32_000]
+    settings = SynthesizerConfig(
+        lips="ferguson", idle_motion_seed=0, expressiveness=1.0, feeling=0.0
+    )
+    made = []
+    for chunk in (32_000, 333):
+        chain = LiveChain(load_model(), LIPS, synthesizer=settings)
+        frames = []
+        for begin in range(0, len(samples), chunk):
+            frames += chain.accept_waveform(samples[begin : begin + chunk])
+        made.append(np.array([faps for _, faps in frames + chain.input_finished()]))
+    np.testing.assert_array_equal(made[0], made[1])
+    opening = 5.0 * made[0][:, LOWER_LIP] / WIDEST
+    assert opening.min() >= 0.0
+    assert 2.5 < opening.max() <= 5.0
+
+
+RATE_HZ = 16_000
+
+
+def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
+    """Return a sound of vowels (v), hissing consonants (s), weak nasals (n) and silence (-)."""
+    rng = np.random.default_rng(0)
+    made = []
+    for kind, length_s in parts:
+        time_s = np.arange(round(length_s * RATE_HZ)) / RATE_HZ
+        sine, noise = np.sin(2 * np.pi * 200.0 * time_s), rng.standard_normal(len(time_s))
+        made.append({"v": 0.2 * sine, "s": 0.05 * noise, "n": 0.03 * sine, "-": 1e-4 * noise}[kind])
+    return np.concatenate(made).astype(np.float32)
+
+
+def test_segments_end_at_pauses_dips_and_hisses() -> None:
+    parts = [("-", 0.4), ("v", 0.2), ("-", 0.2), ("v", 0.2), ("n", 0.08), ("v", 0.2)]
+    segments = segment_speech(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
+    starts = [segment.start_s for segment in segments]
+    np.testing.assert_allclose(starts, [0.4, 0.8, 1.0, 1.28], atol=0.045)
+    assert segments[0].end_s == pytest.approx(0.6, abs=0.045)
+    assert segments[1].end_s == segments[2].start_s
+    assert segments[-1].end_s == pytest.approx(1.58, abs=0.045)
+
+
+def test_streaming_finds_the_same_segments() -> None:
+    samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]
+    segmenter = SyllableSegmenter()
+    segments = []
+    for output in LiveStream(load_model()).feed(samples, chunk=113):
+        if isinstance(output, Progress):
+            segments += segmenter.add_slice(output)
+    segments += segmenter.finish()
+    assert segments == segment_speech(progress_of(samples))
+    assert len(segments) > 3
+
+
+def test_finals_follow_by_the_influence_factor() -> None:
+    sound = speech([("-", 0.4), ("n", 0.06), ("v", 0.2), ("s", 0.12), ("v", 0.2), ("-", 0.4)])
+    phones = time_text(progress_of(sound), [("m", "a"), ("s", "an")], TABLE)
+    assert [phone.symbol for phone in phones] == ["m", "a", "s", "an"]
+    m, a, s, an = phones
+    assert m.onset_s == pytest.approx(0.4, abs=0.05)
+    assert s.onset_s == pytest.approx(0.66, abs=0.05)
+    length_s = an.onset_s + an.duration_s - s.onset_s
+    assert an.onset_s == pytest.approx(s.onset_s + TABLE.influence["an"] * length_s)
+    assert a.onset_s + a.duration_s == pytest.approx(s.onset_s)
+
+
+def test_rejects_text_that_cannot_be_timed() -> None:
+    silent = progress_of(speech([("-", 1.0)]))
+    with pytest.raises(UserError, match="no speech was found"):
+        time_text(silent, [("a",)], TABLE)
+    with pytest.raises(UserError, match="the text is empty"):
+        time_text(silent, [], TABLE)
+    with pytest.raises(UserError, match=f"at most {MAX_SYLLABLES}"):
+        time_text(silent, [("a",)] * (MAX_SYLLABLES + 1), TABLE)
+
+
+def test_key_frames_do_not_overshoot() -> None:
+    frames = KeyFrames(np.array([0.0, 1.0, 2.0]), np.array([0.0, 4.0, 4.0]))
+    np.testing.assert_allclose(frames.openings_at([-1.0, 0.25, 1.5, 9.0]), [0.0, 1.0, 4.0, 4.0])
+    time_s = np.linspace(-1.0, 3.0, 401)
+    smooth = frames.openings_at(time_s, smooth=True)
+    assert smooth.max() <= 4.0
+    assert (np.diff(smooth) >= -1e-12).all()
+    np.testing.assert_allclose(frames.openings_at([0.0, 1.0, 2.0], smooth=True), [0.0, 4.0, 4.0])
+
+
+def test_recovers_openings() -> None:
+    phones = utterance(0, 200)
+    time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
+    true = dataclasses.replace(
+        TABLE, opening={**TABLE.opening, "b": 0.0, "a": 5.0, "i": 1.5, "d": 2.5}
+    )
+    opening = key_frames_of(phones, true, INVENTORY.silence).openings_at(time_s)
+    clip = clip_of(time_s, faps_of(opening))
+    relative = relative_openings([clip])[0]
+    scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5
+    np.testing.assert_allclose(relative, np.minimum(scale * opening, 5.0), atol=0.01)
+    found = fit_openings([clip], [phones], INVENTORY)
+    for symbol in ("a", "i", "u", "d", "b", "sh"):
+        expected = min(scale * true.opening[symbol], 5.0)
+        assert found[symbol] == pytest.approx(expected, abs=0.3)
+    assert found["sil"] == found["b"] == 0.0
+    # a phone without data follows its visemes
+    assert found["ang"] == pytest.approx(found["a"], abs=0.3)
+    travel = faps_of([5.0])[0] / scale
+    np.testing.assert_allclose(travel_of([clip]), travel, rtol=0.05, atol=1e-9)
+    assert len(travel_of([clip])) == len(MOUTH_FAPS)
