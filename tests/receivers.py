@@ -15,6 +15,8 @@ from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.target import Target
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioProtocol, tracking_parameters
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.shapes import SHAPE_SETS
 
 # addresses of all protocols and shape sets
 SENT = (
@@ -33,6 +35,19 @@ LIVE_LINK_ORDER = """
     cheekSquintRight noseSneerLeft noseSneerRight tongueOut
 """.split()
 Messages = list[tuple[str, list[Any]]]
+
+
+def frame_of(shapes: str = "arkit", time_s: float = 0.0, /, **weights: float) -> FaceFrame:
+    """Return a frame with some shapes or FAPs, by name."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    for name, weight in weights.items():
+        if name in FAP_NUMBER:
+            faps[FAP_NUMBER[name] - 1] = weight
+        else:
+            row = np.zeros(len(SHAPE_SETS[shapes].names), np.float32)
+            row[SHAPE_SETS[shapes].names.index(name)] = weight
+            faps += SHAPE_SETS[shapes].faps(row)
+    return FaceFrame(faps, time_s)
 
 
 def received(url: str, faps: NDArray[np.float32]) -> NDArray[np.float32]:

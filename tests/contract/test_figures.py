@@ -1,8 +1,7 @@
-"""Measured figures: six in both READMEs, all others in the report's page, and tables only there."""
+"""Measured figures: six in both READMEs, and the errors by language, are those of the report."""
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,10 +24,6 @@ FIGURES: list[tuple[str, Callable[[Any], str]]] = [  # step and value of each ro
     ("rivals", lambda r: f"{r['learnt, 60 ms']['clean']['zh']['r_opening']:.2f}"),
     ("chain", lambda r: f"{r['page']['drawings']['microphone']['pictures_per_s']:.0f}"),
 ]
-
-
-OTHER_TABLES = {"sizing.md"}  # plans for many speakers are computed
-FIGURE = re.compile(r"[-+]?\d[\d.,]*(?: ?(?:%|x|k?B|MB|GB|m?s|mm))?(?: ?[±/] ?[-+]?\d[\d.,]* ?%?)*")
 
 
 def figures_of(readme: str) -> list[str]:
@@ -84,29 +79,3 @@ def test_the_page_was_written_from_these_results() -> None:
         assert f"{step['date']}, commit {step['commit']}" in text
         assert step["commands"][-1] in text
     assert text.count("\n| --- |") <= len(TABLES) <= 10
-
-
-def test_results_are_small() -> None:
-    for path in Path(ROOT / "docs" / "results").glob("*.json"):
-        assert path.stat().st_size < 200_000, path.name
-
-
-def tables_of_figures(text: str) -> list[str]:
-    """Return the first lines of tables in which most cells are figures.
-
-    The first column, which names the rows, does not count.
-    """
-    found = []
-    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
-        first, _, *rows = table.splitlines()
-        cells = [cell.strip() for row in rows for cell in row.split("|")[2:-1]]
-        if sum(bool(FIGURE.fullmatch(cell)) for cell in cells) > 0.7 * len(cells):
-            found.append(first)
-    return found
-
-
-def test_only_the_report_has_tables_of_figures() -> None:
-    pages = [*ROOT.glob("docs/*.md"), *ROOT.glob("docs/clients/*.md")]
-    tables = {page.name: tables_of_figures(page.read_text("utf-8")) for page in pages}
-    assert len(tables.pop("results.md")) > 3
-    assert {name for name, found in tables.items() if found} <= OTHER_TABLES

@@ -22,15 +22,11 @@ from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.face.shapes import SHAPE_SETS
-from tests.receivers import LIVE_LINK_ORDER, read_live_link
+from tests.receivers import LIVE_LINK_ORDER, frame_of, read_live_link
 from tests.system import LIMIT_S, wait_until
 from tests.vtube_studio import VTubeStudioStub
 
-
-def open_mouth() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    """Return FAPs of an open mouth."""
-    vrm = SHAPE_SETS["vrm"]
-    return vrm.faps(np.array([name == "aa" for name in vrm.names], np.float32))
+OPEN_MOUTH = frame_of("vrm", aa=1.0).faps
 
 
 @pytest.fixture(autouse=True)
@@ -86,7 +82,7 @@ def test_an_osc_server_receives_the_face(senders: Senders) -> None:
             senders.start(parse_target(f"vmc://127.0.0.1:{server.server_address[1]}"))
             wait_until(lambda: bool(opened))
             assert opened[0] == 0.0  # resting face
-            senders.show(0.0, open_mouth())
+            senders.show(0.0, OPEN_MOUTH)
             wait_until(lambda: opened[-1] > 0.8)
         finally:
             server.shutdown()
@@ -149,7 +145,7 @@ def test_media_time_continues_at_rest(senders: Senders, receiver: socket.socket)
 
     senders.start(parse_target(f"osc://127.0.0.1:{receiver.getsockname()[1]}"))
     assert 0.0 <= next_time_s() < LIMIT_S
-    senders.show(1000.0, open_mouth())
+    senders.show(1000.0, OPEN_MOUTH)
     while next_time_s() < 1000.0:
         pass
     rest_s = [next_time_s() for _ in range(5)]
@@ -166,7 +162,7 @@ def test_vtube_studio_asks_once(senders: Senders) -> None:
             "AuthenticationTokenRequest", "AuthenticationRequest", "InputParameterListRequest",
         ]  # fmt: skip
         assert stub.frames[0]["MouthOpen"] == 0.0
-        senders.show(0.0, open_mouth())
+        senders.show(0.0, OPEN_MOUTH)
         wait_until(lambda: stub.frames[-1]["MouthOpen"] > 0.9)
         port = stub.port
     wait_until(lambda: "start it" in problem(senders, url))
@@ -235,7 +231,7 @@ def test_a_tracker_passes_through_with_the_mouth_of_the_session(
     target = parse_target(f"livelink://127.0.0.1:{port}?camera={camera}")
     senders.start(target)
     wait_until(lambda: senders.states()[0].rate_hz > 0)  # both sockets are open
-    senders.show(1.0, open_mouth())
+    senders.show(1.0, OPEN_MOUTH)
     tracked = FaceFrame(SHAPE_SETS["arkit"].faps(np.eye(52, dtype=np.float32)[0]), 0.0)
     packet = LiveLinkConnection(parse_target("livelink://?name=Phone")).encode_at(tracked, 0.0)
     names = set()

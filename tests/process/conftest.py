@@ -7,6 +7,13 @@ import pytest
 from kouxing.shared.bus import Bus
 from kouxing.shared.sockets import Socket
 from tests.control_stage import Stage
+from tests.fake_control import FakeControl
+
+
+@pytest.fixture
+def control() -> Iterator[FakeControl]:
+    with FakeControl() as made:
+        yield made
 
 
 @pytest.fixture

@@ -18,14 +18,15 @@ LONG = b"a" * 300
 
 @pytest.fixture(scope="module")
 def gateway() -> Iterator[Gateway]:
-    gateway = Gateway("tcp://127.0.0.1:9", token="secret")
+    gateway = Gateway("tcp://127.0.0.1:9", token="secret", log_level="info")
     yield gateway
     gateway.process.terminate()
     _, log = gateway.process.communicate(timeout=LIMIT_S)
     assert gateway.process.returncode == 0
     assert "Traceback" not in log
     assert "traceback" not in log
-    assert log.count("overlap") == 1, "a library's line is logged once a minute"
+    for text in ("overlap", "invalid HTTP"):
+        assert log.count(text) == 1, "a line is logged once a minute"
 
 
 def ask(gateway: Gateway, request: bytes) -> str:
@@ -64,6 +65,9 @@ def ask(gateway: Gateway, request: bytes) -> str:
         (b"POST /sound", b"Content-Encoding: br\r\n" + BODY, 415),
         (b"POST /unknown", b"Content-Encoding: deflate\r\n" + BODY, 415),
         (b"G\x00T /", b"\r\n", 400),
+        (b"GET / HTTP/1.1\r\n\r\n", b"", 400),
+        (b"\x16\x03\x01" * 100, b"", 400),
+        (b"\xff\x00" * 5000, b"", 400),
     ],
 )
 def test_answers_bad_requests_without_a_version(

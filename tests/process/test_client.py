@@ -34,12 +34,6 @@ CHUNK = bytes(3200)  # 100 ms
 
 
 @pytest.fixture
-def control() -> Iterator[FakeControl]:
-    with FakeControl() as made:
-        yield made
-
-
-@pytest.fixture
 def client(control: FakeControl) -> Iterator[Client]:
     with Client(control.address, insecure=True) as made:
         yield made

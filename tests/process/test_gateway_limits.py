@@ -24,7 +24,7 @@ from kouxing.services.gateway.web_server import WebServer
 from kouxing.services.gateway.whip import MISSING, WhipClients
 from kouxing.shared.metrics import Metrics
 from tests.process.web_clients import async_test
-from tests.system import LIMIT_S, Gateway, port_of
+from tests.system import LIMIT_S
 
 LONG = b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n"
 SLOW = b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n"
@@ -379,16 +379,3 @@ async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPat
     assert await Served(exhausted.getsockname()).answers()
     assert not failures
     await server.stop()
-
-
-def test_logs_requests_that_are_not_http_once() -> None:
-    gateway = Gateway("tcp://127.0.0.1:9", log_level="info")
-    address = ("127.0.0.1", port_of(gateway.page))
-    for garbage in (b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01" * 100, b"\xff\x00" * 5000):
-        with socket.create_connection(address, 60) as client:
-            client.sendall(garbage)
-            assert b" 400 " in client.recv(100)
-    gateway.process.terminate()
-    _, log = gateway.process.communicate()
-    assert log.count("invalid HTTP") == 1
-    assert "Traceback" not in log

@@ -161,12 +161,6 @@ class Worker(Service):
 
 
 @pytest.fixture
-def control() -> Iterator[FakeControl]:
-    with FakeControl() as made:
-        yield made
-
-
-@pytest.fixture
 def worker(control: FakeControl) -> Iterator[Worker]:
     made = Worker(control.address)
     yield made

@@ -2,27 +2,18 @@
 
 import struct
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kouxing.services.senders.camera import CameraInput
 from kouxing.services.senders.connection import DatagramConnection
-from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import bundles, message
 from kouxing.services.senders.protocols import connect, parse_target
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.fake_time import run
-from tests.receivers import LIVE_LINK_ORDER, read_live_link, read_osc
-
-
-def frame_of(**weights: float) -> FaceFrame:
-    shapes = SHAPE_SETS["arkit"]
-    row = np.array([weights.get(name, 0.0) for name in shapes.names], np.float32)
-    return FaceFrame(shapes.faps(row), 0.0)
+from tests.receivers import LIVE_LINK_ORDER, frame_of, read_live_link, read_osc
 
 
 def connection_to(url: str) -> DatagramConnection:

@@ -80,14 +80,6 @@ def test_error_names_line_and_reason(tmp_path: Path, lines: list[str], complaint
         read_fap(write(tmp_path, *lines))
 
 
-def test_errors_of_missing_paths(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="absent"):
-        read_fap(tmp_path / "absent.fap")
-    animation = FapAnimation("", 50.0, np.zeros((1, 68), dtype=np.float32))
-    with pytest.raises(UserError, match="absent"):
-        write_fap(tmp_path / "absent" / "x.fap", animation)
-
-
 @pytest.mark.parametrize(
     ("bits", "values", "faps"),
     [

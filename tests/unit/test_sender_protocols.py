@@ -16,22 +16,8 @@ from kouxing.services.senders.vtube_studio import (
     tracking_parameters,
 )
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from tests.receivers import LIVE_LINK_ORDER, Messages, read_live_link, read_osc
-
-
-def frame_of(shapes: str = "arkit", time_s: float = 0.0, /, **weights: float) -> FaceFrame:
-    """Return a frame with some shapes or FAPs, by name."""
-    faps = np.zeros(NUM_FAPS, np.float32)
-    for name, weight in weights.items():
-        if name in FAP_NUMBER:
-            faps[FAP_NUMBER[name] - 1] = weight
-        else:
-            row = np.zeros(len(SHAPE_SETS[shapes].names), np.float32)
-            row[SHAPE_SETS[shapes].names.index(name)] = weight
-            faps += SHAPE_SETS[shapes].faps(row)
-    return FaceFrame(faps, time_s)
+from tests.receivers import LIVE_LINK_ORDER, Messages, frame_of, read_live_link, read_osc
 
 
 def osc_messages(url: str, frame: FaceFrame) -> Messages:

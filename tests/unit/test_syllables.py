@@ -8,19 +8,13 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.known_text import characters_of
 from kouxing.shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
+from tests import lips
 
 MANDARIN = load_inventory("mandarin")
 
 
 def phone(index: int, symbol: str, *, final: bool = True, duration_s: float = 0.1) -> Phone:
-    return Phone(
-        index=index,
-        symbol=symbol,
-        onset_s=0.1 * index,
-        duration_s=duration_s,
-        confidence=1.0,
-        final=final,
-    )
+    return lips.phone(index, symbol, 0.1 * index, duration_s, final=final)
 
 
 def test_shows_an_initial_at_once_and_adds_its_vowel() -> None:
