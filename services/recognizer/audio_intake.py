@@ -1,7 +1,7 @@
-"""Checks the audio messages of clients, puts them in order, and reports rejected ones."""
+"""Checks the audio messages of clients, and reports rejected ones."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import AudioRejected, RecognizerSession
@@ -20,7 +20,7 @@ class AudioIntake:
     loop
         Counts and logs problems.
     on_chunk
-        Called with each chunk of valid audio, in order.
+        Called with each chunk of valid audio.
     on_end
         Called when the last chunk of a session has arrived.
     """
@@ -51,32 +51,30 @@ class AudioIntake:
             return
         now_s = time.monotonic()
         session.client = sender
-        if message.sequence <= session.order.last:
+        is_next = False
+        if message.sequence <= session.last_sequence:
             self._loop.metrics.count("repeated")
-            in_order = []
         else:
             session.on_new_audio(now_s)
-            in_order = session.order.push(message, now_s)
-        self.accept_in_order(session, in_order, sender)
+            is_next = session.take_next(message, now_s)
+        if is_next:
+            self._accept(session, message, sender)
         if message.acknowledge:  # at once if the client resends or must fill a gap
-            at_once = not in_order or session.is_finished
+            at_once = not is_next or session.is_finished
             session.request_acknowledgement(now_s, at_once=at_once)
 
-    def accept_in_order(
-        self, session: RecognizerSession, messages: Iterable[AudioChunk], sender: Peer
-    ) -> None:
-        """Accept messages in order; a rejected one counts as received."""
-        for message in messages:
-            try:
-                session.check_open(message)
-            except AudioRejected as rejection:
-                self._reject(session.socket, message, sender, rejection)
-                continue
-            if message.pcm or not message.last:
-                self._accept_chunk(session, message, sender)
-            if message.last:
-                session.end = message
-                self._on_end(session)
+    def _accept(self, session: RecognizerSession, message: AudioChunk, sender: Peer) -> None:
+        """Accept the next message; a rejected one counts as received."""
+        try:
+            session.check_open(message)
+        except AudioRejected as rejection:
+            self._reject(session.socket, message, sender, rejection)
+            return
+        if message.pcm or not message.last:
+            self._accept_chunk(session, message, sender)
+        if message.last:
+            session.end = message
+            self._on_end(session)
 
     def _accept_chunk(self, session: RecognizerSession, message: AudioChunk, sender: Peer) -> None:
         if error := session.mouth_profile_error:

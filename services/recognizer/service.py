@@ -26,7 +26,6 @@ from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.starting_sessions import StartingSessions
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
-from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
@@ -63,7 +62,6 @@ class RecognizerService(Service):
     ) -> None:
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
-        self._unpaced = UnpacedAudio()
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
         self._max_behind_s = config.max_behind_s
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
@@ -113,11 +111,12 @@ class RecognizerService(Service):
         If no live audio is left, decode some unpaced audio. More unpaced audio waits in its socket,
         and then at the sender.
         """
-        has_unpaced = bool(self._unpaced) and not self._is_unpaced_blocked
+        has_unpaced = self._has_unpaced_audio and not self._is_unpaced_blocked
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
         self._read_late_audio()
-        self._live.decode([*self._sessions.values()])
-        if self._unpaced and not self._is_unpaced_blocked and not self._is_live_waiting:
+        self._live.decode(self._paced(True))
+        is_blocked = self._is_unpaced_blocked or not self._has_unpaced_audio
+        if not is_blocked and not self._is_live_waiting:
             self._decode_unpaced()
 
     def wait(self, timeout_s: float) -> list[Socket]:
@@ -157,8 +156,6 @@ class RecognizerService(Service):
         session = self._sessions.get(start.session)
         is_new = session is None or session.start.token != start.token
         if session is None or is_new:
-            if session is not None:
-                self._unpaced.drop(session, keep_end=False)
             socket = self._audio if start.paced else self._unpaced_audio
             session = RecognizerSession(
                 start,
@@ -183,20 +180,22 @@ class RecognizerService(Service):
     def stop_session(self, session: str) -> None:
         """Forget a session."""
         self._starting.remove(session)
-        if (stopped := self._sessions.pop(session, None)) is not None:
-            self._unpaced.drop(stopped, keep_end=False)
+        if self._sessions.pop(session, None) is not None:
             free_at_s = time.monotonic() + FREE_MEMORY_AFTER_S
             self._free_memory_at_s = min(self._free_memory_at_s, free_at_s)
 
     def flush_session(self, session: str) -> None:
         """Drop the current speech; the next audio starts again."""
         if (flushed := self._sessions.get(session)) is not None:
-            self._live.decode_all([flushed])
-            self._unpaced.drop(flushed, keep_end=True)
+            if flushed.start.paced:
+                self._live.decode_all([flushed])
+            flushed.audio.clear()
             flushed.link.forget()
             flushed.without_audio_s = 0.0  # so that the face learns of a stalled client again
             flushed.stream.flush()
             self._send_results(flushed)
+            if flushed.end is not None:
+                self._finish(flushed)
 
     def on_tick(self, now_s: float) -> float:
         """Start sessions, acknowledge audio, report stalled clients, and resend to synthesizers.
@@ -211,7 +210,6 @@ class RecognizerService(Service):
         self._report_stalled(now_s)
         blocked = set()
         for session in self._sessions.values():
-            self._intake.accept_in_order(session, session.order.tick(now_s), session.client)
             session.acknowledge_if_due(now_s)
             self.metrics.count("resent", session.link.tick(now_s))
             if session.link.check_overdue(now_s):
@@ -221,7 +219,7 @@ class RecognizerService(Service):
             self.report_skipped(session.name, session.audio.overload.take_report_s(now_s))
             if session.link.is_full:
                 blocked.add(session.start.paced)
-        self._is_live_blocked = True in blocked or self._live_audio_s > MAX_QUEUED_S
+        self._is_live_blocked = True in blocked or self._queued_s(True) > MAX_QUEUED_S
         self._is_unpaced_blocked = False in blocked
         self.pause(self._audio, paused=self._is_live_blocked)
         self._limit_unpaced()
@@ -238,10 +236,10 @@ class RecognizerService(Service):
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
         sessions = self._sessions.values()
-        self._live.decode_all([*sessions])
+        self._live.decode_all(self._paced(True))
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
-        while self._unpaced:
+        while self._has_unpaced_audio:
             self._decode_unpaced()
         for session in sessions:
             self._finish(session)
@@ -264,7 +262,7 @@ class RecognizerService(Service):
         """Return figures about queued audio, unacknowledged messages and the light model."""
         backlogs = [session.link.backlog for session in self._sessions.values()]
         return {
-            "queued_audio_seconds": self._live_audio_s + self._unpaced.duration_s,
+            "queued_audio_seconds": self._queued_s(True) + self._queued_s(False),
             "unacknowledged_messages": max(backlogs, default=0),
             "network_hop": self._live.hop,
             "light_sessions": sum(session.stream.is_light for session in self._sessions.values()),
@@ -276,31 +274,33 @@ class RecognizerService(Service):
         self._intake.receive(self._sessions.get(message.session), socket, message, sender)
 
     def _on_chunk(self, session: RecognizerSession, chunk: Chunk) -> None:
-        if session.start.paced:
-            session.audio.append(chunk, time.monotonic())
-        else:
-            self._unpaced.append(session, chunk)
+        session.audio.append(chunk, time.monotonic())
+        if not session.start.paced:
             self._limit_unpaced()
 
     def _on_end(self, session: RecognizerSession) -> None:
-        if not session.start.paced:
-            self._unpaced.append(session, None)
-        elif not session.is_decoding:
+        if not session.is_decoding:
             self._finish(session)
+
+    def _paced(self, is_paced: bool) -> list[RecognizerSession]:
+        return [one for one in self._sessions.values() if one.start.paced == is_paced]
+
+    def _queued_s(self, is_paced: bool) -> float:
+        """Duration of the paced or unpaced audio that is not decoded yet."""
+        return sum(session.audio.duration_s for session in self._paced(is_paced))
 
     @property
     def _has_live_audio(self) -> bool:
         sessions = self._sessions.values()
-        return any(session.audio and not session.is_scoring for session in sessions)
+        return any(one.audio and one.start.paced and not one.is_scoring for one in sessions)
+
+    @property
+    def _has_unpaced_audio(self) -> bool:
+        return any(one.audio and not one.start.paced for one in self._sessions.values())
 
     @property
     def _is_live_waiting(self) -> bool:
         return self._has_live_audio or (not self._is_live_blocked and self._audio.wait(0.0))
-
-    @property
-    def _live_audio_s(self) -> float:
-        """Duration of the live audio that is not decoded yet."""
-        return sum(session.audio.duration_s for session in self._sessions.values())
 
     def _read_late_audio(self) -> None:
         """After a stall, read all received audio, so that it can be skipped in one cut."""
@@ -315,11 +315,6 @@ class RecognizerService(Service):
                 return
             self.handle_messages(self._audio)
 
-    def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
-        """Decode the accepted audio of some sessions."""
-        self._recognizer.decode_streams([session.stream for session in sessions])
-        self._send_decoded(sessions)
-
     def _send_decoded(self, sessions: Sequence[RecognizerSession]) -> None:
         """Send the results of decoded sessions; finish those whose audio ends."""
         self.resync_with_control()  # after a stall, other recognizers may serve the sessions
@@ -329,21 +324,19 @@ class RecognizerService(Service):
             self._send_results(session)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps_counted)
             session.num_gaps_counted = session.stream.num_gaps
-            if not session.start.paced:
-                continue
-            self.metrics.observe("chunk_ms", 1e3 * (time.monotonic() - session.accepted_s))
+            if session.start.paced:
+                self.metrics.observe("chunk_ms", 1e3 * (time.monotonic() - session.accepted_s))
             if session.end is not None and not session.is_decoding:
                 self._finish(session)
 
     @property
     def _max_unpaced_s(self) -> float:
         """Duration of unpaced audio that is decoded, and read, at a time."""
-        has_live = any(session.start.paced for session in self._sessions.values())
-        return MAX_UNPACED_S if has_live else MAX_BATCH_S
+        return MAX_UNPACED_S if self._paced(True) else MAX_BATCH_S
 
     def _limit_unpaced(self) -> None:
         """Stop reading unpaced audio while enough of it is queued."""
-        is_full = self._unpaced.duration_s >= self._max_unpaced_s
+        is_full = self._queued_s(False) >= self._max_unpaced_s
         is_paused = is_full or self._is_unpaced_blocked
         self.pause(self._unpaced_audio, paused=is_paused)
         if not is_paused:
@@ -352,18 +345,16 @@ class RecognizerService(Service):
     def _decode_unpaced(self) -> None:
         """Decode some unpaced audio, and finish the sessions whose audio ends."""
         before = self._live.work
-        batch: dict[str, RecognizerSession] = {}
-        for session, chunk in self._unpaced.take(self._max_unpaced_s):
-            if chunk is not None:
-                media_time, samples = chunk
-                session.stream.accept_waveform(samples, media_time)
-                batch[session.name] = session
-                continue
-            self._decode([*batch.values()])
-            batch.clear()
-            self._finish(session)
-        if batch:
-            self._decode([*batch.values()])
+        left_s = self._max_unpaced_s
+        batch = []
+        for session in self._paced(False):
+            if session.audio and left_s > 0.0:
+                queued_s = session.audio.duration_s
+                session.accept_waveform(left_s, time.monotonic(), hop=1)
+                left_s -= queued_s - session.audio.duration_s
+                batch.append(session)
+        self._recognizer.decode_streams([session.stream for session in batch])
+        self._send_decoded(batch)
         self._limit_unpaced()
         self._live.unpaced_work += self._live.work - before
 

@@ -5,10 +5,9 @@ import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
-from kouxing.services.recognizer.audio_order import AudioOrder
+from kouxing.services.recognizer.audio_queue import AudioQueue
 from kouxing.services.recognizer.front_end.pcm import BadAudio, samples_of
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.live_audio import LiveAudio
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
@@ -42,6 +41,7 @@ MAX_LEAD_S = 15.0  # limit for a paced client ahead of the clock; a delayed one 
 ACKNOWLEDGE_EVERY_S = 0.1  # interval between acknowledgements to a client that sends audio
 STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has stalled
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
+RESEND_WAIT_S = 1.0  # for missing audio messages; then the session continues after the gap
 M = TypeVar("M", bound=Message)
 
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
@@ -94,14 +94,18 @@ class RecognizerSession:
         if start.media_time:
             silence = recognizer.model.inventory.silence
             self.resumption = Resumption(to_seconds(start.media_time), silence)
-        overload = Overload(max_behind_s, now_s + CATCH_UP_S if start.epoch > 1 else now_s)
-        self.audio = LiveAudio(start.sample_rate_hz, overload)  # not decoded yet
+        overload = Overload(
+            max_behind_s if start.paced else math.inf,
+            now_s + CATCH_UP_S if start.epoch > 1 else now_s,
+        )
+        self.audio = AudioQueue(start.sample_rate_hz, overload)  # not decoded yet
         self.is_due = False  # waits for the block network's thread
         self.is_scoring = False  # on this thread
         self.accepted_s = now_s  # when the stream last took audio
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
-        self.order = AudioOrder()
+        self.last_sequence = 0  # number of the newest accepted audio message
+        self._gap_since_s: float | None = None  # when a message behind a gap arrived
         self.client = NO_PEER  # sender of the newest audio
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded
@@ -125,15 +129,29 @@ class RecognizerSession:
 
     @property
     def is_decoding(self) -> bool:
-        """Whether received live audio is not decoded yet."""
+        """Whether received audio is not decoded yet."""
         return bool(self.audio) or self.is_due or self.is_scoring
 
     @property
     def received_sequence(self) -> int:
         """Number of the newest audio message that the client need not resend."""
         if self.end is None or self.is_finished:
-            return self.order.last
-        return min(self.order.last, self.end.sequence - 1)
+            return self.last_sequence
+        return min(self.last_sequence, self.end.sequence - 1)
+
+    def take_next(self, message: AudioChunk, now_s: float) -> bool:
+        """Return whether to accept a message newer than the last, which then is the last.
+
+        ZeroMQ loses messages in flight when a connection ends. A client that asks for
+        acknowledgements resends them; until then, later messages are ignored.
+        """
+        is_next = self.last_sequence in (0, message.sequence - 1)
+        if message.acknowledge and not is_next:
+            self._gap_since_s = now_s if self._gap_since_s is None else self._gap_since_s
+            if now_s < self._gap_since_s + RESEND_WAIT_S:
+                return False
+        self.last_sequence, self._gap_since_s = message.sequence, None
+        return True
 
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``AudioRejected`` if the sender may not send this message here."""
@@ -261,7 +279,7 @@ class RecognizerSession:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
             if isinstance(message, SpeechMessage) and not isinstance(message, LipMessage):
-                self.replay_window.update(event_of(message), self.order.last)
+                self.replay_window.update(event_of(message), self.last_sequence)
 
 
 class _AheadLimit:

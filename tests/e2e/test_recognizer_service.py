@@ -68,7 +68,7 @@ class Recognizer(RecognizerService):
     def decode_all(self) -> None:
         while self._has_live_audio:
             self._live.decode([*self._sessions.values()])
-        while self._unpaced:
+        while self._has_unpaced_audio:
             self._decode_unpaced()
             self.send_heartbeat_if_due()
 

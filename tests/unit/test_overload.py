@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.live_audio import LiveAudio
+from kouxing.services.recognizer.audio_queue import AudioQueue
 from kouxing.shared.overload import (
     CATCH_UP_S,
     LIGHT_FOR_S,
@@ -141,7 +141,7 @@ def test_reports_skipped_audio_at_most_once_a_second() -> None:
 
 
 def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
-    audio = LiveAudio(2 * RATE_HZ, Overload(MAX_BEHIND_S))
+    audio = AudioQueue(2 * RATE_HZ, Overload(MAX_BEHIND_S))
     chunk = np.zeros((3200, 1), np.float32)  # 0.1 s
     audio.append((0, chunk), 0.0)
     audio.append((1600, chunk), 0.1)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.audio_order import MAX_HELD_BYTES, WAIT_S, AudioOrder
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.recognizer.recognizer import Recognizer
@@ -14,11 +13,11 @@ from kouxing.services.recognizer.session import (
     MAX_LEAD_S,
     MAX_MEDIA_TIME,
     MOVE_GRACE_S,
+    RESEND_WAIT_S,
     STALLED_AFTER_S,
     AudioRejected,
     RecognizerSession,
 )
-from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
 from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
@@ -173,64 +172,26 @@ def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
     assert [message.sequence for message in messages] == [*range(1, len(messages) + 1)]
 
 
-def test_unpaced_audio_is_taken_in_order_up_to_a_duration() -> None:
-    one, two = make_session(paced=False), make_session(paced=False, session="two")
-    queue = UnpacedAudio()
-    for session in (one, two):
-        queue.append(session, (0, np.zeros((800, 1), np.float32)))  # 0.1 s
-        queue.append(session, None)
-
-    def take(max_s: float) -> list[tuple[str, tuple[int, int] | None]]:
-        taken = queue.take(max_s)
-        return [(session.name, item and (item[0], len(item[1]))) for session, item in taken]
-
-    assert take(0.06) == [("s", (0, 480))]
-    assert queue.duration_s == pytest.approx(0.14)
-    assert take(0.06) == [("s", (960, 320)), ("s", None), ("two", (0, 160))]
-    queue.drop(two, keep_end=True)
-    assert take(1.0) == [("two", None)]
-    assert not queue
+def take(
+    session: RecognizerSession, *sequences: int, now_s: float = 0.0, **values: Any
+) -> list[int]:
+    """Return the messages that a session accepts."""
+    messages = [chunk(number, **{"acknowledge": True, **values}) for number in sequences]
+    return [message.sequence for message in messages if session.take_next(message, now_s)]
 
 
-def acknowledged(number: int, num_bytes: int = 2) -> AudioChunk:
-    return chunk(number, pcm=bytes(num_bytes), acknowledge=True)
-
-
-def push(order: AudioOrder, *sequences: int) -> list[list[int]]:
-    return [
-        [message.sequence for message in order.push(acknowledged(number), 0.0)]
-        for number in sequences
-    ]
-
-
-def test_starts_with_the_first_message_and_waits_for_missing_ones() -> None:
-    assert push(AudioOrder(), 7, 8, 9) == [[7], [8], [9]]
-    order = AudioOrder()
-    assert push(order, 1, 4, 5, 4, 2, 3) == [[1], [], [], [], [2], [3, 4, 5]]
-    assert order.last == 5
+def test_takes_audio_in_order_from_a_client_that_resends() -> None:
+    session = make_session()
+    assert take(session, 7, 8, 11, 12, 9, 10, 11) == [7, 8, 9, 10, 11]
+    assert session.last_sequence == 11
 
 
 def test_does_not_wait_for_a_client_that_resends_nothing() -> None:
-    order = AudioOrder()
-    push(order, 1)
-    message = chunk(4)
-    assert order.push(message, 0.0) == [message]
+    assert take(make_session(), 1, 4, acknowledge=False) == [1, 4]
 
 
-def test_continues_after_each_gap_that_is_not_filled_in_time() -> None:
-    order = AudioOrder()
-    push(order, 1, 4, 6)
-    assert order.tick(WAIT_S * 0.9) == []
-    assert [message.sequence for message in order.tick(WAIT_S)] == [4]
-    assert order.tick(1.9 * WAIT_S) == []
-    assert [message.sequence for message in order.tick(2 * WAIT_S)] == [6]
-
-
-@pytest.mark.parametrize("num_bytes", [0, MAX_HELD_BYTES // 2])
-def test_holds_limited_memory(num_bytes: int) -> None:
-    order = AudioOrder()
-    push(order, 1)
-    num_held = 0
-    while not order.push(acknowledged(3 + num_held, num_bytes), 0.0):
-        num_held += 1
-    assert num_held * (num_bytes + 200) < MAX_HELD_BYTES
+def test_continues_after_a_gap_that_is_not_filled_in_time() -> None:
+    session = make_session()
+    assert take(session, 1, 4, now_s=5.0) == [1]
+    assert take(session, 6, now_s=5.0 + 0.9 * RESEND_WAIT_S) == []
+    assert take(session, 7, 8, now_s=5.0 + RESEND_WAIT_S) == [7, 8]

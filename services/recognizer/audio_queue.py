@@ -1,4 +1,4 @@
-"""The audio of one live session that is queued for decoding."""
+"""The audio of one session that is queued for decoding."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -7,8 +7,10 @@ from kouxing.services.recognizer.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.overload import Overload
 
+_MIN_CHUNK_S = 0.001  # a shorter chunk takes as much time to decode
 
-class LiveAudio:
+
+class AudioQueue:
     """A queue of chunks that drops old audio. Times are in seconds, on any monotonic clock."""
 
     def __init__(self, sample_rate_hz: int, overload: Overload) -> None:
@@ -36,6 +38,11 @@ class LiveAudio:
         self._chunks.append(chunk)
         self._num_samples += len(samples)
 
+    def clear(self) -> None:
+        """Drop all chunks."""
+        self._chunks.clear()
+        self._num_samples = 0
+
     def is_outdated(self, now_s: float) -> bool:
         """Return whether even the newest chunk is late, so more audio should have arrived."""
         return bool(self._chunks) and self.overload.is_late(now_s)
@@ -58,7 +65,7 @@ class LiveAudio:
             if len(rest):
                 rest_time = media_time + num_left * MEDIA_RATE_HZ // self._rate_hz
                 self._chunks.appendleft((rest_time, rest))
-            num_left -= len(taken)
+            num_left -= max(len(taken), round(_MIN_CHUNK_S * self._rate_hz))
             self._num_samples -= len(taken)
             yield media_time, taken
 
