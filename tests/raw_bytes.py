@@ -1,11 +1,13 @@
-"""Invalid bytes for ports of any kind: ZeroMQ, HTTP, WebSockets."""
+"""Raw bytes for the ports of services: invalid ones, and ZeroMQ's own."""
 
 import contextlib
 import socket
 import time
 from random import Random
 
-from kouxing.evaluation.system import attackers
+from kouxing.evaluation.system.attackers import GREETING, LOCALHOST, LONG, ready
+
+MORE = 1  # flag of a frame
 
 
 def pour(port: int, seconds: float) -> None:
@@ -24,7 +26,7 @@ def pour(port: int, seconds: float) -> None:
 
 def answer_handshake(listener: socket.socket, curve: bool, rest: bytes) -> None:
     """Answer a ZeroMQ socket like another program or one with other keys, then free the port."""
-    greeting = attackers.GREETING
+    greeting = GREETING
     if curve:
         greeting = greeting[:12] + b"CURVE".ljust(20, b"\0") + greeting[32:]
     with listener, listener.accept()[0] as connection, contextlib.suppress(OSError):
@@ -37,10 +39,10 @@ def _nonsense(random: Random) -> bytes:
     """Return random bytes after the first bytes of a valid message."""
     beginnings = [
         b"",
-        attackers.GREETING,
-        attackers.GREETING + attackers.ready("DEALER"),
-        attackers.GREETING + attackers.ready("SUB"),
-        attackers.GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32),
+        GREETING,
+        GREETING + ready("DEALER"),
+        GREETING + ready("SUB"),
+        GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32),
         b"\xff" + bytes(8) + b"\x7f\x01\x05",
         b"\x01\x00",
         b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
@@ -48,3 +50,31 @@ def _nonsense(random: Random) -> bytes:
         b"\x16\x03\x01",
     ]
     return random.choice(beginnings) + random.randbytes(random.choice([1, 10, 100, 10_000]))
+
+
+def connected(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socket.socket:
+    """Connect from ``host`` to a port of this machine, with the handshake of a socket without keys.
+
+    ``kind`` is ZeroMQ's name of the socket kind. Raises OSError if the other end refuses.
+    """
+    connection = socket.create_connection((LOCALHOST, port), 5.0, (host, 0))
+    try:
+        connection.sendall(GREETING + ready(kind))
+        answer = b""
+        while len(answer) < len(GREETING) + 2:  # up to the start of the peer's READY
+            received = connection.recv(1024)
+            if not received:
+                raise ConnectionResetError("the peer rejected the handshake")
+            answer += received
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def frame(body: bytes, *, more: bool = False) -> bytes:
+    """Return one message part as it is on the wire."""
+    flags = MORE if more else 0
+    if len(body) < 256:
+        return bytes([flags, len(body)]) + body
+    return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body

@@ -13,7 +13,7 @@ from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, aligned_phones
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
-from kouxing.evaluation.lips.live_faces import Samples, events_of_faces, live_frames
+from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth
 from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
 from kouxing.evaluation.lips.references import read_parts, reference_of
@@ -140,17 +140,26 @@ def takes_of(
 
     The first condition must be CLEAN. Other programs follow in this condition.
     """
-    sources = [(None, 0.0), *((face.predictor, face.delay_ms / 1e3) for face in faces.values())]
+    predictors: dict[int, LipFrameModel | None] = {
+        id(face.predictor): face.predictor for face in faces.values()
+    }
+    delays_s = sorted({face.delay_ms / 1e3 for face in faces.values()} or {0.0})
     reference = None
     for condition, disturb in disturbances.items():
-        events = events_of_faces(model, disturb(clip.samples), sources)
+        samples = disturb(clip.samples)
+        events = {
+            key: live_events(model, samples, lips, delays_s)
+            for key, lips in (predictors or {0: None}).items()
+        }
         if reference is None:
             aligned = aligned_phones(model, clip)
-            reference = reference_of(clip, events[0], model.inventory, aligned)
+            heard = next(iter(events.values()))[delays_s[0]]
+            reference = reference_of(clip, heard, model.inventory, aligned)
             yield REAL, condition, Take(reference, reference.mouth)
             for title, mouth_of in programs.items():
                 yield title, condition, Take(reference, mouth_of(clip))
-        for (title, face), received in zip(faces.items(), events[1:], strict=True):
+        for title, face in faces.items():
+            received = events[id(face.predictor)][face.delay_ms / 1e3]
             yield title, condition, Take(reference, face.mouth(received))
 
 

@@ -1,7 +1,5 @@
 """The frames that live services would send for a recording."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,85 +22,20 @@ Samples = NDArray[np.float32]
 FRAME_RATE_HZ = 50.0
 
 
-class _NumberedLipPositions(LipPositions, frozen=True, kw_only=True):
-    """Lip positions of one of several predictors."""
-
-    predictor: int
-
-
 @dataclass(frozen=True, slots=True)
-class _SeveralPredictors:
-    """Runs several lip predictors, each with several delays, on one run of the recognizer."""
+class _AtSeveralDelays:
+    """A lip predictor that predicts for several delays in one run of the recognizer."""
 
-    predictors: Sequence[LipFrameModel]
-    delays_s: Sequence[float]  # delays of all predictors
+    predictor: LipFrameModel
+    delays_s: Sequence[float]
 
-    def create_stream(self, _delays_s: Sequence[float]) -> _SeveralStreams:
-        return _SeveralStreams(
-            [
-                predictor.create_stream([d for d in predictor.delays_s if d in self.delays_s])
-                for predictor in self.predictors
-            ]
+    def create_stream(self, _delays_s: Sequence[float]) -> LipFrameStream:
+        return self.predictor.create_stream(
+            [delay_s for delay_s in self.predictor.delays_s if delay_s in self.delays_s]
         )
 
     def with_mouth_profile(self, _profile: bytes) -> Self:
         return self
-
-
-@dataclass(frozen=True, slots=True)
-class _SeveralStreams:
-    streams: Sequence[LipFrameStream]
-
-    def process_position(
-        self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
-    ) -> list[LipPositions]:
-        return [
-            _NumberedLipPositions(
-                time_s=lips.time_s,
-                delay_s=lips.delay_s,
-                faps=lips.faps,
-                closure=lips.closure,
-                lip_to_teeth=lips.lip_to_teeth,
-                predictor=number,
-            )
-            for number, stream in enumerate(self.streams)
-            for lips in stream.process_position(known_s, frames, features)
-        ]
-
-    def reset(self) -> None:
-        for stream in self.streams:
-            stream.reset()
-
-
-def events_of_faces(
-    model: AcousticModel,
-    samples: Samples,
-    faces: Sequence[tuple[LipFrameModel | None, float]],
-    config: RecognizerConfig | None = None,
-) -> list[list[SoundEvent]]:
-    """Return the sound events that each face receives, with one run of the recognizer.
-
-    A face has a lip predictor, or None, and a delay in seconds.
-    """
-    predictors = {id(lips): lips for lips, _ in faces if lips is not None}
-    numbers = {key: number for number, key in enumerate(predictors)}
-    sources = [
-        None if lips is None else (numbers[id(lips)], delay_for(lips.delays_s, delay_s))
-        for lips, delay_s in faces
-    ]
-    delays_s = sorted({source[1] for source in sources if source})
-    several = _SeveralPredictors([*predictors.values()], delays_s) if predictors else None
-    events = sound_events(model, samples, several, config=config)
-    return [[event for event in events if _is_for(event, source)] for source in sources]
-
-
-def _is_for(event: SoundEvent, source: tuple[int, float] | None) -> bool:
-    if not isinstance(event, _NumberedLipPositions):
-        return True
-    if source is None:
-        return False
-    number, delay_s = source
-    return event.predictor == number and math.isclose(event.delay_s, delay_s, abs_tol=1e-4)
 
 
 def live_events(
@@ -112,9 +45,24 @@ def live_events(
     delays_s: Sequence[float],
     config: RecognizerConfig | None = None,
 ) -> dict[float, list[SoundEvent]]:
-    """Return the sound events of a lip predictor's faces by their delay, seconds."""
-    faces = [(lips, delay_s) for delay_s in delays_s]
-    return dict(zip(delays_s, events_of_faces(model, samples, faces, config), strict=True))
+    """Return the sound events of a lip predictor's faces by their delay, seconds.
+
+    The recognizer runs once. With None for ``lips``, there are no lip positions.
+    """
+    if lips is None:
+        return dict.fromkeys(delays_s, sound_events(model, samples, None, config=config))
+    chosen_s = {delay_s: delay_for(lips.delays_s, delay_s) for delay_s in delays_s}
+    several = _AtSeveralDelays(lips, [*chosen_s.values()])
+    events = sound_events(model, samples, several, config=config)
+    return {
+        delay_s: [
+            event
+            for event in events
+            if not isinstance(event, LipPositions)
+            or math.isclose(event.delay_s, lips_s, abs_tol=1e-4)
+        ]
+        for delay_s, lips_s in chosen_s.items()
+    }
 
 
 def live_frames(

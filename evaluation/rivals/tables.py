@@ -13,6 +13,7 @@ below the loudest frames of the recording (0) to these (1).
 import json
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -27,7 +28,6 @@ from scipy.signal import resample_poly
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.curve_tables import read_table
 from kouxing.evaluation.lips.references import read_parts
-from kouxing.evaluation.rivals.node import find_node
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
 
@@ -106,6 +106,14 @@ def find_installed(name: str) -> Path:
     if not (FOLDER / name).exists():
         raise UserError("this program is not installed; run 'make report' to install it")
     return FOLDER / name
+
+
+def find_node() -> str:
+    """Return the Node next to Python, or else on the path; UserError if there is none."""
+    node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
+    if node is None:
+        raise UserError("other lip-sync programs need Node: pip install 'kouxing[page]'")
+    return node
 
 
 def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:

@@ -20,10 +20,10 @@ from kouxing.shared import control_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.keys import user_key
 
-# The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and the flags of its frames.
+# The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and flags of its frames.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 CURVE_GREETING = GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32)
-MORE, LONG, COMMAND = 1, 2, 4
+LONG, COMMAND = 2, 4
 
 LOCALHOST = "127.0.0.1"
 BLOCK = b"x" * 65_536
@@ -48,34 +48,6 @@ def ready(kind: str) -> bytes:
     """Return the READY command of a socket kind, such as ``DEALER``."""
     command = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind.encode()
     return bytes([COMMAND, len(command)]) + command
-
-
-def connected(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socket.socket:
-    """Connect from ``host`` to a port of this machine, with the handshake of a socket without keys.
-
-    ``kind`` is ZeroMQ's name of the socket kind. Raises OSError if the other end refuses.
-    """
-    connection = socket.create_connection((LOCALHOST, port), 5.0, (host, 0))
-    try:
-        connection.sendall(GREETING + ready(kind))
-        answer = b""
-        while len(answer) < len(GREETING) + 2:  # up to the start of the peer's READY
-            received = connection.recv(1024)
-            if not received:
-                raise ConnectionResetError("the peer rejected the handshake")
-            answer += received
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def frame(body: bytes, *, more: bool = False) -> bytes:
-    """Return one message part as it is on the wire."""
-    flags = MORE if more else 0
-    if len(body) < 256:
-        return bytes([flags, len(body)]) + body
-    return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
 
 
 def connect(raw: zmq.Socket[bytes], endpoint: str, key: Key, source: str = "") -> None:

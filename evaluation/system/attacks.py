@@ -27,8 +27,10 @@ from kouxing.evaluation.system.latency import percentiles, stream
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.evaluation.tables import format_number
 from kouxing.services.kinds import KINDS
+from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
@@ -98,17 +100,16 @@ def measure(path: Path, names: Collection[str], console: Console) -> list[Damage
     """
     if unknown := [name for name in names if name not in ATTACKS]:
         raise UserError(f"no attack is named {unknown[0]!r}; choose from {', '.join(ATTACKS)}")
-    samples, rate_hz = read_audio(path)
     length_s = len(PHASES) * PHASE_S + 2 * SESSION_START_S
-    speech = np.resize(samples, (round(length_s * rate_hz), samples.shape[1]))
+    speech = np.resize(to_16_khz(*read_audio(path)), round(length_s * MEDIA_RATE_HZ))
     runs = [(name, target) for name in names or ATTACKS for target in ATTACKS[name].targets]
     with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
-        _delays_ms(system.control, speech, rate_hz)  # the first session of a process is slow
+        _delays_ms(system.control, speech)  # the first session of a process is slow
         damages = []
         for place, (name, target) in enumerate(runs, start=2):
             console.print(f"attack: {name}" + (f" on {target}" if target else ""))
             # A new source address each time: a service may reject one that has misbehaved.
-            damages.append(_damage(system, name, target, f"127.0.0.{place}", speech, rate_hz))
+            damages.append(_damage(system, name, target, f"127.0.0.{place}", speech))
         return damages
 
 
@@ -138,7 +139,6 @@ def _damage(
     target: str,
     source: str,
     speech: NDArray[np.float32],
-    rate_hz: int,
 ) -> Damage:
     with connect(system.control) as client:
         services = client.status().services
@@ -151,7 +151,7 @@ def _damage(
             memory.restart_growth()
 
     with _attacker(name, endpoints.get(target, ""), source, restart_growth):
-        delays_ms = _delays_ms(system.control, speech, rate_hz)
+        delays_ms = _delays_ms(system.control, speech)
     restarted = [kind for kind in KINDS if system.supervisor.process(kind).pid != processes[kind]]
     for kind in restarted:
         del memories[kind]
@@ -164,10 +164,10 @@ def _damage(
     return Damage(name, target, has_key, growth_mb, kept_mb, restarted, delays_ms)
 
 
-def _delays_ms(control: str, speech: NDArray[np.float32], rate_hz: int) -> dict[str, float | None]:
+def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | None]:
     """Stream a session through all phases; return the 95th percentile of its delays by phase."""
     with connect(control) as client:
-        times_s, delays_s, _ = stream(client, speech, rate_hz, SynthesizerConfig().delay_ms / 1e3)
+        times_s, delays_s, _ = stream(client, speech, SynthesizerConfig().delay_ms / 1e3)
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)
     delays_ms = [delays_s[phase == place] * 1e3 for place in range(len(PHASES))]

@@ -22,15 +22,15 @@ from kouxing_client import Client
 from numpy.typing import NDArray
 from rich.console import Console
 
+from kouxing.evaluation.system.live import CHUNK_S, speak
 from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
-
-CHUNK_S = 0.02
-END_LIMIT_S = 30.0  # for the last frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Latency:
 
 def measure(path: Path, num_repeats: int, console: Console) -> Latency:
     """Start the services, stream the file and return the figures; UserError if that fails."""
-    samples, rate_hz = read_audio(path)
+    sound = to_16_khz(*read_audio(path))
     delay_s = SynthesizerConfig().delay_ms / 1e3
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -54,13 +54,10 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
         connect(system.control) as client,
     ):
         before = _cpu_s(client)
-        delays = [
-            stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)[1:]
-            for _ in range(num_repeats)
-        ]
+        delays = [stream(client, sound, delay_s)[1:] for _ in range(num_repeats)]
         time.sleep(1.0)  # for the last heartbeats
         after = _cpu_s(client)
-    audio_s = num_repeats * len(samples) / rate_hz
+    audio_s = num_repeats * len(sound) / MEDIA_RATE_HZ
     to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
     return Latency(
         chunk_to_frame_ms=percentiles(to_frame_ms),
@@ -84,46 +81,27 @@ def show(latency: Latency, console: Console) -> None:
 
 
 def stream(
-    client: Client, samples: NDArray[np.float32], rate_hz: int, delay_s: float
+    client: Client, sound: NDArray[np.float32], delay_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Stream in real time; return media time and both latencies of every frame, seconds."""
-    session = client.open_session(
-        encoding="f32le", sample_rate_hz=rate_hz, num_channels=samples.shape[1]
-    )
-    output = session.frames()
-    chunk = round(CHUNK_S * rate_hz)
-    sent_s: list[float] = []
-    arrived: list[tuple[float, float]] = []  # media time, arrival
+    """Stream in real time; return media time and both latencies of every frame, seconds.
 
-    def receive(timeout_s: float) -> None:
-        for frame in output.available(timeout_s):
-            arrived.append((frame.time_s, time.perf_counter()))
-
-    start_s = time.perf_counter()
-    for number, start in enumerate(range(0, len(samples) - chunk + 1, chunk), start=1):
-        while (left_s := start_s + number * CHUNK_S - time.perf_counter()) > 0:
-            receive(left_s)
-        if not session.try_push(samples[start : start + chunk].astype("<f4").tobytes()):
-            raise UserError(
-                "the recognizer does not accept audio; close other programs and try again"
-            )
-        sent_s.append(time.perf_counter())
-    live_until_s = time.perf_counter()
-    session.finish()
-    end_s = time.perf_counter() + END_LIMIT_S
-    while not output.has_ended:
-        receive(1.0)
-        if time.perf_counter() > end_s:
-            raise UserError("the last frame did not arrive; close other programs and try again")
+    Frames after the last sample are left out. Raises UserError if the session does not complete.
+    """
+    session = client.open_session(encoding="f32le")
+    (seen,) = speak([session], sound)
     session.close()
+    if seen.error or not seen.ended:
+        reason = seen.error or "the last frame did not arrive"
+        raise UserError(f"{reason}; close other programs and try again")
     times, to_frame, from_sound = [], [], []
-    for media_s, arrival_s in arrived:
+    for arrival_s, frame in seen.frames:
+        media_s = to_seconds(frame.media_time)
         last_needed = math.ceil((media_s + delay_s) / CHUNK_S - 1e-6) - 1
         last_shown = max(0, round(media_s / CHUNK_S) - 1)
-        if arrival_s < live_until_s and last_needed < len(sent_s):
+        if arrival_s < seen.live_until_s and last_needed < len(seen.sent_s):
             times.append(media_s)
-            to_frame.append(arrival_s - sent_s[max(0, last_needed)])
-            from_sound.append(arrival_s - sent_s[last_shown])
+            to_frame.append(arrival_s - seen.sent_s[max(0, last_needed)])
+            from_sound.append(arrival_s - seen.sent_s[last_shown])
     return np.array(times), np.array(to_frame), np.array(from_sound)
 
 

@@ -32,7 +32,7 @@ from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
 from kouxing.evaluation.lips.references import read_parts
-from kouxing.evaluation.rivals.node import find_node
+from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
 from kouxing.evaluation.tables import format_number
 from kouxing.services.cli.web_model import web_model

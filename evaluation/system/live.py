@@ -12,6 +12,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
+CHUNK_S = CHUNK / MEDIA_RATE_HZ
 END_LIMIT_S = 15.0  # limit from the last sample to the last frame
 MAX_UNPACED_FACTOR = 5.0  # longest time for unpaced audio, relative to its length
 NUM_TRIES = 3
@@ -23,6 +24,7 @@ class Seen:
 
     frames: list[tuple[float, FapFrame]] = field(default_factory=list)  # arrival, s
     phones: list[Phone] = field(default_factory=list)
+    sent_s: list[float] = field(default_factory=list)  # when each chunk was sent
     ended: bool = False
     error: str = ""  # why the session failed
     start_s: float = 0.0  # when the first sample was due
@@ -91,7 +93,6 @@ class _Speaker:
         self._output = session.results(FapFrame, Phone, keep_all=True)
         pcm, size = sound.astype("<f4").tobytes(), 4 * CHUNK
         self._chunks = [pcm[at : at + size] for at in range(0, len(pcm), size)]
-        self._num_sent = 0
         self._paced = paced
         self._has_finished = False
         start_s = time.monotonic()
@@ -109,11 +110,12 @@ class _Speaker:
         try:
             for error in self._session.take_errors():
                 self.seen.error = str(error)
-            while self._num_sent < self._num_due():
-                if not self._session.try_push(self._chunks[self._num_sent]):
+            sent_s = self.seen.sent_s
+            while len(sent_s) < self._num_due():
+                if not self._session.try_push(self._chunks[len(sent_s)]):
                     break
-                self._num_sent += 1
-            if self._num_sent == len(self._chunks) and not self._has_finished:
+                sent_s.append(time.monotonic())
+            if len(sent_s) == len(self._chunks) and not self._has_finished:
                 self._session.finish()
                 self._has_finished = True
             for result in self._output.available(wait_s):

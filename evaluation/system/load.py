@@ -21,7 +21,7 @@ from rich.console import Console
 
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.system.latency import percentiles
-from kouxing.evaluation.system.live import CHUNK
+from kouxing.evaluation.system.live import CHUNK, CHUNK_S
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.evaluation.tables import format_number
 from kouxing.services.kinds import KINDS, read_settings
@@ -40,7 +40,6 @@ SETTLE_S = 3.0  # start of a step, which is not measured
 DRAIN_S = 0.3  # time from the last chunk to the end of the sessions
 PAUSE_S = 1.0  # pause between steps
 MAX_LOST_S = 60.0
-CHUNK_S = CHUNK / MEDIA_RATE_HZ
 VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, relative to the recording
 _OFFSET = 0.618  # from one speaker to the next, relative to the text: no two are close
 

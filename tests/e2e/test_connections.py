@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from kouxing.evaluation.system.attackers import connected, frame
 from kouxing.shared import connections, peer_quota, tarpit
 from kouxing.shared.bus import Bus
 from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
@@ -17,6 +16,7 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.speech import Progress
+from tests.raw_bytes import connected, frame
 from tests.system import LIMIT_S, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, Sound, find_key
 
-from kouxing.evaluation.system import attackers
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
 from kouxing.evaluation.system.attacks import Memory
 from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
@@ -24,7 +23,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
 from tests.e2e.following import Stream, samples_of_file
-from tests.raw_bytes import pour
+from tests.raw_bytes import connected, pour
 from tests.system import DEMO, LIMIT_S, System, wait_until
 
 M = TypeVar("M", bound=Message)
@@ -274,7 +273,7 @@ def test_limits_the_damage_of_an_attack(
 def test_rejects_a_handshake_without_a_key(system: System, target: str, kind: str) -> None:
     port = int(system.endpoints()[target].partition(" ")[0].rpartition(":")[2])
     with pytest.raises(OSError, match=r".+"):
-        attackers.connected(port, kind, "127.0.2.1")
+        connected(port, kind, "127.0.2.1")
 
 
 def test_survives_random_bytes_at_every_port(system: System, witness: Session) -> None:
