@@ -70,7 +70,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
     session.close()
 
 
-def test_only_a_sessions_own_worker_says_that_it_is_idle(
+def test_only_its_worker_reports_a_session_as_idle(
     system: System, client: Client, witness: Session
 ) -> None:
     with Bus(load_key("driver", ("service:driver",))) as bus:
@@ -145,7 +145,7 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
         revoke_key("laptop")
 
 
-def test_a_key_may_do_what_its_roles_say(keyed: Client, client: Client, witness: Session) -> None:
+def test_roles_limit_what_a_key_may_do(keyed: Client, client: Client, witness: Session) -> None:
     assert witness.name in {item.session for item in keyed.status().sessions}
     with pytest.raises(Refused, match=r"not-allowed: .* no role client"):
         keyed.open_session()

@@ -35,7 +35,7 @@ def test_init_makes_the_keys_of_all_services(command: Command) -> None:
     assert {path.stem for path in key_folder().glob("*.key")} == {*KINDS, "client"}
 
 
-def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
+def test_machines_with_copied_keys_work_until_the_keys_are_revoked(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}

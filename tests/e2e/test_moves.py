@@ -36,7 +36,7 @@ def undisturbed(system: System) -> Stream:
     return stream(system.control, SAMPLES)
 
 
-def test_the_only_recognizer_keeps_its_session_after_it_stood_still(system: System) -> None:
+def test_a_recognizer_that_was_suspended_keeps_its_session(system: System) -> None:
     samples = SAMPLES[:48000]
     with Client(system.control) as client, client.open_session(encoding="f32le") as session:
         sent = Stream(session)

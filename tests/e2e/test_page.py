@@ -488,13 +488,6 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
 @pytest.mark.parametrize(
     ("name", "content", "english", "chinese"),
     [
-        ("empty.wav", b"", "empty.wav: the file is empty", "empty.wav：文件是空的，请重新录制"),
-        (
-            "text.mp3",
-            b"hello",
-            "text.mp3: cannot read audio: this is text",
-            "无法读取声音：这是文本",
-        ),
         ("broken.wav", b"RIFF" + bytes(40), "the file is damaged or cut off", "文件损坏或不完整"),
         ("silent.wav", None, "silent.wav: no speech was found; it is silent", "文件是静音的"),
     ],

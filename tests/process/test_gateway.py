@@ -342,7 +342,7 @@ async def test_malformed_messages_do_not_disturb_other_clients(
 
 
 @async_test
-async def test_the_sample_sentence_is_played_once_until_sigterm_closes_the_viewers(
+async def test_the_sample_sentence_plays_once_and_sigterm_closes_viewers(
     own_control: FakeControl, own_gateway: Gateway
 ) -> None:
     control = own_control

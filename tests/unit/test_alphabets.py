@@ -66,7 +66,7 @@ def test_a_final_of_mandarin_is_several_letters_of_ipa() -> None:
     assert [p.onset_s for p in phones] == pytest.approx([0.0, 0.1, 0.1333, 0.1667], abs=1e-3)
 
 
-def test_a_language_without_universal_phones_has_only_its_own() -> None:
+def test_a_language_without_universal_phones_has_no_ipa() -> None:
     inventory = small()
     assert [p.symbol for p in respell(spoken("m a"), inventory)] == ["m", "a"]
     with pytest.raises(UserError, match="language small does not list universal phones"):

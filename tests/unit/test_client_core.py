@@ -95,7 +95,7 @@ def sequences(connection: FakeConnection) -> list[int]:
     return [fields["sequence"] for _, fields in connection.sent]
 
 
-def test_names_of_shapes_are_those_of_the_product() -> None:
+def test_client_and_product_have_the_same_shape_names() -> None:
     assert {name: shapes.names for name, shapes in SHAPE_SETS.items()} == SHAPE_NAMES
 
 

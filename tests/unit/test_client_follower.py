@@ -95,7 +95,7 @@ def test_follows_a_move_to_another_publisher() -> None:
     assert not old.is_open
 
 
-def test_returns_a_message_once_if_two_connections_deliver_it_in_any_order() -> None:
+def test_drops_copies_from_a_second_connection() -> None:
     scene = Scene().complete()
     old = scene.connection
     for _ in range(2):  # it connects again, and once more before that is complete

@@ -61,7 +61,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     return Scene(monkeypatch)
 
 
-def test_a_budget_recovers_up_to_its_start_and_a_blocked_one_only_later() -> None:
+def test_a_budget_recovers_and_a_blocked_one_recovers_later() -> None:
     now_s = 100.0
     budget = Budget(clock=lambda: now_s)
     budget.spend(BUDGET + BUDGET_PER_S)
@@ -88,7 +88,7 @@ def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
     assert not honest.is_cut
 
 
-def test_does_not_wake_the_loop_for_a_message_that_is_known_to_be_incomplete(scene: Scene) -> None:
+def test_does_not_wake_the_loop_for_an_incomplete_message(scene: Scene) -> None:
     scene.limiter.waker = waker = mock.Mock()
     scene.deliver(1)
     scene.enforce_limits(0.0)

@@ -64,7 +64,7 @@ def test_rejects_files_that_others_can_read_or_own(name: str) -> None:
         (user_key(), read_grants())
 
 
-def test_names_a_file_that_is_not_a_key_and_a_folder_that_cannot_be_created(
+def test_names_an_invalid_key_file_and_an_unusable_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     user_key()

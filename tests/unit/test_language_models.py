@@ -25,7 +25,7 @@ SAMPLES = read_audio(VOWELS_FILE)[0][:, 0]
 SOUND = ROOT / "shared" / "demo" / "hello-female.wav"
 
 
-def test_mandarin_has_a_model_of_its_own() -> None:
+def test_mandarin_has_its_own_model() -> None:
     models = (
         model_of_language(),
         model_of_language("mandarin", "gmm"),

@@ -26,7 +26,7 @@ def test_raises_the_session_only_if_the_process_leads_it(
     priority.raise_priority()
 
 
-def test_compiled_functions_go_to_a_temporary_folder_if_no_other_can_be_written(
+def test_compiles_into_a_temporary_folder_if_no_other_is_writable(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

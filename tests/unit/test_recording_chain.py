@@ -36,7 +36,7 @@ def test_dynamic_visemes_are_the_full_model() -> None:
     assert len(made) == num_frames + 15, "and the way to rest"
 
 
-def test_of_a_known_text_every_closing_lip_shuts_and_vowels_are_open() -> None:
+def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:
     samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
     model = load_model()
     aligned = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")

@@ -60,10 +60,6 @@ def test_every_step_names_code_that_exists_and_a_command() -> None:
     assert {name for part in TABLES.values() for name in part.steps} | {"lips"} == {*STEPS}
 
 
-def test_the_page_has_at_most_ten_tables() -> None:
-    assert len(TABLES) <= 10
-
-
 def test_a_step_runs_only_if_its_code_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,7 +190,7 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert (tmp_path / "lookahead.png").stat().st_size > 1000
 
 
-def test_languages_have_a_row_for_each_recognizer_and_hama_comes_first_if_better() -> None:
+def test_the_table_of_languages_has_a_row_per_recognizer() -> None:
     def score(feature: float, **more: Any) -> dict[str, Any]:
         rates = {"phone": 0.3, "viseme": 0.2, "feature": feature}
         final: dict[str, Any] = {f"{unit}_error_rate": rate for unit, rate in rates.items()}

@@ -148,7 +148,7 @@ def test_names_a_missing_service(system: System, service: str) -> None:
         system.open()
 
 
-def test_places_a_worker_of_an_unknown_kind_that_another_worker_needs(system: System) -> None:
+def test_places_a_needed_worker_of_an_unknown_kind(system: System) -> None:
     system.lose("synthesizer-1")
     system.add(replace(worker("synthesizer", "synthesizer-1"), needs=["gaze"]))
     with pytest.raises(Refusal, match="provides 'gaze'"):
@@ -265,7 +265,7 @@ def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
     assert system.sessions.record_started(record, last, 0) == set()
 
 
-def test_a_recognizer_that_is_lost_before_it_starts_is_not_told_to_start(system: System) -> None:
+def test_does_not_start_a_recognizer_that_is_lost(system: System) -> None:
     record = system.open()
     system.lose("synthesizer-1")
     system.add(worker("synthesizer", "synthesizer-2"))

@@ -86,7 +86,7 @@ def test_the_first_readout_and_the_caches_do_not_change() -> None:
                 scored.append_outputs(*(array[0] for array in arrays))
 
 
-def test_features_for_training_are_those_of_the_network() -> None:
+def test_training_uses_the_features_of_the_network() -> None:
     encoder, _ = networks()
     laid = layout(len(FRAMES) // 2, BLOCK_LENGTH, RIGHT_CONTEXT)
     repeated = np.concatenate([FRAMES, FRAMES[-1:]])

@@ -1,6 +1,7 @@
 """Learning viseme parameters, on made-up speakers."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,20 +57,9 @@ def test_estimates_the_parameters_behind_curves() -> None:
     assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
 
 
-def write_clip(
-    folder: Path, name: str, language: str, header: str, row: str, license_name: str = "MIT"
-) -> None:
-    (folder / f"{name}.json").write_text(
-        json.dumps(
-            {
-                "language": language,
-                "speaker": "one",
-                "licence": license_name,
-                "transcript": "",
-                "energy_r": float("nan"),  # not used
-            }
-        )
-    )
+def write_clip(folder: Path, name: str, language: str, header: str, row: str) -> None:
+    about = {"language": language, "speaker": "one", "licence": "MIT", "energy_r": math.nan}
+    (folder / f"{name}.json").write_text(json.dumps(about))  # the last one is not used
     (folder / f"{name}.csv").write_text(f"{header}\n{row}\n")
     soundfile.write(folder / f"{name}.flac", np.zeros(1600), 16_000)
 

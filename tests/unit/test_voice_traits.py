@@ -108,7 +108,7 @@ def test_laughter_and_breath_need_evidence_and_do_not_flicker() -> None:
     assert not breath[-1].is_laughter
 
 
-def test_laughter_ends_in_silence_and_speech_although_the_state_remembers_it() -> None:
+def test_silence_and_speech_end_laughter() -> None:
     laughs = [0, 0, 0.8, 0]
     for after in (Voice.NONE, Voice.SPEECH):
         seen = traits_of((2.0, Voice.LAUGHTER, laughs), (3.0, after, laughs))
