@@ -12,6 +12,7 @@ import numpy as np
 from aiohttp import web
 
 from kouxing.services.gateway import wire
+from kouxing.services.gateway.http import error_response
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.senders import Senders
 from kouxing.services.senders.target import Target, parse_delay_s
@@ -70,11 +71,10 @@ class SendersApi:
             elif isinstance(delay_ms, int | float):
                 self._senders.set_delay(parse_delay_s(delay_ms))
             else:
-                raise UserError(
-                    "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
-                )
+                text = "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
+                raise UserError(text)
         except UserError as error:
-            return web.json_response({"error": str(error)}, status=422)
+            return error_response(error, "bad-address")
         return self._state()
 
     def _allowed_target(self, url: str) -> Target:
@@ -82,7 +82,8 @@ class SendersApi:
         if not (target.is_local or url in self._configured):
             raise UserError(
                 f"{target.host} is another machine; add the address to gateway.senders, "
-                "or use 'kouxing send'"
+                "or use 'kouxing send'",
+                "other-machine",
             )
         return target
 

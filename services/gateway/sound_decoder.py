@@ -1,4 +1,7 @@
-"""The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output."""
+"""The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output.
+
+An error is printed as its code, a tab and its text; otherwise the remarks are printed.
+"""
 
 import resource
 import sys
@@ -40,5 +43,5 @@ if __name__ == "__main__":
     try:
         decode(Path(sys.argv[1]))
     except UserError as error:
-        print(error, file=sys.stderr)
+        print(error.code, error, sep="\t", file=sys.stderr)
         sys.exit(USER_ERROR)

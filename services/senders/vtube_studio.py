@@ -15,7 +15,7 @@ from typing import Any
 
 import aiohttp
 
-from kouxing.services.senders.connection import RETRY_S, Connection
+from kouxing.services.senders.connection import RETRY_S, Connection, Problem
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
@@ -39,7 +39,7 @@ class VTubeStudioProtocol:
     """The messages of one connection, without I/O.
 
     ``token`` is from an earlier connection; if it is empty, VTube Studio asks the user. Frames may
-    be sent while ``is_ready``. ``problem`` is a text for the user, or empty.
+    be sent while ``is_ready``.
     """
 
     def __init__(self, token: str, save_token: Callable[[str], None]) -> None:
@@ -47,13 +47,14 @@ class VTubeStudioProtocol:
         self._save_token = save_token
         self._known: frozenset[str] = frozenset()
         self.is_ready = False
-        self.problem = ""
+        self.problem = Problem()
 
     def first_message(self) -> str:
         """Return the first message."""
         if self._token:
             return _request("AuthenticationRequest", **PLUGIN, authenticationToken=self._token)
-        self.problem = "VTube Studio asks whether kouxing may move the model: press Allow there"
+        text = "VTube Studio asks whether kouxing may move the model: press Allow there"
+        self.problem = Problem(text, "vts-asks")
         return _request("AuthenticationTokenRequest", **PLUGIN)
 
     def reply(self, text: str) -> str:
@@ -74,7 +75,8 @@ class VTubeStudioProtocol:
             }
             return handlers[kind](data) if kind in handlers else ""
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise UserError("the program at this address is not VTube Studio") from None
+            text = "the program at this address is not VTube Studio"
+            raise UserError(text, "vts-unknown") from None
 
     def frame_message(self, frame: FaceFrame, *, is_mouth_only: bool) -> str:
         """Return the message that shows a frame."""
@@ -99,7 +101,7 @@ class VTubeStudioProtocol:
         if not data["authenticated"]:  # the user revoked it
             self._token = ""
             return self.first_message()
-        self.problem = ""
+        self.problem = Problem()
         return _request("InputParameterListRequest")
 
     def _on_parameters(self, data: Any) -> str:
@@ -109,24 +111,25 @@ class VTubeStudioProtocol:
         return ""
 
     def _on_parameters_injected(self, _data: Any) -> str:
-        self.problem = ""
+        self.problem = Problem()
         return ""
 
     def _on_error(self, data: Any) -> str:
-        number, text = data["errorID"], str(data["message"])[:200]
+        number, problem = data["errorID"], Problem(str(data["message"])[:200])
         if number == _DENIED:
-            raise AccessDenied(
-                "access to VTube Studio was denied; stop and start sending to be asked again"
-            )
+            text = "access to VTube Studio was denied; stop and start sending to be asked again"
+            raise AccessDenied(text, "vts-denied")
         if number == _ACCESS_OFF:
             text = "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings"
+            problem = Problem(text, "vts-off")
         elif number == _ASKING:
-            text = self.problem  # it still shows the window of an earlier connection
+            problem = self.problem  # it still shows the window of an earlier connection
         elif number == _IN_USE:
-            text = f"another plugin sets the same parameters: {text}"
+            text = f"another plugin sets the same parameters: {problem.text}"
+            problem = Problem(text, "vts-in-use")
         if not self.is_ready or number == _UNAUTHENTICATED:  # the token may have been revoked
-            raise UserError(text)
-        self.problem = text
+            raise UserError(*problem)
+        self.problem = problem
         return ""
 
 
@@ -209,16 +212,18 @@ class VTubeStudioConnection(Connection):
             while True:
                 try:
                     await self._run_connection(http)
-                    self.problem = "VTube Studio closed the connection; trying again"
+                    text = "VTube Studio closed the connection; trying again"
+                    self.problem = Problem(text, "vts-closed")
                 except UserError as error:
-                    self.problem = str(error)
+                    self.problem = Problem(str(error), error.code)
                     if isinstance(error, AccessDenied):
                         return
                 except (aiohttp.ClientError, OSError, TimeoutError):
-                    self.problem = (
+                    text = (
                         f"no VTube Studio at {self._address}: start it, and turn on "
                         "'Start API (allow plugins)' in its settings"
                     )
+                    self.problem = Problem(text, "vts-missing")
                 finally:
                     self._is_ready = False
                 await asyncio.sleep(RETRY_S)
