@@ -7,13 +7,13 @@ memory. Deleting it is always safe.
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rich.progress import track
 
 from kouxing.corpora.parallel import process_in_order
@@ -33,6 +33,18 @@ def cache_folder() -> Path:
     folder = Path(base) / "kouxing"
     folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+def kept_arrays(
+    path: Path, compute: Callable[[], Mapping[str, ArrayLike]]
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays in a file (.npz). If it does not exist, compute and write it first."""
+    if not path.exists():
+        unfinished = path.with_suffix(".part.npz")
+        np.savez(unfinished, allow_pickle=False, **compute())
+        unfinished.replace(path)
+    with np.load(path, allow_pickle=False) as file:
+        return dict(file)
 
 
 def read_audio(path: Path) -> NDArray[np.float32]:

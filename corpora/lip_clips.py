@@ -13,7 +13,8 @@ folder names further clips and speakers to hold out.
 import csv
 import itertools
 import zlib
-from collections.abc import Collection, Iterable
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +40,7 @@ Array = NDArray[np.float64]
 SAMPLE_RATE_HZ = 16_000
 _MAX_BYTES = 64 << 20  # limit for a table
 _MAX_ROWS = 1_000_000
+_FULL_PERCENTILE = 98.0
 _FILMED = "tracked video"  # start of the kind of a filmed clip
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
@@ -242,6 +244,23 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
     for right, left in MIRROR.items():
         faps[:, MOUTH_FAPS.index(right)] = faps[:, MOUTH_FAPS.index(left)]
     return faps
+
+
+def openings_of(
+    speakers: Sequence[str], mouths: Sequence[Array]
+) -> tuple[list[Array], dict[str, float]]:
+    """Return the opening of each frame of mouth FAPs, and each speaker's widest one, FAP units.
+
+    The widest opening is the 98th percentile of all frames of a speaker, at least 1.
+    """
+    openings = [-faps[:, columns((4, 5))].sum(axis=1) for faps in mouths]
+    by_speaker: dict[str, list[Array]] = defaultdict(list)
+    for speaker, opening in zip(speakers, openings, strict=True):
+        by_speaker[speaker].append(opening)
+    return openings, {
+        speaker: max(float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE)), 1.0)
+        for speaker, group in by_speaker.items()
+    }
 
 
 def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:

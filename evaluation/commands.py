@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from kouxing.evaluation.system.commands import SENTENCE, AudioFile
+from kouxing.evaluation.system.commands import SENTENCE, attacks, faults
 from kouxing.shared.terminal import (
-    CONSOLE,
     Force,
     JsonFile,
     check_output,
@@ -68,7 +67,6 @@ def recognizer(
     grouped by speaking rate. The JSON file also contains figures by speaker and for other output
     rules.
     """
-    from kouxing.corpora.speech_corpus import RowErrors
     from kouxing.evaluation.recognizer.disturbances import (
         check_conditions,
         disturbances_for,
@@ -82,15 +80,13 @@ def recognizer(
     check_conditions(condition or ())
     models = list(_models(acoustic))
     music = music_from(_read_sounds(sounds))
-    errors = RowErrors()
-    references = align_corpus(models[0][1], manifest, split, errors, audio)
+    references = align_corpus(models[0][1], manifest, split, audio)
     disturbances = disturbances_for(references, music, condition or ())
     results = {
         name: {"split": split, **evaluate_recognizer(model, references, disturbances, rule)}
         for name, model, rule in models
     }
     print_figures(results, split, Console())
-    errors.report_to(print_message)
     write_json(json_file, results)
 
 
@@ -111,18 +107,16 @@ def languages(
 
     Each recording is recognized twice: with no language chosen, and with its own language.
     """
-    from kouxing.corpora.speech_corpus import LANGUAGES, RowErrors
+    from kouxing.corpora.speech_corpus import LANGUAGES
     from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
     from kouxing.evaluation.recognizer.references import align_corpus
 
     manifest = manifest or LANGUAGES
     check_output(json_file, inputs=[manifest], force=force)
     ((_, model, rule),) = _models(["universal"])
-    errors = RowErrors()
-    references = align_corpus(model, manifest, "test", errors, audio)
+    references = align_corpus(model, manifest, "test", audio)
     results = evaluate_languages(references, rule, with_hama=hama)
     print_languages(results, Console())
-    errors.report_to(print_message)
     write_json(json_file, results)
 
 
@@ -141,7 +135,6 @@ def voice(
     The audio consists of clean and disturbed speech, held-out sounds, and synthesized voices and
     noises.
     """
-    from kouxing.corpora.speech_corpus import RowErrors
     from kouxing.evaluation.recognizer.disturbances import (
         BABBLE,
         MUSIC,
@@ -155,12 +148,10 @@ def voice(
     models = {name: model for name, model, _ in _models(acoustic)}
     recorded = _read_sounds(sounds)
     music = music_from(recorded)
-    errors = RowErrors()
-    references = align_corpus(next(iter(models.values())), manifest, split, errors, audio)
+    references = align_corpus(next(iter(models.values())), manifest, split, audio)
     disturbances = disturbances_for(references, music, (MUSIC, BABBLE))
     results = evaluate_voice(models, materials_of(references, disturbances, music, recorded))
     print_voice(results, split, Console())
-    errors.report_to(print_message)
     write_json(json_file, results)
 
 
@@ -462,49 +453,8 @@ def visemes(
     write_json(json_file, {"clips": names, "errors": [asdict(error) for error in errors]})
 
 
-@app.command()
-def attacks(
-    audio: AudioFile = SENTENCE,
-    attack: Annotated[
-        list[str] | None, typer.Option(help="Name of an attack; repeatable. Default: all.")
-    ] = None,
-    json_file: JsonFile = None,
-    force: Force = False,
-) -> None:
-    """Measure what attackers cost the services (memory) and other clients (delay)."""
-    from kouxing.evaluation.system.attacks import measure, show
-
-    check_output(json_file, force=force)
-    damages = measure(audio, attack or (), CONSOLE)
-    show(damages, Console())
-    write_json(json_file, [asdict(damage) for damage in damages])
-
-
-@app.command()
-def faults(
-    audio: AudioFile = SENTENCE,
-    fault: Annotated[
-        list[str] | None, typer.Option(help="Name of a fault; repeatable. Default: all.")
-    ] = None,
-    logs: Annotated[Path | None, typer.Option(help="Folder for the services' logs.")] = None,
-    json_file: JsonFile = None,
-    force: Force = False,
-) -> None:
-    """Measure how faults affect a live face: how long it stops, lost frames, and jumps.
-
-    Faults on this machine: "none", "recognizer killed", "recognizer stopped", "recognizer hangs",
-    the same for "synthesizer", each of these also with ", one more" worker of the same kind,
-    "control killed", "busy machine" and "16 sessions".
-
-    Faults between hosts: "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut
-    off for 2 s", "hosts, recognizer gone for good, one more" and the same for "synthesizer".
-    """
-    from kouxing.evaluation.system.faults import TIMING, measure, show
-
-    check_output(json_file, force=force)
-    outcomes = list(measure(audio, fault or (), logs, CONSOLE, TIMING))
-    show(outcomes, Console())
-    write_json(json_file, [asdict(outcome) for outcome in outcomes])
+app.command()(attacks)
+app.command()(faults)
 
 
 @plot_app.callback()

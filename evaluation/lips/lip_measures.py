@@ -12,7 +12,7 @@ from kouxing.evaluation.lips.closure_measures import (
     labials_shut,
     share_shut,
 )
-from kouxing.evaluation.lips.effort_measures import effort_correlation, speech_lip_intensity
+from kouxing.evaluation.lips.effort import effort_correlation, speech_lip_intensity
 from kouxing.evaluation.lips.in_speech import correlation_in_speech, turns_per_s
 from kouxing.evaluation.lips.mouths import CURVES
 from kouxing.evaluation.lips.phone_spread import phone_correlation, phone_spread

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, openings_of, read_clips
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
@@ -56,7 +56,6 @@ Samples = NDArray[np.float32]
 Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
 RATES = (0.8, 1.0, 1.5, 2.0)
-_FULL_PERCENTILE = 98.0
 _MIN_MOUTHS = 3
 _LIP_COLUMNS = [
     column
@@ -147,13 +146,7 @@ def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
 def scale_openings(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
     """Scale FAPs (num_frames, num_mouth_faps) so that every speaker's widest opening is R = 5."""
     full = -float(faps_of([MAX_OPENING])[0, _MIDDLES].sum())
-    openings: dict[str, list[Array]] = defaultdict(list)
-    for speaker, faps in zip(speakers, mouths, strict=True):
-        openings[speaker].append(-faps[:, _MIDDLES].sum(axis=1))
-    widest = {
-        speaker: max(float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE)), 1.0)
-        for speaker, group in openings.items()
-    }
+    _, widest = openings_of(speakers, mouths)
     return [faps * full / widest[speaker] for speaker, faps in zip(speakers, mouths, strict=True)]
 
 

@@ -18,7 +18,7 @@ from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.terminal import CONSOLE
+from kouxing.shared.terminal import CONSOLE, print_message
 
 _RATES = (4.0, 5.5, 7.0)  # limits of the classes of speaking rates, syllables per second
 RATE_NAMES = (
@@ -49,14 +49,13 @@ class Reference:
 
 
 def align_corpus(
-    model: AcousticModel, corpus: Path, split: str, errors: RowErrors, audio: Path | None = None
+    model: AcousticModel, corpus: Path, split: str, audio: Path | None = None
 ) -> list[Reference]:
     """Align the recordings of one split of a corpus in the model's language.
 
-    ``errors`` receives the rows that cannot be used. Raises UserError if the split has no usable
-    recording.
+    Prints the rows that cannot be used. Raises UserError if the split has no usable recording.
     """
-    references = []
+    references, errors = [], RowErrors()
     utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
     for utterance in track(utterances, f"aligning {split}", console=CONSOLE, transient=True):
         try:
@@ -69,4 +68,5 @@ def align_corpus(
         references.append(Reference(utterance, spoken(phones, model.inventory)))
     if not references:
         raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
+    errors.report_to(print_message)
     return references

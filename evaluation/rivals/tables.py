@@ -109,7 +109,7 @@ def find_installed(name: str) -> Path:
 
 
 def find_node() -> str:
-    """Return the Node next to Python, or else on the path; UserError if there is none."""
+    """Return the Node next to Python, or else on the path. Raises UserError if Node is missing."""
     node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
     if node is None:
         raise UserError("other lip-sync programs need Node: pip install 'kouxing[page]'")

@@ -1,4 +1,4 @@
-"""The commands ``kouxing bench``."""
+"""The commands ``kouxing bench``, and ``attacks`` and ``faults`` of ``kouxing evaluate``."""
 
 from __future__ import annotations
 
@@ -159,3 +159,46 @@ def busy(
     if picture is not None:
         save_figure(draw(figures), picture)
     write_json(json_file, asdict(figures) | {"summary": [run.summary for run in figures.runs]})
+
+
+def attacks(
+    audio: AudioFile = SENTENCE,
+    attack: Annotated[
+        list[str] | None, typer.Option(help="Name of an attack; repeatable. Default: all.")
+    ] = None,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure what attackers cost the services (memory) and other clients (delay)."""
+    from kouxing.evaluation.system.attacks import measure, show
+
+    check_output(json_file, force=force)
+    damages = measure(audio, attack or (), CONSOLE)
+    show(damages, Console())
+    write_json(json_file, [asdict(damage) for damage in damages])
+
+
+def faults(
+    audio: AudioFile = SENTENCE,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Name of a fault; repeatable. Default: all.")
+    ] = None,
+    logs: Annotated[Path | None, typer.Option(help="Folder for the services' logs.")] = None,
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Measure how faults affect a live face: how long it stops, lost frames, and jumps.
+
+    Faults on this machine: "none", "recognizer killed", "recognizer stopped", "recognizer hangs",
+    the same for "synthesizer", each of these also with ", one more" worker of the same kind,
+    "control killed", "busy machine" and "16 sessions".
+
+    Faults between hosts: "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut
+    off for 2 s", "hosts, recognizer gone for good, one more" and the same for "synthesizer".
+    """
+    from kouxing.evaluation.system.faults import TIMING, measure, show
+
+    check_output(json_file, force=force)
+    outcomes = list(measure(audio, fault or (), logs, CONSOLE, TIMING))
+    show(outcomes, Console())
+    write_json(json_file, [asdict(outcome) for outcome in outcomes])

@@ -52,8 +52,8 @@ def test_listed_recordings_have_phones_and_a_language() -> None:
 def test_measures_each_recognizer_by_language(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    manifest, errors = write_manifest(tmp_path), RowErrors()
-    references = align_corpus(model_of_language("universal"), manifest, "test", errors)
+    manifest = write_manifest(tmp_path)
+    references = align_corpus(model_of_language("universal"), manifest, "test")
     monkeypatch.setattr(
         languages, "_run_hama", lambda english: iter([("n", "i", "h", "a", "uh"), ()])
     )

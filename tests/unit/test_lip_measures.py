@@ -15,7 +15,6 @@ from kouxing.evaluation.lips import (
     closure_measures,
     curves,
     effort,
-    effort_measures,
     extrema,
     in_speech,
     phone_spread,
@@ -193,8 +192,8 @@ def test_louder_clips_have_wider_and_faster_lips() -> None:
         takes.append(Take(louder, mouth_of(extent * (np.arange(200.0) % 2))))
     level_db = 20 * np.log10([1.0, 2.0, 3.0])
     r_db = np.corrcoef(level_db, [100.0, 300.0, 200.0])[0, 1]
-    assert effort_measures.effort_correlation(takes) == pytest.approx(r_db)
-    assert effort_measures.speech_lip_intensity(takes) == pytest.approx(0.5)
+    assert effort.effort_correlation(takes) == pytest.approx(r_db)
+    assert effort.speech_lip_intensity(takes) == pytest.approx(0.5)
 
 
 def test_matched_extrema_of_a_late_mouth() -> None:

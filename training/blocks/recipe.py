@@ -15,13 +15,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats, as_integers
+from kouxing.corpora.feature_cache import as_floats, as_integers, kept_arrays
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors
@@ -65,29 +66,23 @@ class _Labeled:
     topology: Topology
     log_prior: NDArray[np.float32]  # (states,)
 
-    def save(self, path: Path) -> None:
-        """Write a file, so that training can resume."""
+    def arrays(self) -> dict[str, ArrayLike]:
+        """Return the contents of a file, so that training can resume."""
         targets = [recording.targets for recording in self.recordings]
-        unfinished = path.with_suffix(".part.npz")
-        np.savez(
-            unfinished,
-            allow_pickle=False,
+        return {
             **topology_arrays(self.topology),
-            log_prior=self.log_prior,
-            samples=np.concatenate([recording.samples for recording in self.recordings]),
-            num_samples=[len(recording.samples) for recording in self.recordings],
-            states=np.concatenate([one.states for one in targets]),
-            probs=np.concatenate([one.probs for one in targets]),
-            num_frames=[len(one) for one in targets],
-            weights=[recording.weight for recording in self.recordings],
-        )
-        unfinished.replace(path)
+            "log_prior": self.log_prior,
+            "samples": np.concatenate([recording.samples for recording in self.recordings]),
+            "num_samples": [len(recording.samples) for recording in self.recordings],
+            "states": np.concatenate([one.states for one in targets]),
+            "probs": np.concatenate([one.probs for one in targets]),
+            "num_frames": [len(one) for one in targets],
+            "weights": [recording.weight for recording in self.recordings],
+        }
 
     @classmethod
-    def load(cls, path: Path) -> _Labeled:
-        """Read a file of :meth:`save`."""
-        with np.load(path, allow_pickle=False) as file:
-            kept = {name: file[name] for name in file.files}
+    def of(cls, kept: dict[str, NDArray[Any]]) -> _Labeled:
+        """Restore the object from :meth:`arrays`."""
         samples = np.split(kept["samples"], np.cumsum(kept["num_samples"])[:-1])
         bounds = np.cumsum(kept["num_frames"])[:-1]
         states, probs = np.split(kept["states"], bounds), np.split(kept["probs"], bounds)
@@ -128,7 +123,8 @@ def train_blocks(
         corpora, errors, before.inventory, shipping=shipping, with_samples=True
     )
     labels, checkpoint = (output.with_suffix(end) for end in (".labels.npz", ".network.pt"))
-    if not labels.exists():
+
+    def compute_labels() -> dict[str, ArrayLike]:
         aligned, recordings = label(
             examples,
             untranscribed,
@@ -142,8 +138,9 @@ def train_blocks(
         statistics = statistics_of(
             [one.alignment for one in aligned], weights, before.topology.phone_lm
         )
-        _Labeled([*recordings, *_sung_copies(recordings, seed)], *statistics).save(labels)
-    labeled = _Labeled.load(labels)
+        return _Labeled([*recordings, *_sung_copies(recordings, seed)], *statistics).arrays()
+
+    labeled = _Labeled.of(kept_arrays(labels, compute_labels))
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
     readout = BlockReadout(whole.shape.width * len(whole.kept_layers), num_states, READOUT)

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats, as_integers
+from kouxing.corpora.feature_cache import as_floats, as_integers, kept_arrays
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.ear import Voice
@@ -118,7 +118,7 @@ class TargetStore:
         self.num_chunks = -(-len(recordings) // CHUNK_SIZE)
         folder.mkdir(parents=True, exist_ok=True)
         self._check_key()
-        self._basis = self._load_basis()
+        self._basis = kept_arrays(folder / "basis.npz", self._compute_basis)
 
     @property
     def lips_mean(self) -> Floats:
@@ -152,26 +152,20 @@ class TargetStore:
                 f"{self._folder} contains targets of other recordings or models; delete it"
             )
 
-    def _load_basis(self) -> dict[str, Floats]:
-        """Load the bases of components and lips, or compute them from the first recordings."""
-        path = self._folder / "basis.npz"
-        if not path.exists():
-            speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
-            sounds = [sound for one in speech for sound in _cut(one)]
-            computed = process_in_order(self._teachers.compute_targets, sounds)
-            features = [TeacherFeatures(outputs.encoder, outputs.phones) for outputs in computed]
-            encoder = np.concatenate([one.encoder for one in features])
-            lips = np.concatenate([self._lip_teacher.lips_of(one) for one in features])
-            basis = {
-                "encoder_mean": encoder.mean(axis=0),
-                "encoder": _components_of(encoder - encoder.mean(axis=0)),
-                "lips_mean": lips.mean(axis=0),
-                "lips_deviation": lips.std(axis=0),
-            }
-            np.savez(path.with_suffix(".part.npz"), allow_pickle=False, **basis)
-            path.with_suffix(".part.npz").replace(path)
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+    def _compute_basis(self) -> dict[str, Floats]:
+        """Compute the bases of components and lips from the first recordings."""
+        speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
+        sounds = [sound for one in speech for sound in _cut(one)]
+        computed = process_in_order(self._teachers.compute_targets, sounds)
+        features = [TeacherFeatures(outputs.encoder, outputs.phones) for outputs in computed]
+        encoder = np.concatenate([one.encoder for one in features])
+        lips = np.concatenate([self._lip_teacher.lips_of(one) for one in features])
+        return {
+            "encoder_mean": encoder.mean(axis=0),
+            "encoder": _components_of(encoder - encoder.mean(axis=0)),
+            "lips_mean": lips.mean(axis=0),
+            "lips_deviation": lips.std(axis=0),
+        }
 
     def _file(self, chunk: int, name: str) -> Path:
         return self._folder / f"{chunk:04}.{name}.npy"

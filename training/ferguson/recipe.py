@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, openings_of, read_clips
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
 from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
 from kouxing.services.synthesizer.lips.ferguson.key_frames import anchors_of
@@ -133,7 +132,6 @@ def _means(
     return means
 
 
-_FULL_PERCENTILE = 98.0  # percentile of a speaker's opening, where R is 5
 _OPENING_RIDGE = 10.0  # weight of the value from a phone's visemes, video frames
 _CLOSED = (REST, "b")  # visemes whose lips touch
 _DEFAULT_OPENING = 2.0  # opening of a viseme without data
@@ -144,16 +142,9 @@ def relative_openings(clips: Sequence[LipClip]) -> list[Array]:
 
     R is 0 for a closed mouth and 5 for the speaker's widest.
     """
-    openings = [-clip.faps[:, columns((4, 5))].sum(axis=1) for clip in clips]
-    of_speaker: dict[str, list[Array]] = defaultdict(list)
-    for clip, opening in zip(clips, openings, strict=True):
-        of_speaker[clip.speaker].append(opening)
-    widest = {
-        speaker: float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE))
-        for speaker, group in of_speaker.items()
-    }
+    openings, widest = openings_of([clip.speaker for clip in clips], [clip.faps for clip in clips])
     return [
-        np.clip(MAX_OPENING * opening / max(widest[clip.speaker], 1.0), 0.0, MAX_OPENING)
+        np.clip(MAX_OPENING * opening / widest[clip.speaker], 0.0, MAX_OPENING)
         for clip, opening in zip(clips, openings, strict=True)
     ]
 

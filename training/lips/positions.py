@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.feature_cache import cache_folder
+from kouxing.corpora.feature_cache import cache_folder, kept_arrays
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.positions import record_positions
 from kouxing.services.recognizer.ear import EAR_PATH
@@ -66,18 +66,16 @@ def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
 def _positions(of_ear: hashlib._Hash, samples: Floats) -> dict[str, NDArray[Any]]:
     key = of_ear.copy()
     key.update(samples.tobytes())
-    path = cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz"
-    if not path.is_file():
+
+    def compute() -> dict[str, NDArray[Any]]:
         recorded = record_positions(samples)
-        np.savez(
-            path,
-            allow_pickle=False,
-            starts=np.array(recorded.starts, dtype=np.int64),
-            known_s=np.array(recorded.known_s, dtype=np.float64),
-            features=np.array(recorded.features, dtype=np.float16),
-        )
-    with np.load(path, allow_pickle=False) as kept:
-        return dict(kept)
+        return {
+            "starts": np.array(recorded.starts, dtype=np.int64),
+            "known_s": np.array(recorded.known_s, dtype=np.float64),
+            "features": np.array(recorded.features, dtype=np.float16),
+        }
+
+    return kept_arrays(cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz", compute)
 
 
 def features_of(speech: Sequence[Speech]) -> Floats:

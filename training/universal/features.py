@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.feature_cache import kept_arrays, read_audio
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks.network import MAX_DEVIATIONS
@@ -60,21 +60,20 @@ class FeatureStore:
 
     def standardize(self, recordings: Sequence[Utterance]) -> None:
         """Set mean and deviation to those of some recordings, or read them."""
-        path = self._folder / "standard.npz"
-        if not path.exists():
-            rng = np.random.default_rng(0)
+
+        def compute() -> dict[str, NDArray[np.float32]]:
             size = min(_NUM_STANDARDIZED, len(recordings))
-            chosen = rng.choice(len(recordings), size, replace=False)
             features = []
-            for number in chosen:
+            for number in np.random.default_rng(0).choice(len(recordings), size, replace=False):
                 frames = _frames_of(recordings[number])
                 (rows,) = self._encoder.encode([frames])
                 positions = rows[:, :BLOCK_LENGTH].reshape(-1, WIDTH)[: len(frames) // 2]
                 features.append(positions.astype(np.float32))
             joined = np.concatenate(features)
-            np.savez(path, mean=joined.mean(axis=0), deviation=joined.std(axis=0) + 1e-3)
-        with np.load(path, allow_pickle=False) as file:
-            self.mean, self.deviation = file["mean"], file["deviation"]
+            return {"mean": joined.mean(axis=0), "deviation": joined.std(axis=0) + 1e-3}
+
+        kept = kept_arrays(self._folder / "standard.npz", compute)
+        self.mean, self.deviation = kept["mean"], kept["deviation"]
 
     def read(self, recordings: Sequence[Utterance]) -> Iterator[Features]:
         """Yield the features of recordings, computed if they are missing."""

@@ -1,15 +1,17 @@
 """Trains the universal readout from corpora, and writes its model card."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kouxing.corpora.feature_cache import kept_arrays
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
@@ -25,7 +27,7 @@ from kouxing.training.phone_lm.recipe import estimate_phone_lm, stream_of
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
 from kouxing.training.universal.export import extension_of
-from kouxing.training.universal.features import LAYERS, FeatureStore
+from kouxing.training.universal.features import LAYERS, Features, FeatureStore
 from kouxing.training.universal.recordings import TrainingSet, read_training_set
 from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
 
@@ -67,7 +69,9 @@ def train_universal(
         one.utterance_id: weight for one, weight in zip(data.recordings, data.weights, strict=True)
     }
     aligner = Aligner(by_name, inventory)
-    states = _saved(output.with_suffix(".states.npz"), partial(aligner.align, stored, seed))
+    kept = kept_arrays(states_file, partial(_aligned_states, aligner, stored, seed))
+    pieces = np.split(kept["states"].astype(np.int64), np.cumsum(kept["lengths"])[:-1])
+    states = dict(zip(kept["names"].tolist(), pieces, strict=True))
     aligned = [one for one in stored if one.name in states]
     readout = train_readout(
         new_readout(STATES_PER_PHONE * len(inventory)),
@@ -97,20 +101,16 @@ def train_universal(
     shutil.rmtree(folder)
 
 
-def _saved(
-    path: Path, compute: Callable[[], dict[str, NDArray[np.int64]]]
-) -> dict[str, NDArray[np.int64]]:
-    """Read the states of the frames by recording, or compute and write them."""
-    if not path.exists():
-        unfinished = path.with_suffix(".part.npz")
-        states = compute()
-        lengths = np.array([len(one) for one in states.values()])
-        joined = np.concatenate(list(states.values())).astype(np.int16)
-        np.savez(unfinished, names=np.array(list(states)), lengths=lengths, states=joined)
-        unfinished.replace(path)
-    with np.load(path, allow_pickle=False) as file:
-        pieces = np.split(file["states"].astype(np.int64), np.cumsum(file["lengths"])[:-1])
-        return dict(zip(file["names"].tolist(), pieces, strict=True))
+def _aligned_states(
+    aligner: Aligner, stored: Sequence[Features], seed: int
+) -> dict[str, NDArray[Any]]:
+    """Align recordings; return the arrays of the file of states."""
+    states = aligner.align(stored, seed)
+    return {
+        "names": np.array(list(states)),
+        "lengths": np.array([len(one) for one in states.values()]),
+        "states": np.concatenate(list(states.values())).astype(np.int16),
+    }
 
 
 def _statistics(
