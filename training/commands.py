@@ -79,10 +79,6 @@ def phone_lm(
     words: Annotated[
         int | None, typer.Option(min=1, help="Number of words to sample. Default: 30,000,000.")
     ] = None,
-    order: Annotated[int, typer.Option(min=2, max=10, help="Phones in the longest n-grams.")] = 6,
-    max_ngrams: Annotated[
-        int, typer.Option(min=1000, help="About how many n-grams to keep.")
-    ] = 1_000_000,
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
     force: Force = False,
@@ -101,9 +97,7 @@ def phone_lm(
     drawn = None
     if ngrams and dictionary:
         drawn = draw_phones(ngrams, dictionary, inventory, num_words=words or 30_000_000, seed=seed)
-    train_phone_lm(
-        corpus or [], text or [], output, inventory, drawn=drawn, order=order, max_ngrams=max_ngrams
-    )
+    train_phone_lm(corpus or [], text or [], output, inventory, drawn=drawn)
 
 
 @app.command()

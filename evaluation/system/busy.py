@@ -15,14 +15,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from kouxing_client import Client
 from numpy.typing import NDArray
 from rich.console import Console
 
-from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.system.load import SETTLE_S, Crowd, Spoken
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.kinds import KINDS
@@ -37,6 +35,7 @@ LATE_S = 0.3  # lateness above which the face is behind
 RECOVERED_S = 0.05  # maximum lateness of a face that has recovered
 STEADY_S = 1.0  # time for which the lateness must stay at or below this maximum
 QUIET_S = 5.0  # measured time before the load
+AFTER_S = 15.0  # measured time after the load
 STEP_S = 0.02  # interval of the lateness values
 _PROC = Path("/proc")
 _COLUMNS = 10  # seconds in a row of the table
@@ -112,7 +111,7 @@ class Busy:
 
 
 def measure(
-    paths: Sequence[Path], programs: Sequence[int], load_s: float, after_s: float, console: Console
+    paths: Sequence[Path], programs: Sequence[int], load_s: float, console: Console
 ) -> Busy:
     """Start all services, and speak while each number of busy programs runs.
 
@@ -133,7 +132,7 @@ def measure(
             speaking = _usage(processes, lambda: crowd.speak_until(quiet_s + QUIET_S))
         for num in programs:
             console.print(f"speaking with {num} busy programs")
-            runs.append(_run(client, text, num, load_s, after_s))
+            runs.append(_run(client, text, num, load_s))
     return Busy(runs=runs, idle=idle, speaking=speaking, machine_load=machine_load)
 
 
@@ -150,15 +149,13 @@ def _speaker(client: Client, text: NDArray[np.float32]) -> Iterator[tuple[Crowd,
     crowd.close()
 
 
-def _run(
-    client: Client, text: NDArray[np.float32], num_programs: int, load_s: float, after_s: float
-) -> Run:
+def _run(client: Client, text: NDArray[np.float32], num_programs: int, load_s: float) -> Run:
     with _speaker(client, text) as (crowd, quiet_s):
         start_s = quiet_s + QUIET_S
         crowd.speak_until(start_s)
         with _busy_programs(num_programs):
             crowd.speak_until(start_s + load_s)
-        end_s = start_s + load_s + after_s
+        end_s = start_s + load_s + AFTER_S
         crowd.speak_until(end_s)
         (spoken,) = crowd.spoken
         frames = _frames(spoken)
@@ -301,17 +298,3 @@ def _cells(usage: Mapping[str, Usage], name: str) -> tuple[str, str]:
     services = [usage[name]] if name in usage else usage.values()
     cpu_cores = sum(service.cpu_cores for service in services)
     return f"{cpu_cores:.3f}", f"{sum(service.wake_ups for service in services):.0f}"
-
-
-def draw(busy: Busy) -> Any:
-    """Plot the lateness over time, one line for each number of busy programs."""
-    figure = new_figure(9.0, 4.0)
-    axes = figure.subplots()
-    for run in busy.runs:
-        times_s = np.arange(len(run.lateness_s)) * STEP_S
-        axes.plot(times_s, run.lateness_s, label=f"{run.num_programs} busy programs", linewidth=1)
-    axes.axvspan(0.0, busy.runs[0].load_s, color="grey", alpha=0.15, label="load")
-    axes.axhline(LATE_S, color="grey", linestyle=":", label=f"{LATE_S:g} s")
-    axes.set(xlabel="time, s", ylabel="lateness of the face, s", ylim=(0, None))
-    axes.legend(fontsize=8)
-    return figure

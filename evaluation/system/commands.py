@@ -140,8 +140,6 @@ def busy(
         typer.Option(min=0, max=100, help="Number of busy programs; repeatable. Default: 0, 2, 6."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each load.")] = 30.0,
-    after: Annotated[float, typer.Option(min=1.0, help="Seconds of speech after a load.")] = 15.0,
-    picture: Annotated[Path | None, typer.Option(help="Plot the lateness (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -149,15 +147,12 @@ def busy(
 
     Also measures the processor time and the wake-ups of each service. Needs Linux.
     """
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.system.busy import draw, measure, show
+    from kouxing.evaluation.system.busy import measure, show
 
-    check_output(picture, json_file, force=force)
+    check_output(json_file, force=force)
     paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
-    figures = measure(paths, programs or (0, 2, 6), seconds, after, CONSOLE)
+    figures = measure(paths, programs or (0, 2, 6), seconds, CONSOLE)
     show(figures, Console())
-    if picture is not None:
-        save_figure(draw(figures), picture)
     write_json(json_file, asdict(figures) | {"summary": [run.summary for run in figures.runs]})
 
 

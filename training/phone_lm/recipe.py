@@ -205,8 +205,6 @@ def train_phone_lm(
     inventory: PhoneInventory,
     *,
     drawn: Stream | None = None,
-    order: int = 6,
-    max_ngrams: int = 1_000_000,
 ) -> None:
     """Estimate a phone language model, and write it to a file.
 
@@ -231,7 +229,7 @@ def train_phone_lm(
     if not num_text + len(corpus_stream):
         raise UserError("no text to count; give --text, --ngrams or a corpus with sentences")
     print_message(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
-    phone_lm = estimate_phone_lm(streams, inventory, order=order, max_ngrams=max_ngrams)
+    phone_lm = estimate_phone_lm(streams, inventory)
     write_archive(output, phone_lm_arrays(phone_lm))
     levels = phone_lm.levels
     sizes = ", ".join(f"{end - first}" for first, end in pairwise(levels[1:]))
