@@ -29,7 +29,7 @@ from kouxing.services.synthesizer.face_animator import Frame
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
-_VIDEO_PX = (640, 640)
+VIDEO_PX = (640, 640)
 _IMAGES_PER_S = 25.0
 _INNER_FAPS = dict(zip(range(51, 61), range(4, 14), strict=True))  # by the FAP of the outer contour
 MakeFrames = Callable[[RecognizedSentence], list[Frame]]
@@ -71,18 +71,22 @@ def write_videos(
     if not missing:
         return []
     head = scene.load_head()
-    renderer = Renderer(head, *_VIDEO_PX, camera=scene.camera(head, Framing.FACE))
+    renderer = Renderer(head, *VIDEO_PX, camera=scene.camera(head, Framing.FACE))
     for make, sentence, path in track(missing, description="rendering", transient=True):
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"cannot create {path.parent}: {error.strerror}") from error
-        samples = sentence.sentence.clip.samples
-        film.render_video(
-            make(sentence), path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples
-        )
+        write_video(path, make(sentence), sentence.sentence.clip.samples, renderer)
     renderer.close()
     return [path for _, _, path in missing]
+
+
+def write_video(
+    path: Path, frames: list[Frame], samples: NDArray[np.float32], renderer: Renderer
+) -> None:
+    """Write a video for a listening test, with its folder; UserError if that fails."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot create {path.parent}: {error.strerror}") from error
+    film.render_video(frames, path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples)
 
 
 def _conditions(

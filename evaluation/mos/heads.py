@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from kouxing.evaluation.lips.scheme_videos import VIDEO_PX, write_video
 from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.video import film
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -23,8 +23,6 @@ from kouxing.shared.terminal import CONSOLE
 
 _LENGTH_S = 60.0
 _MIN_PAUSE_S = 0.6  # long enough for the face to finish a phrase
-_VIDEO_PX = (640, 640)
-_IMAGES_PER_S = 25.0
 
 
 def write_head_videos(
@@ -42,12 +40,10 @@ def write_head_videos(
     show = partial(track, description="recognizing", console=CONSOLE, transient=True)
     frames = chain.animate(samples, show)
     for name in track(names, "drawing", console=CONSOLE, transient=True):
-        path = folder / name / "minute.mp4"
-        path.parent.mkdir(parents=True, exist_ok=True)
         head = loaded[name]
-        renderer = Renderer(head, *_VIDEO_PX, camera=scene.camera(head))
+        renderer = Renderer(head, *VIDEO_PX, camera=scene.camera(head))
         with contextlib.closing(renderer):
-            film.render_video(frames, path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples)
+            write_video(folder / name / "minute.mp4", frames, samples, renderer)
 
 
 def join_recordings(recordings: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

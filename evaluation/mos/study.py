@@ -6,7 +6,6 @@ often. A judge sees one row per sentence, drawn at random. Two videos for practi
 come first and do not count.
 """
 
-import json
 import random
 from dataclasses import dataclass, field
 from itertools import product
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.audio_file import check_video
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import write_json
 from kouxing.shared.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "study.json"
@@ -58,21 +58,12 @@ def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str
         "title": title or folder.resolve().name,
         "reference": reference,
         "anchor": anchor,
-        "stimuli": [
-            {"sentence": path.stem, "condition": name, "file": f"{name}/{path.name}"}
-            for path in videos
-            if (name := path.parent.name)
-        ],
+        "videos": [f"{path.parent.name}/{path.name}" for path in videos],
     }
     study = _parse(folder, content)
     for path in study.files.values():
         check_video(path)
-    try:
-        (folder / FILE_NAME).write_text(
-            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-        )
-    except OSError as error:
-        raise UserError(f"cannot write {folder / FILE_NAME}: {error.strerror}") from None
+    write_json(folder / FILE_NAME, content)
     return study
 
 
@@ -88,13 +79,13 @@ def load_study(folder: Path) -> Study:
 def _parse(folder: Path, content: Any) -> Study:
     root = folder.resolve()
     files: dict[tuple[str, str], Path] = {}
-    for entry in content["stimuli"]:
-        path = (root / entry["file"]).resolve()
+    for name in content["videos"]:
+        path = (root / name).resolve()
         if not path.is_relative_to(root) or path.suffix.lower() not in SUFFIXES:
-            raise UserError(f"{entry['file']}: not a video inside {folder}")
+            raise UserError(f"{name}: not a video inside {folder}")
         if not path.is_file():
-            raise UserError(f"{entry['file']}: this video is missing from {folder}; restore it")
-        files[str(entry["sentence"]), str(entry["condition"])] = path
+            raise UserError(f"{name}: this video is missing from {folder}; restore it")
+        files[Path(name).stem, Path(name).parent.name] = path
     if not files:
         raise UserError(f"{folder} has no videos; name them CONDITION/SENTENCE.mp4")
     sentences, conditions = (tuple(dict.fromkeys(names)) for names in zip(*files, strict=True))
@@ -102,10 +93,9 @@ def _parse(folder: Path, content: Any) -> Study:
         if (sentence, condition) not in files:
             raise UserError(f"sentence {sentence!r} has no video in condition {condition!r}")
     title, reference, anchor = (str(content[key]) for key in ("title", "reference", "anchor"))
-    for name in (reference, anchor):
-        if name and name not in conditions:
-            known = ", ".join(sorted(conditions))
-            raise UserError(f"no condition is named {name!r}; choose from {known}")
+    if unknown := {reference, anchor} - {"", *conditions}:
+        known = ", ".join(sorted(conditions))
+        raise UserError(f"no condition is named {min(unknown)!r}; choose from {known}")
     return Study(root, title, sentences, conditions, reference, anchor, files)
 
 
