@@ -13,12 +13,15 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import numpy as np
 from kouxing_client import Client, KouxingError, Status
+from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.cli.service_process import ServiceProcess
 from kouxing.services.kinds import KINDS, free_port_environment, kind_of
+from kouxing.shared.audio_file import read_audio
 from kouxing.shared.config import variable
 
 ROOT = Path(__file__).parents[1]
@@ -39,6 +42,13 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREA
 MAX_KEPT = 200
 
 _kept: deque[socket.socket] = deque()
+
+
+def samples_of_file(path: Path) -> NDArray[np.float32]:
+    """Return a mono recording at 16 kHz."""
+    samples, rate_hz = read_audio(path)
+    assert rate_hz == 16_000
+    return samples[:, 0]
 
 
 def free_port() -> int:

@@ -9,8 +9,7 @@ from kouxing_client import Client, Session
 from kouxing.services.cli.main import main
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import user_key
-from tests.e2e.following import samples_of_file
-from tests.system import DEMO, System, wait_until
+from tests.system import DEMO, System, samples_of_file, wait_until
 
 
 class Command:

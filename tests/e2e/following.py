@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,7 +9,6 @@ from kouxing_client import Client, FapFrame, Phone, Result, Session, Sound, Spee
 from kouxing_client.messages import Floats
 from numpy.typing import NDArray
 
-from kouxing.shared.audio_file import read_audio
 from tests.system import wait_until
 
 RATE_HZ = 16000
@@ -94,12 +92,6 @@ class Stream:
         """The final phones, in order."""
         last = {phone.index: phone.symbol for phone in self.phones}
         return [last[index] for index in sorted(last)]
-
-
-def samples_of_file(path: Path) -> NDArray[np.float32]:
-    samples, rate_hz = read_audio(path)
-    assert rate_hz == RATE_HZ
-    return samples[:, 0]
 
 
 def stream(

@@ -17,8 +17,8 @@ from aiortc.rtcdtlstransport import RTCDtlsTransport
 from kouxing.services.gateway.wire import FAP_TYPE, SHAPES_TYPE
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
-from tests.e2e.following import samples_of_file, stream
-from tests.system import DEMO, LIMIT_S, System
+from tests.e2e.following import stream
+from tests.system import DEMO, LIMIT_S, System, samples_of_file
 
 SDP = "application/sdp"
 OPEN_JAW = 2  # index of FAP 3

@@ -27,9 +27,9 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
 from tests.e2e.conftest import Command
-from tests.e2e.following import Stream, samples_of_file, stream
+from tests.e2e.following import Stream, stream
 from tests.lips import LIPS
-from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, start_python
+from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
 
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
 OPEN_JAW = 2  # index of FAP 3

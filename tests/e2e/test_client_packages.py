@@ -23,9 +23,8 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.e2e.following import samples_of_file
 from tests.glb_writer import Mesh, write_glb
-from tests.system import DEMO, NODE, ROOT, Gateway, System
+from tests.system import DEMO, NODE, ROOT, Gateway, System, samples_of_file
 
 SPEECH = DEMO / "hello-female.wav"
 JAVASCRIPT_CLIENT = ROOT / "clients" / "javascript"

@@ -7,8 +7,8 @@ import pytest
 from kouxing_client import Client, Status
 from ray.cluster_utils import Cluster
 
-from tests.e2e.following import samples_of_file, stream
-from tests.system import VOWELS_FILE, System, kouxing
+from tests.e2e.following import stream
+from tests.system import VOWELS_FILE, System, kouxing, samples_of_file
 
 NODE = {"object_store_memory": 80 << 20, "include_dashboard": False}
 

@@ -20,9 +20,18 @@ from kouxing.services.kinds import KINDS
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.conftest import Command
-from tests.e2e.following import Stream, samples_of_file
+from tests.e2e.following import Stream
 from tests.receivers import read_osc
-from tests.system import LIMIT_S, ROOT, VOWELS_FILE, System, kouxing, start_python, wait_until
+from tests.system import (
+    LIMIT_S,
+    ROOT,
+    VOWELS_FILE,
+    System,
+    kouxing,
+    samples_of_file,
+    start_python,
+    wait_until,
+)
 
 SENTENCE = VOWELS_FILE
 

@@ -6,8 +6,8 @@ import numpy as np
 from kouxing_client import Client
 
 from kouxing.shared.face.shapes import ARKIT, VRM
-from tests.e2e.following import Stream, samples_of_file
-from tests.system import CHAIN, DEMO, System
+from tests.e2e.following import Stream
+from tests.system import CHAIN, DEMO, System, samples_of_file
 
 
 def test_a_session_continues_while_control_is_killed_and_started_again(tmp_path: Path) -> None:

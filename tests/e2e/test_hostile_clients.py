@@ -22,9 +22,9 @@ from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, Sessio
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
-from tests.e2e.following import Stream, samples_of_file
+from tests.e2e.following import Stream
 from tests.raw_bytes import connected, pour
-from tests.system import DEMO, LIMIT_S, System, wait_until
+from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
 
 M = TypeVar("M", bound=Message)
 HEARTBEAT = Heartbeat(

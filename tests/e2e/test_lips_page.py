@@ -11,8 +11,8 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
 from tests.browser import Browser
 from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
-from tests.process.test_lips_package import package_faps, read
-from tests.system import DEMO, NODE
+from tests.process.test_lips_package import package_faps
+from tests.system import DEMO, NODE, samples_of_file
 
 SIZE_PX = (320, 480)  # heads are drawn without a GPU
 FACE = "document.getElementById('face')"
@@ -75,7 +75,7 @@ def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Pa
 def test_frames_in_the_browser_equal_those_of_node(
     browser: Browser, site: Path, tmp_path: Path, phones: bool | str
 ) -> None:
-    samples = read(DEMO / "lake-male.wav")
+    samples = samples_of_file(DEMO / "lake-male.wav")
     for name, content in web_model().items():
         (tmp_path / name).write_bytes(content)
     with serve_folder(site) as origin:

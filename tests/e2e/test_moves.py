@@ -14,8 +14,8 @@ from kouxing_client import Client
 from kouxing.shared.bus import Bus
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.speech import Phone
-from tests.e2e.following import Stream, samples_of_file, stream
-from tests.system import CHAIN, DEMO, LIMIT_S, System
+from tests.e2e.following import Stream, stream
+from tests.system import CHAIN, DEMO, LIMIT_S, System, samples_of_file
 
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 LOST_AT = 24000  # samples

@@ -16,8 +16,7 @@ from kouxing.evaluation.system.network import Link
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.keys import CLIENT
 from tests.containers import network_or_skip
-from tests.e2e.following import samples_of_file
-from tests.system import DEMO, NOTHING_SKIPPED
+from tests.system import DEMO, NOTHING_SKIPPED, samples_of_file
 
 CUT_AT_S = 1.0
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]

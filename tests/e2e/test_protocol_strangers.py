@@ -20,8 +20,8 @@ from kouxing_client.keys import Key
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.keys import key_folder, load_key, user_key
 from tests.documents import code_blocks
-from tests.e2e.following import Stream, samples_of_file, stream
-from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port
+from tests.e2e.following import Stream, stream
+from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port, samples_of_file
 
 EXAMPLES = ROOT / "examples" / "stream"
 KEY_FILE = "~/.local/state/kouxing/client.key"

@@ -20,8 +20,8 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.config import variable
-from tests.e2e.following import Stream, samples_of_file, stream
-from tests.system import LIMIT_S, VOWELS_FILE, System, wait_until
+from tests.e2e.following import Stream, stream
+from tests.system import LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 
 FACE = SynthesizerConfig(
     lips="dynamic-visemes", delay_ms=160.0, frame_rate_hz=30.0, idle_motion_seed=0

@@ -21,10 +21,9 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.events import Phone, SoundEvent
-from tests.system import DEMO, NODE, ROOT, VOWELS_FILE
+from tests.system import DEMO, NODE, ROOT, VOWELS_FILE, samples_of_file
 
 SCRIPT = ROOT / "clients" / "kouxing-lips" / "tests" / "frames.mjs"
 RATE_HZ = 16_000
@@ -70,7 +69,7 @@ def package_faps(models: Path, samples: Frames, **options: Any) -> Frames:
 
 @cache
 def output_of(models: Path, file: Path) -> dict[str, Any]:
-    return package_output(models, read(file))
+    return package_output(models, samples_of_file(file))
 
 
 def server_events(samples: Frames, acoustic: str = "light") -> list[SoundEvent]:
@@ -92,12 +91,6 @@ def server_faps(events: Sequence[SoundEvent], feeling: float = FEELING) -> Frame
     return faps
 
 
-def read(path: Path) -> Frames:
-    samples, rate_hz = read_audio(path)
-    assert rate_hz == RATE_HZ
-    return samples.astype(np.float32).reshape(-1)
-
-
 def opening(faps: Frames) -> Frames:
     return -(faps[:, 3] + faps[:, 4])
 
@@ -114,13 +107,13 @@ def assert_equal(ours: Frames, theirs: Frames) -> None:
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_frames_and_first_phones_equal_the_servers(models: Path, file: Path) -> None:
-    check_frames_and_phones(output_of(models, file), server_events(read(file)))
+    check_frames_and_phones(output_of(models, file), server_events(samples_of_file(file)))
 
 
 @pytest.mark.parametrize("file", FILES[:2], ids=lambda file: file.stem)
 def test_frames_and_final_phones_equal_the_servers(models: Path, file: Path) -> None:
-    output = package_output(models, read(file), phones="final")
-    check_frames_and_phones(output, server_events(read(file), "blocks"))
+    output = package_output(models, samples_of_file(file), phones="final")
+    check_frames_and_phones(output, server_events(samples_of_file(file), "blocks"))
 
 
 def check_frames_and_phones(output: dict[str, Any], events: Sequence[SoundEvent]) -> None:
@@ -140,7 +133,10 @@ def edit_distance(ours: list[str], theirs: list[str]) -> int:
 
 
 def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
-    speech, other = read(DEMO / "lake-male.wav"), read(DEMO / "fast-female.wav")
+    speech, other = (
+        samples_of_file(DEMO / "lake-male.wav"),
+        samples_of_file(DEMO / "fast-female.wav"),
+    )
     samples = np.concatenate([np.zeros(7001, np.float32), 0.1 * speech, np.zeros(20_000), other])
     assert_equal(
         package_faps(models, samples), server_faps(server_events(samples.astype(np.float32)))
@@ -148,14 +144,14 @@ def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
 
 
 def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
-    samples = read(DEMO / "bilabials-female.wav")
+    samples = samples_of_file(DEMO / "bilabials-female.wav")
     without = [event for event in server_events(samples) if not isinstance(event, Phone)]
     assert_equal(package_faps(models, samples, phones=False), server_faps(without))
 
 
 @pytest.mark.parametrize("rate_hz", [8_000, 48_000])
 def test_resamples_like_the_server(models: Path, rate_hz: int) -> None:
-    samples = read(DEMO / "hello-female.wav")
+    samples = samples_of_file(DEMO / "hello-female.wav")
     resampled = soxr.resample(samples, RATE_HZ, rate_hz)
     ours = package_faps(models, resampled, sampleRateHz=rate_hz)
     assert_equal(ours, server_faps(server_events(to_16_khz(resampled, rate_hz))))
@@ -164,7 +160,7 @@ def test_resamples_like_the_server(models: Path, rate_hz: int) -> None:
 def test_any_chunks_give_the_same_frames(models: Path) -> None:
     file = DEMO / "lake-male.wav"
     assert np.array_equal(
-        faps_of(output_of(models, file)), package_faps(models, read(file), chunk=97)
+        faps_of(output_of(models, file)), package_faps(models, samples_of_file(file), chunk=97)
     )
 
 
@@ -178,7 +174,7 @@ def test_weights_equal_the_servers(models: Path) -> None:
 
 
 def test_voice_state_follows_the_speech(models: Path) -> None:
-    samples = read(DEMO / "hello-female.wav")
+    samples = samples_of_file(DEMO / "hello-female.wav")
     frames = package_output(models, np.concatenate([np.zeros(RATE_HZ, np.float32), samples]))[
         "frames"
     ]

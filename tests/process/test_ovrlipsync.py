@@ -21,8 +21,8 @@ from kouxing.services.recognizer.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
 from kouxing.shared.phones.events import Phone
 from tests.documents import code_blocks
-from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, read, server_events, server_faps
-from tests.system import DEMO, NODE, ROOT
+from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, server_events, server_faps
+from tests.system import DEMO, NODE, ROOT, samples_of_file
 
 SOURCE = ROOT / "clients" / "ovrlipsync"
 LIBRARY = "OVRLipSync.c", "lips.c", "ear.c", "face.c", "lips_model.c"
@@ -97,7 +97,9 @@ def assert_close(ours: Weights, theirs: Weights) -> None:
 
 def run_program(folder: Path, name: str) -> tuple[Frames, Weights]:
     """Return a sound and the rows that the program prints for it."""
-    integers = np.round(read(DEMO / f"{name}.wav") * 32768).clip(-32768, 32767).astype("<i2")
+    integers = (
+        np.round(samples_of_file(DEMO / f"{name}.wav") * 32768).clip(-32768, 32767).astype("<i2")
+    )
     printed = subprocess.run(
         [folder / "visemes", "16000"], input=integers.tobytes(), capture_output=True, check=True
     ).stdout.decode()
@@ -147,7 +149,7 @@ def process(
 
 
 def test_buffers_at_48_khz_from_python(library: Any) -> None:
-    samples = read(DEMO / "hello-female.wav")
+    samples = samples_of_file(DEMO / "hello-female.wav")
     sound = soxr.resample(samples, 16_000, RATE_HZ).astype(np.float32)
     context = create(library)
     delays_ms, mono = process(library, context, sound)

@@ -18,10 +18,9 @@ from kouxing.services.recognizer.lip_predictor import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
-from tests.e2e.following import samples_of_file
 from tests.lip_predictors import NUM_FEATURES, NUM_LIPS, UNITS, made_up_model
 from tests.live_streams import recognize_live
-from tests.system import VOWELS_FILE
+from tests.system import VOWELS_FILE, samples_of_file
 
 SAMPLES = samples_of_file(VOWELS_FILE)[:32_000]
 MODEL = made_up_model()

@@ -19,8 +19,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.lips.linear import fit_linear
 from kouxing.training.lips.positions import Speech
 from kouxing.training.lips.recipe import DELAYS_S, train_lips
-from tests.e2e.following import samples_of_file
-from tests.system import VOWELS_FILE
+from tests.system import VOWELS_FILE, samples_of_file
 
 FRAME_S = 0.04
 

@@ -21,9 +21,8 @@ from kouxing.services.recognizer.mouth_profile import (
     read_mouth_profile,
 )
 from kouxing.shared.errors import UserError
-from tests.e2e.following import samples_of_file
 from tests.lip_predictors import made_up_model
-from tests.system import VOWELS_FILE
+from tests.system import VOWELS_FILE, samples_of_file
 
 MODEL = made_up_model()
 SHAPE = MODEL.residual_shape

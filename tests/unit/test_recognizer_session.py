@@ -25,9 +25,8 @@ from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import AcousticModelName, Progress
-from tests.e2e.following import samples_of_file
 from tests.live_streams import START
-from tests.system import VOWELS_FILE
+from tests.system import VOWELS_FILE, samples_of_file
 
 RATE_HZ = START.sample_rate_hz
 SOCKET, OTHER_SOCKET = (cast(Socket, object()) for _ in range(2))

@@ -22,9 +22,8 @@ from kouxing.shared.phones.events import (
 )
 from kouxing.shared.phones.final_time import QUIET_S, FinalTime
 from tests import lips
-from tests.e2e.following import samples_of_file
 from tests.live_streams import LiveStream
-from tests.system import DEMO
+from tests.system import DEMO, samples_of_file
 
 TOLERANCE_S = 0.03  # of onsets: the networks received other audio before
 CHUNK = 1600  # samples: 100 ms

@@ -26,9 +26,8 @@ from kouxing.shared.phones.events import (
 )
 from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.message import Message
-from tests.e2e.following import samples_of_file
 from tests.live_streams import LiveStream, recognize_live, recognize_together
-from tests.system import DEMO, VOWELS_FILE
+from tests.system import DEMO, VOWELS_FILE, samples_of_file
 
 MODEL = load_model()
 SAMPLES = samples_of_file(VOWELS_FILE)
