@@ -1,5 +1,6 @@
 """The command ``kouxing``."""
 
+import contextlib
 import errno
 import os
 import sys
@@ -137,23 +138,26 @@ for kind in KINDS.values():
 def main() -> None:
     """Run the command line. A user error gives one line on standard error and exit status 2.
 
-    Ctrl-C gives exit status 130, whatever exception a library turns it into.
+    Ctrl-C gives exit status 130, whatever exception a library turns it into. Python's shutdown is
+    left out then, because native libraries can wait forever or crash in it.
     """
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # also when it is a log file
     try:
         _run_command()
-    except Exception:
+    except (Exception, KeyboardInterrupt, SystemExit):
         if not is_interrupted():
             raise
-        sys.exit(130)
-    finally:
+    if is_interrupted():
         clear_interrupt()
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+        os._exit(130)
 
 
 def _run_command() -> None:
     try:
-        app(prog_name="kouxing")
+        typer.main.get_command(app)(prog_name="kouxing")  # app() would replace sys.excepthook
     except UserError as error:
         if is_interrupted():
             raise

@@ -8,6 +8,7 @@ _LINE = re.compile(  # up to the first Chinese character, and after the last one
     "(?P<before>[^\u3400-\u9fff]*)(?P<spoken>[\u3400-\u9fff]|[\u3400-\u9fff].*[^\0-\x7f])"
     "(?P<after>[\0-\x7f]*)"
 )
+_HEADER = re.compile(r"[A-Za-z_ ]+(?:[,;|\t][A-Za-z_ ]+)+")  # names of columns
 _TIME = re.compile(r"(?<![\w.])\d+(?:[:'′]\d+)*(?:\.\d+)?")
 _TIME_LIKE = re.compile(r"\d[:'′.]\d|\ds\b")
 _SEPARATOR = re.compile(r"[(\[{<【（|;,=:~\t\"]|^\s*s\b")
@@ -21,6 +22,8 @@ def remove_columns(text: str) -> str:
     Times increase from line to line. A text of a single line has no columns.
     """
     lines = [line.strip(" ") for line in text.split("\n") if line.strip()]
+    if len(lines) > 2 and _HEADER.fullmatch(lines[0]):
+        del lines[0]
     parts = [match for line in lines if (match := _LINE.fullmatch(line))]
     if len(parts) < 2 or len(parts) < len(lines):
         return text

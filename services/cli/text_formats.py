@@ -54,7 +54,7 @@ _LABEL = (  # times of Audacity or CTM, or the name of a recording
     r"(?:\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t|(?:\S+ \d )?\d+\.\d+ +\d+\.\d+ +"
     r"|[A-Za-z]+(?:[\w.-]*?\d){6}[\w.-]*[ \t]+)"
 )
-_TIMES = rf"{_TIME}(?:[ \t]*(?:--?>|[-–—~→])[ \t]*{_TIME})?"
+_TIMES = rf"{_TIME}(?:[ \t]*(?:--?>|[-–—~～→])[ \t]*{_TIME})?"
 _SECONDS = r"\d+(?:\.\d+[ \t]*s?|[ \t]*s)"
 _LINE_IN_SECONDS = (  # [0.00s -> 3.40s], as faster-whisper prints
     rf"[(\[]?{_SECONDS}[ \t]*(?:--?>|→)[ \t]*{_SECONDS}[)\]]?"
@@ -62,8 +62,12 @@ _LINE_IN_SECONDS = (  # [0.00s -> 3.40s], as faster-whisper prints
 )
 _TIME_IN_BRACKETS = rf"[(\[{{<（［【〔「]{_TIMES}[)\]}}>）］】〕」]"
 _EXACT_TIME = r"0?0[:：]\d{2}(?:[:：]\d{2}(?:[.,:]\d{1,3})?|[.,]\d{1,3})"
+_FIRST_TIME = rf"0?0[:：]\d{{2}}(?:[ \t]*[-–—~～→][ \t]*{_TIME})?"  # of a recording, not a clock
 _TIMED_LINE = (  # also the line of a speaker, with the time at its end
     rf"(?:(?:{_TIME_IN_BRACKETS})+|{_TIMES}(?=[ \t]|$)|\S.{{,30}}?[ \t]+{_TIMES}[ \t]*$)[ \t]*"
+)
+_SPEAKER = (  # SPEAKER_00: or 说话人 1：, as programs number them
+    rf"[ \t]*(?:[A-Za-z]+[ _]?|(?:说话人|說話人|发言人|發言人)[ ]?)\d+(?:[ \t]+{_TIME})?[ \t]*[:：]"
 )
 _LYRICS_TIME = r"\[\d+,\d+\]"
 
@@ -166,12 +170,14 @@ def _read_cues(text: str) -> str:
         if re.match(r"WEBVTT|NOTE\b|STYLE$|REGION$", lines[0]):
             continue
         for number, line in enumerate(lines):
-            if not _CUE_TIMES.match(line):
+            times = _CUE_TIMES.match(line)
+            if times is None:
                 cues[-1].append(_SOUND_NAME.sub("", _BRACES.sub("", line)))
                 continue
             if number == 1 or (number and lines[number - 1].strip().isdigit()):
                 cues[-1].pop()  # the name of the cue
-            cues.append([])
+            rest = line[times.end() :]  # settings, or the text itself
+            cues.append([rest] if _CHINESE.search(rest) else [])
     return "\n".join(_without_repeats([_read_markup("\n".join(cue)).split("\n") for cue in cues]))
 
 
@@ -196,9 +202,10 @@ def _read_lrc(text: str) -> str:
     for line in text.split("\n"):
         if _LRC_FIELD.fullmatch(line.strip()):
             continue
+        first = re.match(rf"[ \t]*(?:{_LRC_TIME}[ \t]*)*", line)
         times_s = [
             60 * int(minutes) + float(seconds.replace(":", "."))
-            for minutes, seconds in re.findall(_LRC_TIME, line)
+            for minutes, seconds in re.findall(_LRC_TIME, first[0] if first else "")
         ]
         words = _INLINE_TIME.sub("", re.sub(_LRC_TIME, "", line))
         timed += [(time_s, words) for time_s in times_s or [timed[-1][0] if timed else 0.0]]
@@ -249,6 +256,10 @@ def _read_timed_lines(text: str) -> str:
     return "\n".join(
         line if match is None else "" if are_names else line[match.end() :] for match, line in lines
     )
+
+
+def _read_speakers(text: str) -> str:
+    return re.sub(rf"^{_SPEAKER}", "", text, flags=re.MULTILINE)
 
 
 def _read_lines_in_seconds(text: str) -> str:
@@ -373,6 +384,8 @@ _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (
         re.compile(rf"^[ \t]*(?:{_TIME_IN_BRACKETS}|{_EXACT_TIME}(?=[ \t]))", re.MULTILINE),
         _read_timed_lines,
     ),
+    ("a transcript with times", re.compile(rf"\A{_FIRST_TIME}[ \t]"), _read_timed_lines),
+    ("a transcript with speakers", re.compile(rf"^{_SPEAKER}", re.MULTILINE), _read_speakers),
     ("MicroDVD or MPL2", re.compile(rf"\A{_FRAMES}"), _read_frame_numbers),
     ("a table of labels", re.compile(rf"\A([^\n]*\n)?{_LABEL}"), _read_labels),
     ("SSML", re.compile(r"<speak\b", re.I), _read_markup),

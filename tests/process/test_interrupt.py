@@ -56,6 +56,15 @@ def interrupt(*arguments):
 
 media_file._GuardedFile._call = interrupt
 """
+IN_OPTIONS = """
+import signal
+import typer.main
+typer.main.get_group = lambda _: signal.raise_signal(signal.SIGINT)
+"""
+IN_SHUTDOWN = """
+import atexit, threading
+atexit.register(threading.Event().wait)
+"""
 IN_IMPORT = """
 import signal
 try:
@@ -84,11 +93,15 @@ def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) 
     assert process.communicate(timeout=LIMIT_S) == (printed, "")
 
 
-@pytest.mark.parametrize("place", ["FFmpeg", "import"])
+@pytest.mark.parametrize("place", ["FFmpeg", "import", "shutdown", "options"])
 def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) -> None:
     program, path = COMMAND, str(ROOT)
     if place == "FFmpeg":
         program = IN_FFMPEG + COMMAND
+    elif place == "shutdown":
+        program = IN_SHUTDOWN + IN_FFMPEG + COMMAND
+    elif place == "options":
+        program = IN_OPTIONS + COMMAND
     else:
         (tmp_path / "onnxruntime.py").write_text(IN_IMPORT)
         path = f"{tmp_path}{os.pathsep}{ROOT}"
