@@ -1,6 +1,7 @@
 """Handles the messages that arrive on the sockets of a service."""
 
 import errno
+import logging
 import time
 from collections.abc import Callable
 from typing import Any
@@ -62,11 +63,11 @@ class MessageLoop:
         """Wait up to the timeout for messages; return the sockets that have some."""
         return self._poller.wait(timeout_s)
 
-    def warn(self, reason: str, text: str, session: str = "") -> None:
+    def warn(self, reason: str, text: str, session: str = "", level: int = logging.WARNING) -> None:
         """Count a problem, and log it at a limited rate."""
         self.metrics.count(f"dropped_{reason}")
         if self._warning_limit.allows(reason):
-            LOG.warning(text, extra={"session": session})
+            LOG.log(level, text, extra={"session": session})
 
     def handle_messages(self, socket: Socket) -> None:
         """Handle the messages that a socket has received, up to its fair share."""

@@ -1,5 +1,6 @@
 """Checks the audio messages of clients, and reports rejected ones."""
 
+import logging
 import time
 from collections.abc import Callable
 
@@ -93,7 +94,9 @@ class AudioIntake:
         self, socket: Socket, message: AudioChunk, sender: Peer, rejection: AudioRejected
     ) -> None:
         text = str(rejection)
-        self._loop.warn(rejection.code, text, message.session)
+        is_expected = rejection.code == ErrorCode.UNKNOWN_SESSION  # after Ctrl-C in a client
+        level = logging.INFO if is_expected else logging.WARNING
+        self._loop.warn(rejection.code, text, message.session, level)
         error = Error(
             session=message.session, media_time=message.media_time, code=rejection.code, text=text
         )

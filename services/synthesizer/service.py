@@ -10,6 +10,7 @@ live stream is stalled.
 """
 
 import itertools
+import logging
 import math
 import time
 from collections import deque
@@ -294,7 +295,8 @@ class SynthesizerService(Service):
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
-            self.warn("unknown-session", "dropped phones of an unknown session", message.session)
+            text = "dropped phones of an unknown session"  # it has just been closed
+            self.warn("unknown-session", text, message.session, logging.INFO)
         elif sender.key != key_of(session.start.endpoints.get("phones", "")):
             self.warn("foreign", "dropped phones of another recognizer", message.session)
         elif message.epoch != session.start.epoch:  # resent until both ends have the epoch

@@ -25,6 +25,13 @@ def test_an_existing_output_needs_force(tmp_path: Path) -> None:
     assert path.read_text() == "mine"
 
 
+def test_checking_a_link_to_a_new_file_changes_nothing(tmp_path: Path) -> None:
+    link = tmp_path / "link.csv"
+    link.symlink_to(tmp_path / "new.csv")
+    check_output(link)
+    assert [*tmp_path.iterdir()] == [link]
+
+
 def test_an_output_is_never_an_input(tmp_path: Path) -> None:
     source, link = tmp_path / "me.mp4", tmp_path / "link.mp4"
     source.touch()
