@@ -11,6 +11,7 @@ import codecs
 import csv
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -21,7 +22,9 @@ from kouxing.services.senders.live_link import ANGLES
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.shape_names import find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import parse_json, read_file, split_lines
 
 TABLE_SUFFIXES = (".csv", ".jsonl")
@@ -32,6 +35,8 @@ _MAX_WEIGHT = 10.0  # limit for the weight of a shape; percentages are larger
 _TIME_CODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+(?:\.\d+)?)")  # ";" if frames are dropped
 _TIME_CODE_RATES_HZ = (24, 25, 30, 48, 50, 60, 100, 120)  # the app's default is 60
 _DAY_S = 86400.0
+_OTHER_COLUMNS = {"", "time_s", "sequence", "phone", "timecode", "blendshapecount"}
+_OTHER_COLUMNS |= {angle.lower() for angle in ANGLES}
 _HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
 
 Float64 = NDArray[np.float64]
@@ -46,12 +51,16 @@ def read_table(path: Path) -> FapAnimation:
     lines = _read_lines(path)
     is_json = path.suffix.lower() == ".jsonl"
     rows = _json_rows(path, lines) if is_json else _csv_rows(path, lines)
-    names = [str(name).strip().lower() for name in next(rows, [])]
+    written = [str(name).strip() for name in next(rows, [])]
+    names = [name.lower() for name in written]
     time_name = next((name for name in ("time_s", "timecode") if name in names), None)
     if time_name is None:
         raise UserError(f"{path}: the table has no times; add a column time_s or Timecode")
-    columns, basis = _known_columns(path, names)
+    columns, basis = _known_columns(path, written)
     is_shapes = names[columns[0]] not in FAP_NUMBER
+    expected = {*_OTHER_COLUMNS, *(names[column] for column in columns)}
+    if ignored := [name for name in written if name.lower() not in expected]:
+        print_message(f"{path}: columns that no face has were ignored: {', '.join(ignored)}")
     count = names.index("blendshapecount") if "blendshapecount" in names else None
     times: list[str] = []
     values: list[Float64] = []
@@ -128,27 +137,33 @@ def _json_rows(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
 
 
 def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
-    """Return the columns of FAPs or of one set of shapes, and their FAPs at a value of 1."""
+    """Return the columns of FAPs or of one set of shapes, and their FAPs at a value of 1.
+
+    Shapes may have any name that other programs give them. Several columns that form one shape
+    share its FAPs.
+    """
     fap_rows = np.eye(NUM_FAPS)
-    tables = [
-        [(name, fap_rows[number - 1]) for name, number in FAP_NUMBER.items()],
-        *(list(zip(shapes.names, shapes.basis, strict=True)) for shapes in SHAPE_SETS.values()),
-    ]
-    known = max(
-        ([(name, row) for name, row in table if name.lower() in names] for table in tables), key=len
-    )
+    tables = [{name: fap_rows[FAP_NUMBER[name.lower()] - 1] for name in names
+               if name.lower() in FAP_NUMBER}]  # fmt: skip
+    for set_name, shapes in SHAPE_SETS.items():
+        shape_of = find_shapes(set_name, names)
+        parts = Counter(shape_of.values())
+        basis = dict(zip(shapes.names, shapes.basis, strict=True))
+        tables.append({name: basis[shape] / parts[shape] for name, shape in shape_of.items()})
+    known = max(tables, key=len)
     if not known:
         raise UserError(
             f"{path}: no column has the name of a FAP or of a shape such as jawOpen; rename the"
             " columns"
         )
-    for name, _ in known:
-        if names.count(name.lower()) > 1:
+    folded = [name.lower() for name in names]
+    for name in known:
+        if folded.count(name.lower()) > 1:
             raise UserError(f"{path}: several columns have the name {name}; keep one")
     for angle, fap in _HEAD_FAPS.items():
-        if angle.lower() in names:
-            known.append((angle, fap_rows[FAP_NUMBER[fap] - 1] / RADIANS_PER_ANGLE_UNIT))
-    return [names.index(name.lower()) for name, _ in known], np.array([row for _, row in known])
+        if angle.lower() in folded:
+            known[angle] = fap_rows[FAP_NUMBER[fap] - 1] / RADIANS_PER_ANGLE_UNIT
+    return [folded.index(name.lower()) for name in known], np.array([*known.values()])
 
 
 def _times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:

@@ -1,5 +1,6 @@
 """Reads the spoken texts of commands: given directly, or as a file."""
 
+import re
 from pathlib import Path
 
 from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text
@@ -14,6 +15,7 @@ _MAX_BYTES = 8 << 20
 _MAX_CHARACTERS = 150_000
 _MAX_DIGITS = 10_000  # converting numbers to words is slow
 _MAX_NAMED = 20  # words in a message
+_CLOCK_TIME = re.compile(r"\d{1,2}[:：]\d{2}(?=[ \t])")  # or the time of a recording
 _TEXT_SUFFIXES = {
     *(".txt", ".text", ".md", ".markdown", ".html", ".htm", ".xml", ".ssml", ".json", ".textgrid"),
     *(".srt", ".vtt", ".lrc", ".ass", ".ssa", ".sbv", ".sub", ".ttml", ".dfxp", ".smi", ".tsv"),
@@ -88,6 +90,8 @@ def text_of(text: str) -> str:
     if forms:
         name = "the text" if path is None else str(path)
         print_message(f"{name} was read as {' in '.join(forms)}")
+    elif time := _CLOCK_TIME.match(spoken.text):
+        print_message(f"{time[0]} is read as a spoken time of day; delete it if nobody says it")
     return spoken.text
 
 

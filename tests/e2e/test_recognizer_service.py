@@ -52,7 +52,7 @@ class Recognizer(RecognizerService):
     ) -> None:
         self.events.append((name, session, detail))
 
-    def warn(self, reason: str, text: str, session: str = "") -> None:
+    def warn(self, reason: str, text: str, session: str = "", level: int = 0) -> None:
         self.warned.append((reason, text))
 
     def session_started(self, start: StartSession, media_time: int = 0) -> None:

@@ -116,6 +116,24 @@ def test_reads_a_take_that_a_spreadsheet_wrote(tmp_path: Path, text: str, encodi
 
 
 @pytest.mark.parametrize(
+    ("columns", "shapes"),
+    [
+        ("jaw_open,Head.mouthSmile_L", ("jawOpen", "mouthSmileLeft")),
+        ("JawOpen,Cheek_Puff_L", ("jawOpen", "cheekPuff")),
+    ],
+)
+def test_reads_the_names_of_other_programs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], columns: str, shapes: tuple[str, str]
+) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"TIME_S,{columns},nose\n0,0.5,0.25,1\n", encoding="utf-8")
+    weights = np.zeros(len(ARKIT.names), np.float32)
+    weights[[ARKIT.names.index(shape) for shape in shapes]] = 0.5, 0.25
+    assert np.abs(read_table(path).faps[0] - ARKIT.faps(weights)).max() < 1e-3
+    assert capsys.readouterr().err == f"{path}: columns that no face has were ignored: nose\n"
+
+
+@pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("a.csv", "frame,jawOpen\n0,0.5\n", "no times; add a column time_s or Timecode"),
