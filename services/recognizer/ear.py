@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive
+from kouxing.services.recognizer.acoustic.model_file import load_part
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     check_outputs,
@@ -38,7 +38,6 @@ from kouxing.services.recognizer.acoustic.network import (
     run_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.shared.errors import UserError
 
 EAR_PATH = Path(__file__).parent / "models" / "ear.npz"
 FORMAT = "ear 1"
@@ -131,13 +130,6 @@ def process_positions(streams: Sequence[EarStream], frames: Sequence[Floats]) ->
 @cache
 def load_ear(path: Path = EAR_PATH) -> Ear:
     """Read a model file; ``UserError`` if it is missing, broken or of another format."""
-    archive = read_archive(path)
-    try:
-        return _ear_from(archive)
-    except ValueError as error:
-        raise UserError(f"small ear {path}: {error}; train it again") from error
-
-
-def _ear_from(archive: Archive) -> Ear:
-    archive.check_format(FORMAT)
-    return Ear(archive.array("network", None).astype(np.uint8))
+    return load_part(
+        path, FORMAT, "small ear", lambda file: Ear(file.array("network", None).astype(np.uint8))
+    )

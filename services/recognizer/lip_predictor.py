@@ -38,7 +38,7 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
+from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
@@ -225,19 +225,10 @@ def _sigmoid(x: Floats) -> Floats:
 
 def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
     """Read a file; ``UserError`` if it is missing, broken or of another format."""
-    archive = read_archive(path)
-    try:
-        archive.check_format(FORMAT)
-        predictor = lip_predictor_from(archive)
-        num_features = FRAMES_PER_POSITION * NUM_MELS + load_ear().num_features
-        if len(predictor.feature_mean) != num_features:
-            raise ValueError("it was trained for another ear")
-        return predictor
-    except ValueError as error:
-        raise UserError(f"lip predictor {path}: {error}; train it again") from error
+    return load_part(path, FORMAT, "lip predictor", _lip_predictor_from)
 
 
-def lip_predictor_from(archive: Archive) -> LipPredictor:
+def _lip_predictor_from(archive: Archive) -> LipPredictor:
     """Build the predictor after checking every size; ``ValueError`` if an array does not fit."""
     delays = archive.floats("delays", *_sizes(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
@@ -245,10 +236,10 @@ def lip_predictor_from(archive: Archive) -> LipPredictor:
     if (np.diff(delays) <= 0).any():
         raise ValueError("its delays do not rise")
     num_features, num_components = _sizes(archive, "projection", 2)
-    if num_features <= FRAMES_PER_POSITION * NUM_MELS:
-        raise ValueError(f"it takes {num_features} features per position")
     _, units = _sizes(archive, "entry_weights", 2)
     num_lips = _sizes(archive, "lip_weights", 3)[0]
+    if num_features != FRAMES_PER_POSITION * NUM_MELS + load_ear().num_features:
+        raise ValueError("it was trained for another ear")
     if num_lips > num_features:
         raise ValueError(f"it reads {num_lips} lip values from {num_features} features")
     outputs = (len(delays), NUM_OUTPUTS)

@@ -29,9 +29,8 @@ from typing import NamedTuple
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
+from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
 from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
-from kouxing.shared.errors import UserError
 
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
 FORMAT = "traits 1"
@@ -124,15 +123,10 @@ class VoiceTraitsStream:
 @cache
 def load_voice_readout(path: Path = TRAITS_PATH) -> VoiceReadout:
     """Read a model file; ``UserError`` if it is missing, broken or of another format."""
-    archive = read_archive(path)
-    try:
-        return _readout_from(archive)
-    except ValueError as error:
-        raise UserError(f"voice traits {path}: {error}; train them again") from error
+    return load_part(path, FORMAT, "readout of voice traits", _readout_from)
 
 
 def _readout_from(archive: Archive) -> VoiceReadout:
-    archive.check_format(FORMAT)
     return VoiceReadout(
         weights=archive.floats("weights", load_ear().state_width, NUM_TRAITS),
         bias=archive.floats("bias", NUM_TRAITS),

@@ -4,9 +4,9 @@ An array of FAPs has shape ``(68,)``; index ``i`` holds FAP ``i + 1`` in FAP uni
 is ``value * FAPU / 1024``, an angle ``value * 1e-5`` rad.
 """
 
-import csv
 from dataclasses import dataclass
-from importlib import resources
+
+from kouxing.shared.tables import read_table
 
 NUM_FAPS = 68
 MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte
@@ -26,7 +26,6 @@ class Fap:
 
 
 def _read_table() -> tuple[Fap, ...]:
-    text = resources.files("kouxing.shared.face").joinpath("faps.tsv").read_text(encoding="utf-8")
     return tuple(
         Fap(
             number=int(row["fap"]),
@@ -35,7 +34,7 @@ def _read_table() -> tuple[Fap, ...]:
             direction=row["direction"],
             feature_points=tuple(point for point in row["feature_points"].split(",") if point),
         )
-        for row in csv.DictReader(text.splitlines(), delimiter="\t")
+        for row in read_table(__package__, "faps.tsv")
     )
 
 

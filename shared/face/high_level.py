@@ -13,13 +13,11 @@ standard's English ones. Deviations:
 - Disgust raises both sides of the lip.
 """
 
-import csv
-from importlib import resources
-
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.tables import read_table
 
 Float32 = NDArray[np.float32]
 
@@ -28,8 +26,7 @@ FULL = 63  # highest viseme_blend and expression_intensity
 
 def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
     """Read a table of this package: its rows, and its columns ``fapN`` as FAPs (rows, 68)."""
-    text = resources.files("kouxing.shared.face").joinpath(name).read_text("utf-8")
-    rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
+    rows = read_table(__package__, name)
     values = np.zeros((len(rows), NUM_FAPS), np.float32)
     for row, target in zip(rows, values, strict=True):
         for column, value in row.items():

@@ -29,7 +29,6 @@ from importlib import resources
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.espeak import transcribe_phrases
 from kouxing.shared.phones.mecab import has_mecab, split_words
-from kouxing.shared.phones.table import read_table
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 from kouxing.shared.phones.universal.segments import (
     ipa_of,
@@ -37,6 +36,7 @@ from kouxing.shared.phones.universal.segments import (
     read_ipa,
     remove_language_flags,
 )
+from kouxing.shared.tables import read_table
 
 SETTINGS = "language.toml"
 _SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words

@@ -298,18 +298,13 @@ def forward_errors(future: Future[Any]) -> Iterator[None]:
         future.set_exception(error)
 
 
-def forward(asked: Future[T], make: Callable[[T], U], made: Future[U]) -> None:
-    """Set a future to what a function makes of an answer."""
+def then(asked: Future[T], make: Callable[[T], U], made: Future[U] | None = None) -> Future[U]:
+    """Return a future, by default a new one, of what a function makes of an answer."""
+    made = new_future() if made is None else made
 
     def on_answer(answer: Future[T]) -> None:
         with forward_errors(made):
             made.set_result(make(answer.result()))
 
     asked.add_done_callback(on_answer)
-
-
-def then(asked: Future[T], make: Callable[[T], U]) -> Future[U]:
-    """Return the future of what a function makes of an answer."""
-    made = new_future()
-    forward(asked, make, made)
     return made

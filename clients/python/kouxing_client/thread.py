@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-from kouxing_client.core import ClientCore, forward, new_future
+from kouxing_client.core import ClientCore, new_future, then
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
 from kouxing_client.session_core import SessionCore, Signal
@@ -64,7 +64,11 @@ class ClientThread:
         if not self.is_running:
             raise KouxingError("the client is closed")
         answer = new_future()
-        self._sockets.call(lambda: forward(function(self.core), lambda result: result, answer))
+
+        def run() -> None:
+            then(function(self.core), lambda result: result, answer)
+
+        self._sockets.call(run)
         return answer
 
     def forget(self, session: SessionCore) -> Future[None]:

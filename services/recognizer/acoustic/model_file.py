@@ -1,11 +1,11 @@
 """Model files: npz archives of plain arrays, without pickle. Every size is checked."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0
 _LANGUAGE = ("language", "phones")  # arrays
+Part = TypeVar("Part")
 _LOG_STEP = np.float32(0.05)  # nats; a phone language model's logs are stored in 8 bits
 
 
@@ -45,12 +46,6 @@ class Archive:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
         return array
 
-    def check_format(self, expected: str) -> None:
-        """Raise ValueError if the file has another format."""
-        form = str(self.array("format", ()))
-        if form != expected:
-            raise ValueError(f"it has the format {form!r}, expected {expected!r}")
-
     def floats(self, name: str, *shape: int) -> NDArray[np.float32]:
         """Return an array of finite numbers of a given shape; ValueError if it does not fit."""
         values = self.array(name, shape).astype(np.float32)
@@ -67,6 +62,21 @@ def read_archive(path: Path) -> Archive:
             " file"
         )
     return Archive(read_arrays(path, MAX_BYTES, "an acoustic model; reinstall or train one"))
+
+
+def load_part(path: Path, form: str, name: str, build: Callable[[Archive], Part]) -> Part:
+    """Build a part of a recognizer from a file; ``name`` is for errors.
+
+    Raises ``UserError`` if the file is missing, broken or of another format.
+    """
+    archive = read_archive(path)
+    try:
+        found = str(archive.array("format", ()))
+        if found != form:
+            raise ValueError(f"it has the format {found!r}, expected {form!r}")
+        return build(archive)
+    except ValueError as error:
+        raise UserError(f"{name} {path}: {error}; train it again") from error
 
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -31,6 +31,12 @@ def still(value: Array) -> FapState:
     return FapState(value, np.zeros(NUM_MOUTH_FAPS))
 
 
+def clip(state: FapState, lowest: Array, highest: Array) -> FapState:
+    """Keep FAPs within limits; those at a limit do not move."""
+    value = np.minimum(np.maximum(state.value, lowest), highest)
+    return FapState(value, np.where(value == state.value, state.velocity, 0.0))
+
+
 @dataclass(frozen=True, slots=True)
 class Transition:
     """Leads the difference between two trajectories to zero along cubics, one duration per FAP."""

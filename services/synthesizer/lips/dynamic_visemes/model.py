@@ -42,6 +42,7 @@ from kouxing.services.synthesizer.lips.trajectory import (
     FapState,
     RestTransition,
     Transition,
+    clip,
     still,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
@@ -187,8 +188,7 @@ class VisemeStream:
         self._pending_s = self._rest = None
 
     def _within_hull(self, state: FapState) -> FapState:
-        value = self._clip(state.value)
-        return FapState(value, np.where(value == state.value, state.velocity, 0.0))
+        return clip(state, self._lowest, self._highest)
 
     def _clip(self, faps: NDArray[np.float64]) -> NDArray[np.float64]:
         clipped: NDArray[np.float64] = np.minimum(np.maximum(faps, self._lowest), self._highest)

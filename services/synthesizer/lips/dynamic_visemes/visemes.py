@@ -6,8 +6,6 @@ static targets in ``targets.tsv``, are from Crystal.TTVS (Tsinghua University, A
 of other languages have visemes that are derived from these (``derived``).
 """
 
-from importlib import resources
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +15,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.derived import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeShares
+from kouxing.shared.tables import read_table
 
 REST = "rest"
 TRAINED_VISEMES = (
@@ -65,9 +64,10 @@ def check_visemes(inventory: PhoneInventory) -> None:
 
 
 def static_targets() -> NDArray[np.float64]:
-    """Return the static targets T (num_visemes, num_mouth_faps), FAP units."""
-    text = (resources.files(__package__) / "targets.tsv").read_text("utf-8")
-    lines = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
-    rows = {row[0]: [float(value) for value in row[1:]] for row in lines[1:]}  # as MOUTH_FAPS
+    """Return the static targets T (num_visemes, num_mouth_faps), FAP units, as MOUTH_FAPS."""
+    table = (list(row.values()) for row in read_table(__package__, "targets.tsv"))
+    rows = {
+        viseme: [float(value) for value in values] for viseme, *values in table
+    }  # as MOUTH_FAPS
     trained = np.array([rows[viseme] for viseme in TRAINED_VISEMES])
     return np.concatenate([trained, derived_targets(trained, VISEME_INDEX)])

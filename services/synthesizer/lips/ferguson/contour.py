@@ -23,10 +23,8 @@ of Cupid's bow. The curves have free ends (natural splines). As in the paper, li
 vertically: the corners do not move, so /u/ is a small opening.
 """
 
-import csv
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import resources
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +32,7 @@ from scipy.interpolate import CubicSpline
 
 from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
+from kouxing.shared.tables import read_table
 
 Array = NDArray[np.float64]
 
@@ -85,8 +84,6 @@ class LipLine:
 @lru_cache
 def lip_points() -> dict[str, LipPoint]:
     """Return the points of ``lip_points.tsv`` by name."""
-    text = (resources.files(__package__) / "lip_points.tsv").read_text("utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
     return {
         row["point"]: LipPoint(
             float(row["x"]),
@@ -94,7 +91,7 @@ def lip_points() -> dict[str, LipPoint]:
             int(row["fap"]) if row["fap"] else None,
             float(row["travel"] or 0.0),
         )
-        for row in csv.DictReader(lines, delimiter="\t")
+        for row in read_table(__package__, "lip_points.tsv")
     }
 
 

@@ -38,6 +38,7 @@ from kouxing.services.synthesizer.lips.trajectory import (
     FapState,
     RestTransition,
     Transition,
+    clip,
     still,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
@@ -281,5 +282,4 @@ def _rising(frames: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def _within_limits(state: FapState) -> FapState:
     widest = faps_of([MAX_OPENING])[0]
-    value = np.clip(state.value, np.minimum(widest, 0.0), np.maximum(widest, 0.0))
-    return FapState(value, np.where(value == state.value, state.velocity, 0.0))
+    return clip(state, np.minimum(widest, 0.0), np.maximum(widest, 0.0))
