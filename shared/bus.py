@@ -34,7 +34,7 @@ CONNECT_MS = 300  # for one attempt; limits the round-trip time
 HANDSHAKE_MS = 2000
 
 
-class Reach(Enum):
+class ProbeResult(Enum):
     """Result of an attempt to connect to an endpoint."""
 
     ACCEPTED = "accepted"
@@ -100,7 +100,7 @@ class Bus:
             socket.connect(endpoint)
         return socket
 
-    def probe(self, endpoint: str, *, is_publisher: bool = False) -> Reach:
+    def probe(self, endpoint: str, *, is_publisher: bool = False) -> ProbeResult:
         """Try to connect to a router or a publisher; this takes up to four seconds.
 
         A service that rejects the key closes the connection. A service that hangs does not.
@@ -117,9 +117,9 @@ class Bus:
         monitor.close()
         self.drop(probe, linger_s=0.0)
         if zmq.EVENT_HANDSHAKE_SUCCEEDED in events:
-            return Reach.ACCEPTED
+            return ProbeResult.ACCEPTED
         is_refused = {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
-        return Reach.REFUSED if is_refused else Reach.UNREACHABLE
+        return ProbeResult.REFUSED if is_refused else ProbeResult.UNREACHABLE
 
     def wake_on_connections(self, waker: Waker) -> None:
         """Wake the caller's loop when a connection ends, or while a message is incomplete."""

@@ -45,7 +45,7 @@ SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
 MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
 MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
 STALLED_S = 1.0  # a live subscriber that reads nothing for this time is disconnected
-NEW_LOOKS = 20  # checks in which a connection is new; a flood is disconnected earlier
+NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
 MAX_ENDED = 1024  # ended connections that a service has not handled yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
@@ -94,7 +94,7 @@ class Connection:
         self.key = ""  # the peer's key; known when its first message is delivered
         self.budget = Budget()
         self.num_delivered = 0  # messages
-        self.num_looks = 0
+        self.num_checks = 0
         self.topics: set[bytes] = set()
         self.is_cut = False
         self.undelivered = 0  # bytes since the last delivered message
@@ -127,7 +127,7 @@ class Connection:
 
     def update(self, traffic: Traffic, now_s: float) -> None:
         """Update the figures; disconnect a peer whose message does not end."""
-        self.num_looks += 1
+        self.num_checks += 1
         if self.num_delivered != self._delivered_before:
             self._delivered_before, self._read_before = self.num_delivered, traffic.read
             self._mark = (0, self.socket.num_polls)
@@ -362,7 +362,7 @@ class ConnectionLimiter:
         hold = partial(self._tarpit.add, now_s=now_s)
         for connection, reason in self._quota.excess(connections):
             # An older peer may be idle. It must reconnect at once, or its next messages are lost.
-            connection.disconnect(reason, end=hold if connection.num_looks < NEW_LOOKS else None)
+            connection.disconnect(reason, end=hold if connection.num_checks < NEW_CHECKS else None)
         for connection in connections:
             connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
         _disconnect_heaviest(

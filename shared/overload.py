@@ -35,17 +35,17 @@ PACE_PERIOD_S = 0.5  # the load is measured over this time
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class ProcessorTime:
     """Processor time spent on sessions, in seconds."""
 
     network_s: float = 0.0  # in the block network
     others_s: float = 0.0  # in the rest of the recognizer
 
-    def __add__(self, other: Work) -> Work:
-        return Work(self.network_s + other.network_s, self.others_s + other.others_s)
+    def __add__(self, other: ProcessorTime) -> ProcessorTime:
+        return ProcessorTime(self.network_s + other.network_s, self.others_s + other.others_s)
 
-    def __sub__(self, other: Work) -> Work:
-        return Work(self.network_s - other.network_s, self.others_s - other.others_s)
+    def __sub__(self, other: ProcessorTime) -> ProcessorTime:
+        return ProcessorTime(self.network_s - other.network_s, self.others_s - other.others_s)
 
 
 class NetworkPace:
@@ -63,14 +63,14 @@ class NetworkPace:
         The time, in seconds, on any monotonic clock.
     """
 
-    def __init__(self, work: Work, now_s: float) -> None:
+    def __init__(self, work: ProcessorTime, now_s: float) -> None:
         self.hop = 1  # in shortest hops
         self._since_s = self._restored_s = now_s
         self._before = work
         self._needed = 1  # the longest hop needed since ``_restored_s``
         self._is_behind = False  # whether a session has been behind since ``_since_s``
 
-    def update(self, work: Work, now_s: float, *, is_behind: bool) -> int:
+    def update(self, work: ProcessorTime, now_s: float, *, is_behind: bool) -> int:
         """Return the hop, given the work on live sessions so far and if a session is behind."""
         self._is_behind |= is_behind
         passed_s = now_s - self._since_s

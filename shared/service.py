@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, ClassVar
 from kouxing_client.keys import Key
 
 from kouxing.shared import parent_process
-from kouxing.shared.bus import Bus, Reach
+from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import is_loopback, reach_error, split_endpoint, with_key
@@ -407,7 +407,7 @@ class Service(MessageLoop):
     def _warn_about_control(self) -> None:
         """Log why control does not answer, and what to do; runs on a thread, as it waits."""
         with contextlib.suppress(UserError), Bus(self.key) as bus:
-            if bus.probe(self.control_endpoint) is Reach.REFUSED:
+            if bus.probe(self.control_endpoint) is ProbeResult.REFUSED:
                 if self.key is not None and self._load_key() != self.key:
                     LOG.warning("restarting with a new key")
                     self.has_new_key = self._exit_requested = True

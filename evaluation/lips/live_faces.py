@@ -13,7 +13,7 @@ from kouxing.corpora.scoring import is_emitted
 from kouxing.services.live_chain import sound_events
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_frames import LipFrameModel, LipFrameStream, delay_for
+from kouxing.services.recognizer.lip_frames import LipFrameModel, LipFrameStream, choose_delay
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent
@@ -51,7 +51,7 @@ def live_events(
     """
     if lips is None:
         return dict.fromkeys(delays_s, sound_events(model, samples, None, config=config))
-    chosen_s = {delay_s: delay_for(lips.delays_s, delay_s) for delay_s in delays_s}
+    chosen_s = {delay_s: choose_delay(lips.delays_s, delay_s) for delay_s in delays_s}
     several = _AtSeveralDelays(lips, [*chosen_s.values()])
     events = sound_events(model, samples, several, config=config)
     return {

@@ -36,7 +36,7 @@ from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
-from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
@@ -170,7 +170,7 @@ def _methods(
     """Yield the name and the curves of each method."""
     inventory = model.inventory
     table = load_table(inventory)
-    by_endpoints = time_text(progress_of(samples), syllables, table)
+    by_endpoints = time_text(measure_slices(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
         yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
     delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}

@@ -12,7 +12,7 @@ from kouxing_client.keys import Key
 from kouxing.services.cli.clients import find_system
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import KINDS
-from kouxing.shared.bus import Bus, Reach
+from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.control_client import connect
 from kouxing.shared.endpoints import reach_error, split_endpoint, with_key
 from kouxing.shared.errors import UserError
@@ -83,7 +83,7 @@ def _check_key(name: str, key: Key | None, address: str) -> Finding:
             reach = bus.probe(control)
     except UserError as error:
         return Finding(f"key {name}", "cannot be used", str(error))
-    if reach is Reach.ACCEPTED:
+    if reach is ProbeResult.ACCEPTED:
         return Finding(f"key {name}", "control accepts it")
     running, _, running_key = find_control().partition(" ")
     if key is not None and running == address and running_key not in ("", key.control):
@@ -137,7 +137,7 @@ def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str
         roles = {role.partition(":")[0] for role in _roles(key_name)}
         if not is_publisher and ROUTERS.get(name) not in roles:
             continue
-        if bus.probe(endpoint, is_publisher=is_publisher) is Reach.REFUSED:
+        if bus.probe(endpoint, is_publisher=is_publisher) is ProbeResult.REFUSED:
             return (
                 f"it does not accept the key {key_name}; check its roles with 'kouxing keys list'"
                 " on control's machine, or restart the service"

@@ -23,7 +23,7 @@ from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_m
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.alignment import align_syllables, spoken
-from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline import WithProgress, recognize
 from kouxing.services.recognizer.transcriber import Transcriber
@@ -174,7 +174,7 @@ def _time_phones(
         is_long = len(transcript.syllables) > MAX_SYLLABLES
         timing = Timing.ALIGN if is_long else Timing.ENDPOINTS
     if transcript is not None and timing is Timing.ENDPOINTS:
-        recording = progress_of(samples, with_progress), transcript.phones, load_table(inventory)
+        recording = measure_slices(samples, with_progress), transcript.phones, load_table(inventory)
         phones = time_text(*recording)
         ratio = speech_ratio(*recording)
         if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
@@ -256,9 +256,9 @@ def _write_picture(output: Path, mouth: _Mouth) -> str:
             f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this sound has {len(moments)};"
             " cut the sound, or write .mp4 or .csv"
         )
-    picture = drawing.strip(moments, _MOUTHS_PER_ROW, _MOUTH_PX)
+    picture = drawing.draw_strip(moments, _MOUTHS_PER_ROW, _MOUTH_PX)
     if is_svg:
-        write_text(output, drawing.svg(picture))
+        write_text(output, drawing.to_svg(picture))
     else:
         write_picture(output, drawing.rasterize(picture))
     return f"{plural(len(moments), 'key frame')}, {plural(len(mouth.phones), 'phone')}"
@@ -281,7 +281,7 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
             moment = drawing.LabeledMouth(
                 time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels), width
             )
-            writer.write_image(drawing.rasterize(drawing.image(moment, *_VIDEO_SIZE_PX)))
+            writer.write_image(drawing.rasterize(drawing.draw_image(moment, *_VIDEO_SIZE_PX)))
     return f"{plural(len(frames), 'image')}, {plural(len(mouth.phones), 'phone')}"
 
 

@@ -37,7 +37,7 @@ from kouxing.services.mouth_profiles.lip_tracks import (
     lip_measures,
 )
 from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
-from kouxing.services.recognizer.lip_frames import delay_for
+from kouxing.services.recognizer.lip_frames import choose_delay
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
@@ -169,7 +169,7 @@ def measure_gain(lip_predictor: LipPredictor, observations: Observations) -> Pro
     first_held_out = round((1 - _HELD_OUT) * len(observations))
     profile = fit_profile(observations[:first_held_out])
     held_out = observations[first_held_out:]
-    delay_s = delay_for(lip_predictor.delays_s, FACE_DELAY_S)
+    delay_s = choose_delay(lip_predictor.delays_s, FACE_DELAY_S)
     delay = lip_predictor.delays_s.index(delay_s)
     versions = (held_out.tracked, held_out.predicted, apply_profile(profile, held_out))
     tracked, before, after = (lip_measures(faps[:, delay]) for faps in versions)

@@ -53,7 +53,7 @@ class LipFrameModel(Protocol):
         """Adapt the model to the speaker of a mouth profile; ``UserError`` if it does not fit."""
 
 
-def delay_for(delays_s: Sequence[float], face_delay_s: float) -> float:
+def choose_delay(delays_s: Sequence[float], face_delay_s: float) -> float:
     """Choose the longest delay whose lip frames are in time for a face with a delay."""
     in_time = [delay for delay in delays_s if delay + POSITION_LAG_S <= face_delay_s + 1e-6]
     return max(in_time, default=min(delays_s))

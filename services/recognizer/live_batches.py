@@ -7,7 +7,7 @@ from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.shared.metrics import LoadMeter
-from kouxing.shared.overload import MAX_HOP, NetworkPace, Work
+from kouxing.shared.overload import MAX_HOP, NetworkPace, ProcessorTime
 
 MAX_BATCH_S = 0.3  # of audio that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
@@ -51,7 +51,7 @@ class LiveBatches:
         self._busy = busy
         self._on_early, self._on_decoded, self._on_batch = on_early, on_decoded, on_batch
         self._network = NetworkThread(recognizer, wake)
-        self.unpaced_work = Work()  # part of ``work`` that is not for live audio
+        self.unpaced_work = ProcessorTime()  # part of ``work`` that is not for live audio
         self._pace = NetworkPace(self.work, time.monotonic())
 
     @property
@@ -60,10 +60,10 @@ class LiveBatches:
         return self._pace.hop
 
     @property
-    def work(self) -> Work:
+    def work(self) -> ProcessorTime:
         """The work of the service so far."""
         network_s = self._recognizer.network_s
-        return Work(network_s, time.thread_time() + self._network.work_s - network_s)
+        return ProcessorTime(network_s, time.thread_time() + self._network.work_s - network_s)
 
     def decode_all(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode all queued audio of sessions."""

@@ -13,7 +13,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     AcousticStream,
     Floats,
-    Work,
+    ScoreRequest,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
 from kouxing.services.recognizer.ear import EarPosition, EarStream, process_positions
@@ -202,7 +202,7 @@ class SpeechScorer:
                 self._events.append(item)
         self._queue.extendleft(reversed(unscored))
 
-    def next_work(self) -> Work:
+    def next_request(self) -> ScoreRequest:
         """Return the audio to score next."""
         item, stream = self._queue[0], self._stream
         self._last_provisional = stream.provisional
@@ -212,7 +212,7 @@ class SpeechScorer:
         return stream, item.phones if stream.uses_ear else item.features
 
     def add_scores(self, settled: Floats) -> None:
-        """Add the settled scores of ``next_work``, (m, states)."""
+        """Add the settled scores of ``next_request``, (m, states)."""
         item, provisional = self._queue.popleft(), self._stream.provisional
         self._num_unscored -= len(settled)
         if len(settled) or provisional is not self._last_provisional:
@@ -237,6 +237,6 @@ def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     while ready := [scorer for scorer in scorers if scorer.is_ready]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]
-        scores = model.score([scorer.next_work() for scorer in batch])
+        scores = model.score([scorer.next_request() for scorer in batch])
         for scorer, settled in zip(batch, scores, strict=True):
             scorer.add_scores(settled)

@@ -12,7 +12,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, F
 from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.pcm import SliceMeter
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.services.recognizer.lip_frames import LipFrameModel, delay_for
+from kouxing.services.recognizer.lip_frames import LipFrameModel, choose_delay
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import SpeechScorer
@@ -181,7 +181,7 @@ class SpeechStream:
         lip_stream = start_frame = None
         if self._lip_predictor is not None:
             lip_stream = self._lip_predictor.create_stream(
-                [delay_for(self._lip_predictor.delays_s, self._face_delay_s)]
+                [choose_delay(self._lip_predictor.delays_s, self._face_delay_s)]
             )
         if self._speech_time and self._first_chunk is not None:
             start_frame = frame_at(to_seconds(self._speech_time - media_time))

@@ -51,16 +51,16 @@ _STATE_S = 0.8  # time constant of a change of the head's motion
 _BREATH_HZ, _BREATH_DEG = 0.23, 0.35
 
 
-def span(first: str, last: str) -> slice:
+def fap_slice(first: str, last: str) -> slice:
     """Return where successive FAPs are in an array (68,)."""
     return slice(FAP_NUMBER[first] - 1, FAP_NUMBER[last])
 
 
-_LIDS_UPPER = span("close_t_l_eyelid", "close_t_r_eyelid")
-_LIDS_LOWER = span("close_b_l_eyelid", "close_b_r_eyelid")
-EYES_YAW = span("yaw_l_eyeball", "yaw_r_eyeball")
-EYES_PITCH = span("pitch_l_eyeball", "pitch_r_eyeball")
-_HEAD = span("head_pitch", "head_roll")
+_LIDS_UPPER = fap_slice("close_t_l_eyelid", "close_t_r_eyelid")
+_LIDS_LOWER = fap_slice("close_b_l_eyelid", "close_b_r_eyelid")
+EYES_YAW = fap_slice("yaw_l_eyeball", "yaw_r_eyeball")
+EYES_PITCH = fap_slice("pitch_l_eyeball", "pitch_r_eyeball")
+_HEAD = fap_slice("head_pitch", "head_roll")
 
 
 class State(Enum):

@@ -11,7 +11,7 @@ import pytest
 from kouxing_client import Client, KouxingError
 
 from kouxing.services.kinds import KINDS
-from kouxing.shared.bus import Bus, Reach
+from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
@@ -88,7 +88,7 @@ def test_a_socket_accepts_only_keys_of_its_role(
         dealer.send(StatusRequest(request="1"))
         assert router.wait(LIMIT_S if gets_in else 0.5) == gets_in
         assert [item.sender.key for item in router.receive()] == gets_in * [key.public]
-        assert (bus.probe(endpoint) is Reach.ACCEPTED) == gets_in
+        assert (bus.probe(endpoint) is ProbeResult.ACCEPTED) == gets_in
 
 
 def test_rejects_a_key_of_another_system(
@@ -101,8 +101,8 @@ def test_rejects_a_key_of_another_system(
     with Bus(key) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
         assert not router.wait(0.5)
-        assert bus.probe(endpoint) is Reach.REFUSED
-        assert bus.probe(with_key(router.endpoint, control.public)) is Reach.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REFUSED
+        assert bus.probe(with_key(router.endpoint, control.public)) is ProbeResult.REFUSED
 
 
 def test_a_hung_control_does_not_answer() -> None:
@@ -194,14 +194,14 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     with service.bus, Bus(key) as bus:
         router = service.bus.bind_router(LOCAL, "recognizer.audio")
         endpoint = with_key(router.endpoint, service.key.public if service.key else "")
-        assert bus.probe(endpoint) is Reach.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REFUSED
         key_folder().chmod(0o755)  # nothing is written there
         allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
         service._allow_keys(allowed)
         assert "until this process ends: other users can read" in caplog.text
-        assert bus.probe(endpoint) is not Reach.REFUSED
+        assert bus.probe(endpoint) is not ProbeResult.REFUSED
         service._allow_keys({})
-        assert bus.probe(endpoint) is Reach.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REFUSED
 
 
 @pytest.mark.parametrize(

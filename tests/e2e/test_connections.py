@@ -132,7 +132,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
     with connected(port_of(faps), "SUB") as hostile:
         for number in range(MAX_TOPICS // MAX_TOPIC):
             hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_TOPIC, "x").encode()))
-        assert not is_cut(hostile, faps, num_looks=20)
+        assert not is_cut(hostile, faps, num_checks=20)
         hostile.sendall(frame(b"\x01x"))
         assert is_cut(hostile, faps)
     with connected(port_of(faps), "SUB") as hostile:
@@ -145,7 +145,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
 
 def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peer_quota, "MAX_CONNECTIONS", 4)
-    monkeypatch.setattr(connections, "NEW_LOOKS", 10**6)
+    monkeypatch.setattr(connections, "NEW_CHECKS", 10**6)
     monkeypatch.setattr(tarpit, "HOLD_S", 600.0)
     with contextlib.ExitStack() as stack:
         with Bus() as bus:
@@ -156,9 +156,9 @@ def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch)
         wait_until(lambda: all(has_ended(peer) for peer in peers))
 
 
-def is_cut(connection: socket.socket, bound: Socket, num_looks: int = 500) -> bool:
+def is_cut(connection: socket.socket, bound: Socket, num_checks: int = 500) -> bool:
     """Whether a connection ends soon, while its other end's messages are received."""
-    for _ in range(num_looks):
+    for _ in range(num_checks):
         list(bound.receive())
         if has_ended(connection):
             return True

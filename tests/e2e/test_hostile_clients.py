@@ -12,7 +12,7 @@ from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, Sou
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
 from kouxing.evaluation.system.attacks import Memory
 from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
-from kouxing.shared.bus import Bus, Reach
+from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
 from kouxing.shared.records import replace
@@ -127,7 +127,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
         assert max(frame.media_time for frame in frames) <= 16000
         assert not stranger.wait(0.1), "it gets no sequence number"
     with Bus(user_key()) as bus:
-        assert bus.probe(endpoint) is Reach.REFUSED, "a client does not even get in"
+        assert bus.probe(endpoint) is ProbeResult.REFUSED, "a client does not even get in"
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 
 from kouxing_client import FapFrame, Sound
-from kouxing_client.follower import CATCH_UP_S, KEEP_S, MAX_OLD, RETRY_S, Follower
+from kouxing_client.follower import CATCH_UP_S, MAX_HELD_FRAMES, OVERLAP_S, RETRY_S, Follower
 from kouxing_client.messages import EndOfFaps, Joined, Message
 
 from tests.fake_sockets import FakeConnection, FakeSockets
@@ -90,7 +90,7 @@ def test_follows_a_move_to_another_publisher() -> None:
     assert not scene.follower.has_ended
     assert scene.follower.num_outdated == 1
     assert old.is_open, "the publisher of phones is still connected there"
-    scene.sockets.now_s += KEEP_S
+    scene.sockets.now_s += OVERLAP_S
     scene.follower.tick()
     assert not old.is_open
 
@@ -105,7 +105,7 @@ def test_drops_copies_from_a_second_connection() -> None:
     for connection, number in ((old, 1), (old, 3), (scene.connection, 2), (scene.connection, 3)):
         connection.on_message(sound(number))
     old.unread.append(sound(4))
-    scene.sockets.now_s += KEEP_S
+    scene.sockets.now_s += OVERLAP_S
     scene.follower.tick()
     assert scene.received == [sound(number) for number in (1, 3, 2, 4)]
 
@@ -142,5 +142,5 @@ def test_drops_old_live_frames_after_the_process_was_suspended() -> None:
     assert scene.received == frames[:1]
     scene.sockets.now_s += CATCH_UP_S
     scene.publish(frames[-1])
-    assert scene.received == [frames[0], *frames[-1 - MAX_OLD :]]
-    assert scene.follower.num_missed == 28 - MAX_OLD
+    assert scene.received == [frames[0], *frames[-1 - MAX_HELD_FRAMES :]]
+    assert scene.follower.num_missed == 28 - MAX_HELD_FRAMES

@@ -11,7 +11,7 @@ from kouxing.shared.budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, Budget
 from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
     MAX_QUEUED,
-    NEW_LOOKS,
+    NEW_CHECKS,
     NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
     TRIMS_S,
@@ -183,10 +183,10 @@ def test_an_idle_surplus_peer_can_reconnect_at_once(scene: Scene) -> None:
     scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
     for number in range(10):
         scene.limiter.find(number, scene.socket)
-    for look in range(NEW_LOOKS):
+    for look in range(NEW_CHECKS):
         scene.enforce_limits(float(look))
     scene.deliver(10, "talker")
-    scene.enforce_limits(float(NEW_LOOKS))
+    scene.enforce_limits(float(NEW_CHECKS))
     assert scene.ended == {0}
     assert not scene.held
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
@@ -120,7 +120,7 @@ def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
 
 def test_segments_end_at_pauses_dips_and_hisses() -> None:
     parts = [("-", 0.4), ("v", 0.2), ("-", 0.2), ("v", 0.2), ("n", 0.08), ("v", 0.2)]
-    segments = segment_speech(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
+    segments = segment_speech(measure_slices(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
     starts = [segment.start_s for segment in segments]
     np.testing.assert_allclose(starts, [0.4, 0.8, 1.0, 1.28], atol=0.045)
     assert segments[0].end_s == pytest.approx(0.6, abs=0.045)
@@ -136,13 +136,13 @@ def test_streaming_finds_the_same_segments() -> None:
         if isinstance(output, Progress):
             segments += segmenter.add_slice(output)
     segments += segmenter.finish()
-    assert segments == segment_speech(progress_of(samples))
+    assert segments == segment_speech(measure_slices(samples))
     assert len(segments) > 3
 
 
 def test_finals_follow_by_the_influence_factor() -> None:
     sound = speech([("-", 0.4), ("n", 0.06), ("v", 0.2), ("s", 0.12), ("v", 0.2), ("-", 0.4)])
-    phones = time_text(progress_of(sound), [("m", "a"), ("s", "an")], TABLE)
+    phones = time_text(measure_slices(sound), [("m", "a"), ("s", "an")], TABLE)
     assert [phone.symbol for phone in phones] == ["m", "a", "s", "an"]
     m, a, s, an = phones
     assert m.onset_s == pytest.approx(0.4, abs=0.05)
@@ -153,7 +153,7 @@ def test_finals_follow_by_the_influence_factor() -> None:
 
 
 def test_rejects_text_that_cannot_be_timed() -> None:
-    silent = progress_of(speech([("-", 1.0)]))
+    silent = measure_slices(speech([("-", 1.0)]))
     with pytest.raises(UserError, match="no speech was found"):
         time_text(silent, [("a",)], TABLE)
     with pytest.raises(UserError, match="the text is empty"):

@@ -8,7 +8,7 @@ import pytest
 from kouxing.services.cli.mouth_drawing import draw_mouth
 from kouxing.services.cli.options import DrawnLips
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.languages import limit_phones, model_of_language
+from kouxing.services.recognizer.acoustic.languages import model_of_language, restrict_phones
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline import recognize
 from kouxing.shared.audio_file import read_audio
@@ -53,7 +53,7 @@ def test_a_model_of_other_phones_is_an_error() -> None:
 
 def test_limits_the_phones_of_a_model() -> None:
     model = load_model("gmm")
-    limited = limit_phones(model, ("sil", "i", "u"))
+    limited = restrict_phones(model, ("sil", "i", "u"))
     assert {phone.symbol for phone in recognize(limited, SAMPLES, 16_000)} <= {"sil", "i", "u"}
     assert "ao" in {phone.symbol for phone in recognize(model, SAMPLES, 16_000)}
 

@@ -15,7 +15,7 @@ from kouxing.shared.overload import (
     RESTORE_AFTER_S,
     NetworkPace,
     Overload,
-    Work,
+    ProcessorTime,
 )
 
 MAX_BEHIND_S = 0.2
@@ -174,7 +174,7 @@ class Recognizer:
 
     def __init__(self) -> None:
         self.now_s = 100.0
-        self._work = Work(others_s=3.0)  # the start of the service
+        self._work = ProcessorTime(others_s=3.0)  # the start of the service
         self.pace = NetworkPace(self._work, self.now_s)
 
     def run(
@@ -184,7 +184,7 @@ class Recognizer:
         hops = []
         for _ in range(round(duration_s / CHUNK_S)):
             self.now_s += CHUNK_S
-            done = Work(network * CHUNK_S / self.pace.hop, others * CHUNK_S)
+            done = ProcessorTime(network * CHUNK_S / self.pace.hop, others * CHUNK_S)
             self._work += done
             hops.append(self.pace.update(self._work, self.now_s, is_behind=is_behind))
         return hops

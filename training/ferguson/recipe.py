@@ -28,12 +28,12 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_c
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
-from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
 from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
 from kouxing.services.synthesizer.lips.ferguson.key_frames import anchors_of
 from kouxing.services.synthesizer.lips.ferguson.table import COLUMNS, MAX_OPENING, PhoneTable
-from kouxing.services.synthesizer.lips.ferguson.timing import Hiss
+from kouxing.services.synthesizer.lips.ferguson.timing import OnsetCrossings
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -64,7 +64,7 @@ def phone_table(
     crossings: dict[str, list[float]] = defaultdict(list)
     shares: dict[str, list[float]] = defaultdict(list)
     for recording in speech:
-        hiss = Hiss(recording.slices)
+        hiss = OnsetCrossings(recording.slices)
         remaining = iter(recording.phones)
         for syllable in recording.syllables:
             phones = list(islice(remaining, len(syllable)))
@@ -289,7 +289,7 @@ def aligned_speech(
         except (UserError, OSError, ValueError) as error:
             errors.add(row.utterance_id, str(error))
             continue
-        yield AlignedSpeech(progress_of(samples), syllables, spoken(phones, model.inventory))
+        yield AlignedSpeech(measure_slices(samples), syllables, spoken(phones, model.inventory))
 
 
 def format_table(table: PhoneTable, inventory: PhoneInventory, about: list[str]) -> str:

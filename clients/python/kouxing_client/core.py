@@ -213,7 +213,7 @@ class ClientCore:
             except KouxingError:
                 return  # control may restart
             else:
-                session.place({name: state[name] for name in ("phones", "faps")})
+                session.set_endpoints({name: state[name] for name in ("phones", "faps")})
 
         self.status(session.name).add_done_callback(place)
 

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 from kouxing_client.errors import KouxingError
 
 RETRY_S = 3.0  # an unconfirmed subscription is made again after this time
-KEEP_S = 3.0  # how long a connection that may be dead stays open for what TCP still delivers
+OVERLAP_S = 3.0  # how long a connection that may be dead stays open for what TCP still delivers
 CATCH_UP_S = 0.1  # queued messages arrive within this time after a suspension
-MAX_OLD = 8  # how many of these live frames are kept
+MAX_HELD_FRAMES = 8  # how many of these live frames are kept
 END = "end-of-faps"
 _PUBLISHER_OF = {"fap-frame": "faps", END: "faps"}  # endpoint; other kinds are at "phones"
 _Number = tuple[int, int]  # epoch and sequence, or media time and sequence
@@ -52,9 +52,9 @@ class Follower:
     """Receives chosen classes of messages of one session, in order and each message once.
 
     After a move, the old connection stays open until the new subscriptions are in effect, and
-    ``KEEP_S`` longer if one of the publishers stays the same. If a publisher does not confirm, the
-    follower subscribes again: libzmq never reconnects a socket to an address where another program
-    answered before.
+    ``OVERLAP_S`` longer if one of the publishers stays the same. If a publisher does not confirm,
+    the follower subscribes again: libzmq never reconnects a socket to an address where another
+    program answered before.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ class Follower:
         Classes of messages to subscribe to. They have the attribute ``kind``, and their instances
         ``epoch``, ``sequence`` and ``media_time``.
     live
-        Whether late frames are worthless. If so, only the newest ``MAX_OLD`` of the frames that
-        queued while this process was suspended are passed on.
+        Whether late frames are worthless. If so, only the newest ``MAX_HELD_FRAMES`` of the frames
+        that queued while this process was suspended are passed on.
     on_complete
         Called when every publisher has confirmed: no later message is missed. Called again after
         each ``start``.
@@ -101,7 +101,7 @@ class Follower:
         self._retry_s = math.inf
         self._addresses: set[str] = set()
         self._live_addresses: set[str] = set()
-        self._stays = False  # one of the addresses was also among those before
+        self._keeps_publisher = False  # one of the addresses was also among those before
         self._confirmed: set[str] = set()  # publishers
         self._first_epoch = 0
         self._epochs: dict[str, int] = {}  # publisher: epoch of its newest message
@@ -110,7 +110,7 @@ class Follower:
         self._seen: set[tuple[str, _Number]] = set()  # messages since it subscribed again
         self._last_frame = _NONE  # media time and sequence
         self._last_sequence: int | None = None
-        self._held_frames: deque[Any] = deque(maxlen=MAX_OLD)
+        self._held_frames: deque[Any] = deque(maxlen=MAX_HELD_FRAMES)
 
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
         """Subscribe to ``endpoints``; when called again, where the session is published now.
@@ -134,10 +134,10 @@ class Follower:
         self._addresses = addresses
         if has_incomplete and replaced is not None:
             self._transport.close_connection(replaced)  # so far, only the old one works
-            self._stays = self._stays and stays
+            self._keeps_publisher = self._keeps_publisher and stays
         else:
             self._close_old_connection()
-            self._old_connection, self._stays = replaced, stays
+            self._old_connection, self._keeps_publisher = replaced, stays
             self._newest_before, self._seen = dict(self._newest), set()
         self._close_old_due_s = math.inf
         self._first_epoch = self._first_epoch or epoch
@@ -229,7 +229,9 @@ class Follower:
         if len(confirmed) >= len(self._addresses):
             self.is_complete = True
             self._retry_s = math.inf
-            self._close_old_due_s = self._transport.now_s + (KEEP_S if self._stays else 0.0)
+            self._close_old_due_s = self._transport.now_s + (
+                OVERLAP_S if self._keeps_publisher else 0.0
+            )
             self.tick()
             self._on_complete()
 

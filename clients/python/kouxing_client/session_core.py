@@ -265,14 +265,14 @@ class SessionCore:
         if moved["epoch"] <= self.epoch:
             return
         self.epoch = moved["epoch"]
-        self.place({name: moved[name] for name in ("audio", "phones", "faps")})
+        self.set_endpoints({name: moved[name] for name in ("audio", "phones", "faps")})
         next_sequence = moved.get("next_sequence")
         if self.stream is not None and next_sequence:
             self._unknown = None
             self.stream.move(next_sequence, self.sockets.now_s)
             self.connect()
 
-    def place(self, endpoints: Fields) -> None:
+    def set_endpoints(self, endpoints: Fields) -> None:
         """Subscribe again if the session is published somewhere else now."""
         old, self.endpoints = self.endpoints, {**self.endpoints, **endpoints}
         if any(old[name] != self.endpoints[name] for name in ("phones", "faps")):

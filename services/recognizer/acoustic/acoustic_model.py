@@ -90,7 +90,7 @@ def empty_scores(num_states: int) -> Floats:
 
 
 # A stream and the front end's next frames, (n, k), or None at the end of a segment.
-Work: TypeAlias = tuple[AcousticStream, Floats | None]
+ScoreRequest: TypeAlias = tuple[AcousticStream, Floats | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ class AcousticModel(ABC):
         """Create the stream of one speaker."""
 
     @abstractmethod
-    def score(self, work: Sequence[Work]) -> list[Floats]:
+    def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score several streams in one batch, with the same scores as one by one."""
 
 

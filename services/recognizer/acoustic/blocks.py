@@ -53,7 +53,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, Work
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, ScoreRequest
 from kouxing.services.recognizer.acoustic.light import LightModel, light_model
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.acoustic.network import (
@@ -103,10 +103,10 @@ class BlockModel(NetworkModel):
         """Create the stream of one speaker."""
         return BlockStream(self)
 
-    def score(self, work: Sequence[Work]) -> list[Floats]:
+    def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score frames of several streams in batches; None ends a stream's segment."""
-        streams = [cast(BlockStream, stream) for stream, _ in work]
-        for stream, (_, frames) in zip(streams, work, strict=True):
+        streams = [cast(BlockStream, stream) for stream, _ in requests]
+        for stream, (_, frames) in zip(streams, requests, strict=True):
             stream.append_frames(frames)
         while ready := [stream for stream in streams if stream.is_due]:
             num_kept = ready[0].block().num_kept

@@ -36,7 +36,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     AcousticStream,
     Floats,
-    Work,
+    ScoreRequest,
 )
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
 from kouxing.services.recognizer.front_end.features import (
@@ -114,9 +114,9 @@ class GmmModel(AcousticModel):
         """Create the stream of one speaker; it has no positions."""
         return GmmStream(self)
 
-    def score(self, work: Sequence[Work]) -> list[Floats]:
+    def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score the frames of several streams, one stream at a time."""
-        return [stream.score(frames) for stream, frames in work]
+        return [stream.score(frames) for stream, frames in requests]
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""

@@ -42,7 +42,7 @@ def model_of_language(language: str | None = None, acoustic: str | None = None) 
             f"the acoustic model {acoustic or UNIVERSAL} has the phones of {of_model}; use that"
             f" language, or a model for {language}"
         )
-    return limit_phones(model, inventory.phones)
+    return restrict_phones(model, inventory.phones)
 
 
 @cache
@@ -50,7 +50,7 @@ def _load(acoustic: str) -> AcousticModel:
     return load_model(acoustic)
 
 
-def limit_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticModel:
+def restrict_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticModel:
     """Return a model that recognizes only some of its phones. Both share the network."""
     language_model = model.topology.phone_lm
     kept = np.array([phone in phones for phone in model.inventory.phones])

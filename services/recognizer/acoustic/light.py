@@ -28,8 +28,8 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     AcousticStream,
     Floats,
+    ScoreRequest,
     Topology,
-    Work,
 )
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
@@ -74,9 +74,9 @@ class LightModel(AcousticModel):
         """Create the stream of one speaker."""
         return LightStream(self)
 
-    def score(self, work: Sequence[Work]) -> list[Floats]:
+    def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score the ear's rows of several streams; None ends a stream's segment."""
-        return [self._scores_of(cast(LightStream, stream).take(rows)) for stream, rows in work]
+        return [self._scores_of(cast(LightStream, stream).take(rows)) for stream, rows in requests]
 
     def _scores_of(self, rows: Floats) -> Floats:
         num_states = np.diff(self.topology.first_state)

@@ -110,7 +110,7 @@ class SliceMeter:
             )
 
 
-def progress_of(
+def measure_slices(
     samples: NDArray[np.float32],
     with_progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> list[Progress]:

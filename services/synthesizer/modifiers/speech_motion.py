@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.services.synthesizer.modifiers.prosody import Prosody, ProsodyTracker
 from kouxing.shared.face.faps import RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.idle_motion import EYES_PITCH, EYES_YAW, IdleMotion, State, span
+from kouxing.shared.face.idle_motion import EYES_PITCH, EYES_YAW, IdleMotion, State, fap_slice
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # prominence of syllables with these movements
@@ -56,9 +56,9 @@ _LIFT_DEG = 0.6  # upwards, with a pitch one spread above the mean
 _TILT_DEG, _TURN_DEG = 4.0, 2.5
 _TURN_S = 0.5  # start times in the same interval of this length have the same direction
 
-_BROWS = span("raise_l_i_eyebrow", "raise_r_o_eyebrow")
+_BROWS = fap_slice("raise_l_i_eyebrow", "raise_r_o_eyebrow")
 _BROW_UNITS = np.array([*_BROW.values()], np.float32)
-_HEAD = span("head_pitch", "head_roll")
+_HEAD = fap_slice("head_pitch", "head_roll")
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 

@@ -1,6 +1,6 @@
 """Draws the mouth in two dimensions, as SVG text or pictures.
 
-A drawing is a list of outlines and labels, in pixels, y downwards. ``svg`` and ``rasterize``
+A drawing is a list of outlines and labels, in pixels, y downwards. ``to_svg`` and ``rasterize``
 convert it to the text of a file and to a picture.
 """
 
@@ -64,7 +64,7 @@ class Drawing:
     labels: list[Label] = field(default_factory=list)
 
 
-def mouth(
+def draw_mouth(
     opening: float, center_px: tuple[float, float], width_px: float, width: float = 1.0
 ) -> list[Outline]:
     """Draw a mouth with opening R, 0 to 5.
@@ -127,7 +127,7 @@ class LabeledMouth:
     width: float = 1.0  # relative to the mouth at rest
 
 
-def strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> Drawing:
+def draw_strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> Drawing:
     """Draw mouths in order of time, in rows, with syllables above, phones and times below.
 
     ``mouth_px`` is the width of a mouth.
@@ -147,7 +147,7 @@ def strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> 
             label = Label(labeled.syllable, middle, top + 1.4 * text_px, 1.2 * text_px)
             drawing.labels.append(label)
         center = (middle, mouth_top + HIGHEST * mouth_px)
-        drawing.outlines.extend(mouth(labeled.opening, center, mouth_px, labeled.width))
+        drawing.outlines.extend(draw_mouth(labeled.opening, center, mouth_px, labeled.width))
         below = mouth_top + mouth_height_px
         drawing.labels.append(Label(labeled.phone, middle, below + 1.1 * text_px, text_px))
         time = f"{labeled.time_s:.2f} s"
@@ -157,13 +157,13 @@ def strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> 
     return drawing
 
 
-def image(labeled: LabeledMouth, width_px: int, height_px: int) -> Drawing:
+def draw_image(labeled: LabeledMouth, width_px: int, height_px: int) -> Drawing:
     """Draw one mouth that fills a picture, with its time and speech."""
     drawing = Drawing(width_px, height_px)
     text_px = 0.06 * height_px
     mouth_px = min(width_px / WIDTH, (height_px - 3.0 * text_px) / (HIGHEST - LOWEST))
     center = (0.5 * width_px, 0.5 * text_px + HIGHEST * mouth_px)
-    drawing.outlines.extend(mouth(labeled.opening, center, mouth_px, labeled.width))
+    drawing.outlines.extend(draw_mouth(labeled.opening, center, mouth_px, labeled.width))
     below = height_px - text_px
     drawing.labels.append(
         Label(f"{labeled.time_s:.2f} s", text_px, below, text_px, _FAINT_INK, "start")
@@ -175,7 +175,7 @@ def image(labeled: LabeledMouth, width_px: int, height_px: int) -> Drawing:
     return drawing
 
 
-def svg(drawing: Drawing) -> str:
+def to_svg(drawing: Drawing) -> str:
     """Return a drawing as the text of an SVG file."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{drawing.width_px}"'

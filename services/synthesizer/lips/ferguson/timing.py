@@ -119,7 +119,7 @@ def syllable_times(
         crossings=np.array([table.crossings[phones[0]] for phones in syllables]),
     )
     times_s = np.zeros((len(syllables), 2))
-    for group in _cheapest_assignment(segments, text, Hiss(slices)):
+    for group in _cheapest_assignment(segments, text, OnsetCrossings(slices)):
         start_s, end_s = segments[group.first_segment].start_s, segments[group.last_segment].end_s
         duration_s = text.duration_s[group.syllables]
         share = np.concatenate([[0.0], np.cumsum(duration_s) / duration_s.sum()])
@@ -145,7 +145,7 @@ class _Group:
     syllables: slice
 
 
-class Hiss:
+class OnsetCrossings:
     """The maximum zero-crossing rate within a consonant's duration after any time."""
 
     def __init__(self, slices: Sequence[Progress]) -> None:
@@ -162,7 +162,9 @@ class Hiss:
         return maximum
 
 
-def _cheapest_assignment(segments: Sequence[Segment], text: _Text, hiss: Hiss) -> list[_Group]:
+def _cheapest_assignment(
+    segments: Sequence[Segment], text: _Text, hiss: OnsetCrossings
+) -> list[_Group]:
     """Assign every syllable; total_cost[n, s] is for the first n segments and s syllables."""
     num_segments, num_syllables = len(segments), len(text.duration_s)
     until_s = np.concatenate([[0.0], np.cumsum(text.duration_s)])
