@@ -49,7 +49,7 @@ export class LipSync extends EventTarget {
   express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;
   /** Start suspended sound. Call it from a click handler. */
   resume(): Promise<void>;
-  /** Stop following the sound. */
+  /** Stop following the sound. The face returns to rest. */
   stop(): void;
   /** Stop, and release all resources. */
   close(): void;

@@ -2,7 +2,7 @@
 
 import { FrameTrack } from "./frame-track.js";
 
-const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
+const SHOW_AFTER_S = 0.12; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
 const DEFAULT_SHAPES = ["arkit"];
 const MAX_LATE_S = 0.5; // from the sound to its face
 const TELEPHONE_HZ = 8000;
@@ -29,7 +29,9 @@ export class LipSync extends EventTarget {
   #ownsContext;
   #session = 0; // number of the newest
   #track = new FrameTrack();
-  #source = null; // { node, release(), startS: null before the first sound, isPlayed }
+  #source = null; // { node, release() }
+  #startS = null; // start of the session on the context's clock; null before the first sound, and for push()
+  #isPlayed = false; // whether the page plays the sound
   #pending = null; // the request that the worker has not answered: { answer, resolve, reject }
   #isSpeaking = false;
   #isLaughing = false;
@@ -102,14 +104,12 @@ export class LipSync extends EventTarget {
     const { port1, port2 } = new MessageChannel();
     await this.#open({ sampleRateHz: context.sampleRate }, port1);
     const input = new AudioWorkletNode(context, "kouxing-lips", { channelCount: 1, channelCountMode: "explicit", numberOfOutputs: 0 });
-    const isPlayed = node.isPlayed;
-    const delay = isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
+    this.#isPlayed = node.isPlayed;
+    const delay = node.isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
     node.connect(input);
     if (delay) node.connect(delay).connect(context.destination);
     this.#source = {
       node,
-      isPlayed,
-      startS: null,
       release() {
         input.port.postMessage(null);
         node.disconnect(input);
@@ -176,10 +176,9 @@ export class LipSync extends EventTarget {
 
   /** The face to show now, for sound from listenTo(): { faps, arkit, ... }; null before the first. */
   get current() {
-    const startS = this.#source?.startS ?? null;
-    if (startS === null) return this.#track.at(Infinity);
-    const latencyS = this.#source.isPlayed ? (this.#context.outputLatency ?? 0) : 0;
-    return this.#track.at(this.#context.currentTime - startS - SHOW_AFTER_S - latencyS);
+    if (this.#startS === null) return this.#track.at(Infinity);
+    const latencyS = this.#isPlayed ? (this.#context.outputLatency ?? 0) : 0;
+    return this.#track.at(this.#context.currentTime - this.#startS - SHOW_AFTER_S - latencyS);
   }
 
   /** Return the face at a time of the session, seconds. */
@@ -187,10 +186,12 @@ export class LipSync extends EventTarget {
     return this.#track.at(timeS);
   }
 
-  /** Stop following the sound. */
+  /** Stop following the sound. The face returns to rest. */
   stop() {
-    this.#source?.release();
+    if (this.#source === null) return;
+    this.#source.release();
     this.#source = null;
+    this.#worker.postMessage({ type: "finish", session: this.#session });
   }
 
   /** Stop, and release all resources. */
@@ -205,6 +206,7 @@ export class LipSync extends EventTarget {
 
   async #open(options, input = null) {
     this.#track = new FrameTrack();
+    this.#startS = null;
     const session = ++this.#session;
     const message = { type: "open", session, options: { ...this.#options, ...options }, input };
     await this.#request("opened", message, input ? [input] : []);
@@ -254,7 +256,7 @@ export class LipSync extends EventTarget {
     this.#track.push(frames);
     const { timeS, isSpeaking, isLaughing } = frames.at(-1);
     if (this.#source) {
-      this.#source.startS = startS;
+      this.#startS = startS;
       if (this.#mayBeSlow && this.#context.currentTime - startS - timeS > MAX_LATE_S) {
         this.#mayBeSlow = false; // one notice is enough
         this.#report(TEXTS.slow);

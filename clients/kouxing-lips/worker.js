@@ -40,6 +40,7 @@ const HANDLERS = {
   },
 
   finish({ session }) {
+    port?.close();
     send(session, engine.finish());
     self.postMessage({ type: "finished", session });
   },

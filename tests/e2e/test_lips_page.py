@@ -58,7 +58,20 @@ def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
         browser.wait_for(f"{FACE}.shown && {FACE}.shown[2] > 20")
         browser.click("microphone")
         assert browser.evaluate("document.getElementById('microphone').ariaPressed") == "false"
+        browser.wait_for(f"Math.abs({FACE}.shown[2]) < 1")  # the face returns to rest
     assert not [text for text in browser.complaints if "GL Driver" not in text]
+
+
+def test_the_page_fits_on_a_phone(browser: Browser, site: Path) -> None:
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.resize(*SIZE_PX, mobile=True)
+        try:
+            browser.command("Page.reload")
+            browser.wait_for(f"{FACE}?.set != null")
+            assert browser.evaluate("[innerWidth, innerHeight]") == [*SIZE_PX]
+        finally:
+            browser.resize(*SIZE_PX)
 
 
 def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Path) -> None:

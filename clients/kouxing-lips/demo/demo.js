@@ -79,8 +79,8 @@ async function prepare() {
   const phones = new Map(); // symbols by index
   lips.addEventListener("phone", ({ detail: { index, symbol, durationS } }) => {
     if (index === 0) phones.clear(); // a new sound
-    phones.set(index, durationS > 0 ? symbol : "");
-    note.textContent = [...phones.values()].slice(-NUM_PHONES).join(" ");
+    phones.set(index, durationS > 0 && symbol !== "sil" ? symbol : "");
+    note.textContent = [...phones.values()].filter(Boolean).slice(-NUM_PHONES).join(" ");
   });
   const items = [];
   byId("visemes").replaceChildren();
