@@ -6,43 +6,32 @@ import sys
 
 from kouxing.shared.waker import Waker
 
-if sys.platform == "linux":
+_REPORTS_ARRIVALS = sys.platform == "linux"  # elsewhere, every wait returns at once
 
-    class Arrivals:
-        """Ends a wait when data arrives at one of the added descriptors.
 
-        Only new data ends a wait, whether or not libzmq has read it. The kernel removes closed
-        descriptors.
-        """
+class Arrivals:
+    """Ends a wait when data arrives at one of the added descriptors.
 
-        def __init__(self) -> None:
-            self._waker = Waker()
-            self._epoll = select.epoll()
-            self.add(self._waker.descriptor)
+    Only new data ends a wait, whether or not libzmq has read it. The kernel removes closed
+    descriptors.
+    """
 
-        def add(self, descriptor: int) -> None:
-            """Add a descriptor to wait for. Any thread may call this."""
+    def __init__(self) -> None:
+        self._waker = Waker()
+        self._epoll = select.epoll() if _REPORTS_ARRIVALS else None
+        self.add(self._waker.descriptor)
+
+    def add(self, descriptor: int) -> None:
+        """Add a descriptor to wait for. Any thread may call this."""
+        if self._epoll is not None:
             with contextlib.suppress(OSError):  # closed, or added before
                 self._epoll.register(descriptor, select.EPOLLIN | select.EPOLLET)
 
-        def wait(self, timeout_s: float) -> None:
-            """Wait until data arrives, up to the timeout."""
+    def wait(self, timeout_s: float) -> None:
+        """Wait until data arrives, up to the timeout."""
+        if self._epoll is not None:
             self._epoll.poll(max(0.0, timeout_s))
 
-        def close(self) -> None:
-            """End the wait of another thread."""
-            self._waker.wake()
-
-else:
-
-    class Arrivals:
-        """Returns from every wait at once, because this system does not report arrivals."""
-
-        def add(self, descriptor: int) -> None:
-            """Do nothing."""
-
-        def wait(self, timeout_s: float) -> None:
-            """Do nothing."""
-
-        def close(self) -> None:
-            """Do nothing."""
+    def close(self) -> None:
+        """End the wait of another thread."""
+        self._waker.wake()

@@ -15,9 +15,10 @@ from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmF
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
+    MAX_EXPRESSIVENESS,
+    MIN_EXPRESSIVENESS,
+    check_amount,
     check_expressions,
-    check_expressiveness,
-    check_feeling,
 )
 from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.names import is_name
@@ -151,10 +152,10 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
         if acoustic not in [*AcousticModelName]:
             raise UserError("acoustic must be full or light")
         settings["acoustic"] = acoustic
-    if (amount := fields.get("expressiveness")) is not None:
-        settings["expressiveness"] = check_expressiveness(amount)
-    if (amount := fields.get("feeling")) is not None:
-        settings["feeling"] = check_feeling(amount)
+    limits = {"expressiveness": (MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS), "feeling": (0.0, 1.0)}
+    for name, (lowest, highest) in limits.items():
+        if (amount := fields.get(name)) is not None:
+            settings[name] = check_amount(name, amount, lowest, highest)
     for name in ("still", "eye_contact", "listening"):
         if (value := fields.get(name)) is not None:
             if not isinstance(value, bool):

@@ -43,11 +43,6 @@ class ReplayWindow:
         self._final = FinalTime()  # final time of the events that the synthesizer has
         self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED)  # sequence, end
 
-    @property
-    def final_time_s(self) -> float:
-        """Media time up to which the synthesizer has final phones."""
-        return self._final.time_s
-
     def add(self, sequence: int, end: int) -> None:
         """Add an audio message that ends at a media time in samples."""
         self._messages.append((sequence, end))

@@ -252,7 +252,6 @@ class RecognizerService(Service):
             name: SessionInput(
                 idle_s=max(0.0, read_s[session.start.paced] - session.last_audio_s),
                 sequence=session.replay_window.last_droppable_sequence,
-                media_time=to_samples(session.replay_window.final_time_s),
                 skipped_s=session.audio.overload.skipped_s,
             )
             for name, session in self._sessions.items()

@@ -39,22 +39,10 @@ def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
         raise UserError(f"hold_s is {hold_s}; give 0 to {MAX_HOLD_S:g} seconds")
 
 
-def check_expressiveness(amount: object) -> float:
-    """Return the expressiveness if it is in range.
-
-    Raises ``UserError`` if the value is out of range.
-    """
-    if not _is_number(amount, MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS):
-        raise UserError(
-            f"expressiveness is {amount}; give {MIN_EXPRESSIVENESS:g} to {MAX_EXPRESSIVENESS:g}"
-        )
-    return float(amount)  # type: ignore[arg-type]
-
-
-def check_feeling(amount: object) -> float:
-    """Return the strength of the feeling; ``UserError`` if it is not between 0 and 1."""
-    if not _is_number(amount, 1.0):
-        raise UserError(f"feeling is {amount}; give 0 to 1")
+def check_amount(name: str, amount: object, lowest: float, highest: float) -> float:
+    """Return the amount of a face setting; ``UserError`` if it is out of range."""
+    if not _is_number(amount, highest, lowest):
+        raise UserError(f"{name} is {amount}; give {lowest:g} to {highest:g}")
     return float(amount)  # type: ignore[arg-type]
 
 

@@ -149,12 +149,13 @@ EVENTS_AND_FINAL_TIMES_S: list[tuple[SoundEvent, float]] = [
 
 
 def test_audio_is_droppable_once_no_recognizer_would_replay_it() -> None:
-    window = ReplayWindow()
+    window, final = ReplayWindow(), FinalTime()
     for sequence in range(1, 5):
         window.add(sequence, to_samples(sequence))
     for event, final_s in EVENTS_AND_FINAL_TIMES_S:
         window.update(event, newest_sequence=4)
-        assert window.final_time_s == final_s
+        final.update(event)
+        assert final.time_s == final_s
     assert window.last_droppable_sequence == int(4.0 - WARM_UP_S)
     window.update(EndOfSound(time_s=5.0), newest_sequence=4)
     assert window.last_droppable_sequence == 4
