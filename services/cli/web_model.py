@@ -10,8 +10,8 @@ file            contents
 ``model.json``  types, shapes and offsets of these arrays; constants of the modules
 =============== ====================================================================
 
-The constants come from the modules that the server runs. The package defines none of its own, so a
-new model or threshold needs only a new export.
+The constants come from the modules that the server runs, so a new model or threshold needs only a
+new export.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.light import light_model_from
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
-from kouxing.services.recognizer.front_end import features, pcm, resample, vad, whisper_mel
+from kouxing.services.recognizer.front_end import pcm, resample, vad, whisper_mel
 from kouxing.services.recognizer.search import decoder
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator
@@ -53,35 +53,65 @@ from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 FORMAT = "kouxing-lips 2"
 
 _ALIGNMENT_BYTES = 8
-_MAX_CONSTANT_SIZE = 400  # longer lists are arrays
-_MODULES = {  # kouxing-lips and ovrlipsync use the numbers of these modules by name
-    "animator": face_animator,
-    "blocks": blocks,
-    "clock": clock,
-    "closures": closures,
-    "decoder": decoder,
-    "ear": ear,
-    "expression": expression_motion,
-    "expressiveness": expressiveness,
-    "features": features,
-    "feeling": feeling,
-    "learnt": model,
-    "lips": lip_predictor,
-    "lipFrames": lip_frames,
-    "liveDecoder": live_decoder,
-    "mel": whisper_mel,
-    "modelFile": model_file,
-    "network": network,
-    "nonverbal": nonverbal,
-    "pcm": pcm,
-    "resample": resample,
-    "rest": rest,
-    "segmenter": speech_segmenter,
-    "shapes": shapes,
-    "stream": stream,
-    "track": track,
-    "traits": voice_traits,
-    "vad": vad,
+# the constants that kouxing-lips and ovrlipsync use, by module
+_CONSTANTS: dict[str, tuple[ModuleType, str]] = {
+    "animator": (face_animator, "REST_S _VOICE_LEAD_S _SPEECH_LEAD_S _ROUNDING _MOUTH"),
+    "blocks": (blocks, "FRAMES_PER_POSITION MAX_POSITIONS FLOOR_BANDS _PADDING _SEEN_AFTER"),
+    "clock": (clock, "MEDIA_RATE_HZ"),
+    "closures": (
+        closures,
+        "_MIN_PROBABILITY _MAX_PROBABILITY _HOLD_S _LATE_HOLD_S _MAX_LATE_S _EDGE_S _PARTED "
+        "_WIDE_APART _ROUNDED _INNER_UPPER _INNER_LOWER _LEFT_CORNER _RIGHT_CORNER _UPPER "
+        "_LOWER _LOWER_OUTER _INNER _OUTER _BOTH",
+    ),
+    "decoder": (decoder, "IMPOSSIBLE _BEAM _MAX_TOKENS"),
+    "ear": (ear, "PHONES_LAG_FRAMES"),
+    "expression": (
+        expression_motion,
+        "CLOSED OPEN JAW UPPER LOWER _VISIBLE _EASE_S _FADE_S _FREE_S _BIND_S _WIDEST _WIDEST_JAW",
+    ),
+    "expressiveness": (
+        expressiveness,
+        "CLOSED JAW LOWER OPEN UPPER _WIDEST _USUAL_WIDTH _USUAL_PUSH _SIDEWAYS _MIN_WIDTH "
+        "_MAX_PUSH _WIDTH _PUSH",
+    ),
+    "feeling": (feeling, "_GAIN _FILTER_S _SIZE _AROUSED _TIRED _PLEASANT _UNPLEASANT"),
+    "learnt": (
+        model,
+        "HOLD_S MAX_GAP_S NUM_MOUTH_FAPS _TRANSITION_S _MEMORY_S _TEETH_LOG_ODDS "
+        "_CLOSED_SHARE _EPSILON _UNTRACKED _JITTER_SQUARED",
+    ),
+    "lips": (lip_predictor, "CLOSURE NUM_OUTPUTS _COLUMNS _ONES _OTHERS"),
+    "lipFrames": (lip_frames, "POSITION_LAG_S"),
+    "liveDecoder": (live_decoder, "_DEFAULT_CONFIDENCE"),
+    "mel": (whisper_mel, "HOP_SAMPLES WINDOW_SAMPLES NUM_MELS FLOOR_BANDS _FLOOR _HANN _EDGES"),
+    "modelFile": (model_file, "_LOG_STEP"),
+    "network": (network, "MAX_POSITIONS FRAMES_PER_POSITION _LONGEST_WAVE"),
+    "nonverbal": (nonverbal, "_HOLD_S _LAUGHTER _BREATH"),
+    "pcm": (pcm, "MEDIA_RATE_HZ SLICE"),
+    "resample": (
+        resample,
+        "SAMPLE_RATE_HZ MIN_RATE_HZ MAX_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA",
+    ),
+    "rest": (
+        rest,
+        "HOLD_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB _FADE_DB "
+        "_LAST_SOUND_S _ONSET_S _LIKELY _DOUBT AJAR",
+    ),
+    "segmenter": (
+        speech_segmenter,
+        "FRAMES_PER_POSITION HOP_S WINDOW_S _FIRST_FRAME_PARITY _SEEN_AFTER_FRAMES "
+        "_PRE_ROLL_FRAMES _MAX_RECENT",
+    ),
+    "shapes": (shapes, "NUM_FAPS _PATIENCE _ROUNDING"),
+    "stream": (stream, "MEDIA_RATE_HZ SILENT_DB"),
+    "track": (track, "HOLD_S CLOSE_S _OPEN_S MAX_GAP_S"),
+    "traits": (
+        voice_traits,
+        "NUM_TRAITS MIN_VOICE _MEAN_POSITIONS _PRIOR_FEELING _PRIOR_POSITIONS _MAX_POSITIONS "
+        "_DIGITS _EVIDENCE_SHARE _START _STOP _MIN_LAUGHTER _LAUGH_POSITIONS",
+    ),
+    "vad": (vad, "_NO_EVIDENCE _ENOUGH _IMPROBABLE _STOP_POSITIONS"),
 }
 
 
@@ -134,7 +164,13 @@ def web_model() -> dict[str, bytes]:
         },
         "shapeNames": {name: shape_set.names for name, shape_set in shapes.SHAPE_SETS.items()},
         "expressionNames": list(expression_motion.EXPRESSION_FAPS),
-        "constants": {name: _constants(module) for name, module in _MODULES.items()},
+        "constants": {
+            name: {
+                constant.lstrip("_"): np.asarray(getattr(module, constant)).tolist()
+                for constant in constants.split()
+            }
+            for name, (module, constants) in _CONSTANTS.items()
+        },
         "phones": {
             **_phones_header(topology),
             "acousticScale": float(block_archive.floats("acoustic_scale")),
@@ -196,18 +232,3 @@ def _shortened(array: NDArray[Any]) -> NDArray[Any]:
         if np.array_equal(short, array):
             return short
     return array.astype(np.float64)
-
-
-def _constants(module: ModuleType) -> dict[str, Any]:
-    """Return the numbers and lists of numbers that a module defines in upper case."""
-    values = {
-        name.lstrip("_"): np.asarray(value).tolist()
-        for name, value in vars(module).items()
-        if name.isupper() and isinstance(value, int | float | tuple | list | np.ndarray | np.number)
-    }
-    return {name: value for name, value in values.items() if _is_small_number_list(value)}
-
-
-def _is_small_number_list(value: object) -> bool:
-    numbers = np.asarray(value)
-    return numbers.dtype.kind in "if" and numbers.size <= _MAX_CONSTANT_SIZE
