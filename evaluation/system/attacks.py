@@ -2,14 +2,16 @@
 
 The services run as under ``kouxing run``, with keys, on free ports. During each attack a session
 is streamed in real time: before, during and after it. The attacker is a separate process, which
-starts over whenever it is cut off. The first row is a process that only keeps a core busy, because
-an attacker also takes processor time.
+starts over whenever it is cut off. It has a process session of its own, like any other program:
+in the caller's session, it would have the caller's priority, which can exceed the services'. The
+first row is a process that only keeps a core busy, because an attacker also takes processor time.
 
 On Linux only: memory is read from ``/proc``.
 """
 
 import contextlib
 import multiprocessing
+import os
 import tempfile
 import threading
 import time
@@ -202,6 +204,7 @@ def _attacker(
 
 def _attack(name: str, endpoint: str, source: str, start: Event) -> None:
     """Attack until the process is terminated."""
+    os.setsid()
     start.wait()
     while True:
         with contextlib.suppress(OSError, UserError):  # rejected or cut off
