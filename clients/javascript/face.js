@@ -20,7 +20,7 @@ const MAX_STEP_S = 0.1; // longest time step of the hair physics
 export class KouxingFace extends HTMLElement {
   static observedAttributes = ["src", "gateway", "session", "token", "recording", "local", "phones"];
   #renderer = null;
-  #note = document.createElement("p"); // the last error
+  #note = Object.assign(document.createElement("p"), { part: "note" }); // the last error
   #drawRate = null;
   #images = null;
   #scene = new THREE.Scene();

@@ -37,8 +37,10 @@ export async function loadPuppet(url) {
     return await readAvatar(url);
   } catch (error) {
     const word = Object.keys(UNREADABLE).find((key) => error.message.includes(key));
-    const text = word ? `it needs ${UNREADABLE[word]}, which kouxing cannot read; export it without` : error.message;
-    throw new Error(`${url}: ${text}`, { cause: error });
+    let text = error.message;
+    if (word) text = `it needs ${UNREADABLE[word]}, which kouxing cannot read; export it without`;
+    if (error instanceof SyntaxError) text = "it is not a GLB or VRM file; choose another file";
+    throw new Error(url.startsWith("blob:") ? `cannot show this file: ${text}` : `${url}: ${text}`, { cause: error });
   }
 }
 

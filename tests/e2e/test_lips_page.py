@@ -54,7 +54,7 @@ def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
         open_demo(browser, origin)
         browser.click("microphone")
         browser.wait_for("window.opened > 200")
-        browser.wait_for(f"{NOTE}.split(' ').length > 4")  # phones
+        browser.wait_for("document.getElementById('phones').textContent.split(' ').length > 4")
         browser.wait_for(f"{FACE}.shown && {FACE}.shown[2] > 20")
         browser.click("microphone")
         assert browser.evaluate("document.getElementById('microphone').ariaPressed") == "false"
@@ -139,11 +139,16 @@ def test_each_problem_gives_a_sentence(browser: Browser, site: Path) -> None:
         open_demo(browser, origin)
         check_sound_waits_for_a_click(browser)
         browser.evaluate(
-            "const drop = new Event('drop', { bubbles: true });"
+            "window.drop = new Event('drop', { bubbles: true });"
             "drop.dataTransfer = { files: [new File(['text'], 'speech.txt')] };"
             "document.body.dispatchEvent(drop); 1"
         )
         wait_for_note("the browser cannot read this file")
+        browser.evaluate(
+            "drop.dataTransfer = { files: [new File(['text'], 'avatar.vrm')] };"
+            "document.body.dispatchEvent(drop); 1"
+        )
+        wait_for_note("it is not a GLB or VRM file")
         for error, text in (
             ("NotAllowedError", "the microphone is blocked; allow it"),
             ("NotFoundError", "no microphone was found"),

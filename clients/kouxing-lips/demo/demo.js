@@ -6,7 +6,7 @@ const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
 const NUM_PHONES = 12; // on the page
 const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
-const [face, note] = [byId("face"), byId("note")];
+const [face, note, voice] = [byId("face"), byId("note"), byId("phones")];
 let rivals = null; // [{ face, lips: input and FAPs }], while they are compared
 let followed = null; // audio node that the rivals follow
 
@@ -74,13 +74,13 @@ async function prepare() {
   const loading = face.lips;
   const lips = await loading;
   lips.addEventListener("voice", ({ detail: { isSpeaking, isLaughing } }) => {
-    note.textContent = isLaughing ? "Laughter" : isSpeaking ? "Speech" : "Silence";
+    voice.textContent = isLaughing ? "Laughter" : isSpeaking ? "Speech" : "Silence";
   });
   const phones = new Map(); // symbols by index
   lips.addEventListener("phone", ({ detail: { index, symbol, durationS } }) => {
     if (index === 0) phones.clear(); // a new sound
     phones.set(index, durationS > 0 && symbol !== "sil" ? symbol : "");
-    note.textContent = [...phones.values()].filter(Boolean).slice(-NUM_PHONES).join(" ");
+    voice.textContent = [...phones.values()].filter(Boolean).slice(-NUM_PHONES).join(" ");
   });
   const items = [];
   byId("visemes").replaceChildren();
@@ -192,6 +192,7 @@ function showHead(head) {
 }
 
 function choose(head) {
+  note.textContent = "";
   for (const button of byId("heads").children) button.ariaChecked = String(button.dataset.head === head);
 }
 
