@@ -37,21 +37,18 @@ class Exporter(Protocol):
         """Write the motion and return the number of frames or images."""
 
 
-class VideoExporter:
-    """Draws a video, or a numbered picture for each of its images, such as ``face%05d.png``.
+class PictureExporter:
+    """Draws one picture (PNG).
 
     Raises ``UserError`` if the options do not fit the format or each other.
     """
 
     unit: ClassVar[str] = "image"
-    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"rate_hz", "sound", "speed"}
+    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"at_s"}
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        check_name(output)
         self._output = output
-        self._rate_hz = options.rate_hz
-        self._speed = options.speed
-        self._captions = options.captions
+        self._options = options
         self._size_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
         self._renderer = _make_renderer(output, options, self._size_px)
 
@@ -60,44 +57,37 @@ class VideoExporter:
 
         Raises ``UserError`` if a file cannot be written.
         """
-        task = progress.add_task("drawing", total=1.0)
-        motion = slow_down(motion, self._speed)
         with contextlib.closing(self._renderer):
-            return film.render_video(
-                motion.frames,
-                self._output,
-                self._renderer,
-                frame_rate_hz=self._rate_hz or motion.image_rate_hz,
-                samples=motion.samples,
-                captions=make_captions(self._captions, motion, self._size_px),
-                on_progress=lambda share: progress.update(task, completed=share),
-            )
+            return self._draw(motion, progress)
+
+    def _draw(self, motion: Motion, progress: Progress) -> int:
+        captions = make_captions(self._options.captions, motion, self._size_px)
+        at_s = self._options.at_s or 0.0
+        film.render_picture(motion.frames, self._output, self._renderer, at_s, captions)
+        return 1
 
 
-class PictureExporter:
-    """Draws one picture (PNG); parameters and errors as for ``VideoExporter``."""
+class VideoExporter(PictureExporter):
+    """Draws a video, or a numbered picture for each of its images, such as ``face%05d.png``."""
 
-    unit: ClassVar[str] = "image"
-    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"at_s"}
+    options: ClassVar[frozenset[str]] = _DRAWING_OPTIONS | {"rate_hz", "sound", "speed"}
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        self._output = output
-        self._at_s = options.at_s or 0.0
-        self._captions = options.captions
-        self._size_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
-        self._renderer = _make_renderer(output, options, self._size_px)
+        check_name(output)
+        super().__init__(output, options)
 
-    def export(self, motion: Motion, progress: Progress) -> int:
-        """Draw the picture and return 1."""
-        with contextlib.closing(self._renderer):
-            film.render_picture(
-                motion.frames,
-                self._output,
-                self._renderer,
-                self._at_s,
-                make_captions(self._captions, motion, self._size_px),
-            )
-        return 1
+    def _draw(self, motion: Motion, progress: Progress) -> int:
+        task = progress.add_task("drawing", total=1.0)
+        motion = slow_down(motion, self._options.speed)
+        return film.render_video(
+            motion.frames,
+            self._output,
+            self._renderer,
+            frame_rate_hz=self._options.rate_hz or motion.image_rate_hz,
+            samples=motion.samples,
+            captions=make_captions(self._options.captions, motion, self._size_px),
+            on_progress=lambda share: progress.update(task, completed=share),
+        )
 
 
 EXPORTERS: dict[str, type[Exporter]] = {

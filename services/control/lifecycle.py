@@ -3,9 +3,9 @@
 Each step is sent to the services and the client of the session, and is published as an event.
 """
 
+import math
 import time
 
-from kouxing.services.control.move_repeats import MoveRepeats
 from kouxing.services.control.registry import Registry
 from kouxing.services.control.requests import Requests
 from kouxing.services.control.session_record import SessionRecord
@@ -16,10 +16,11 @@ from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Event, EventName
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import CloseSession, Error, ErrorCode
+from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionMoved
 
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # time without a worker after which a session is closed
+REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # a client's connection may have broken
 
 
 class Lifecycle:
@@ -47,17 +48,20 @@ class Lifecycle:
         self._events_address = events_address
         self._metrics = metrics
         self._num_events = 0
-        self._move_repeats = MoveRepeats()
+        self._repeats: list[tuple[float, SessionMoved]] = []  # times, and messages to repeat
 
     def on_tick(self, now_s: float) -> float:
         """Repeat move messages and check timeouts; return when the next repetition is due."""
-        for moved in self._move_repeats.due(now_s):
+        due = [moved for due_s, moved in self._repeats if due_s <= now_s]
+        if due:
+            self._repeats = [repeat for repeat in self._repeats if repeat[0] > now_s]
+        for moved in due:
             record = self._sessions.get(moved.session)
             if record is not None and record.epoch == moved.epoch:
                 self._commands.send(moved, to=record.client)
         for record in self._sessions.pending():
             self._check_timeout(record, now_s)
-        return self._move_repeats.due_s
+        return min((due_s for due_s, _ in self._repeats), default=math.inf)
 
     def send_start(self, record: SessionRecord, instances: set[str]) -> None:
         """Ask services to start serving a session."""
@@ -150,7 +154,8 @@ class Lifecycle:
         self.publish(EventName.SESSION_MOVED, record.name)
         workers = ", ".join(sorted({*record.workers.values()}))
         LOG.info("session moved to %s", workers, extra={"session": record.name})
-        self._move_repeats.add(moved, time.monotonic())
+        now_s = time.monotonic()
+        self._repeats += [(now_s + after_s, moved) for after_s in REPEAT_AFTER_S]
 
     def _stop_waiting(self, record: SessionRecord) -> None:
         """Continue without the missing observers. If a worker is missing, end the session."""

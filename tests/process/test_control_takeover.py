@@ -2,7 +2,7 @@
 
 import pytest
 
-from kouxing.services.control import lifecycle, move_repeats, takeover
+from kouxing.services.control import lifecycle, takeover
 from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
@@ -110,7 +110,7 @@ def test_stops_unknown_sessions_only_after_the_deadline(stage: Stage) -> None:
 def test_repeats_session_moved_to_the_client(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(move_repeats, "REPEAT_AFTER_S", (0.1, 0.2))
+    monkeypatch.setattr(lifecycle, "REPEAT_AFTER_S", (0.1, 0.2))
     recognizer, synthesizer = stage.services
     client.send(OpenSession(session="mine", request="1"))
     for service in stage.services:
