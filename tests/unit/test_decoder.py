@@ -25,16 +25,33 @@ class Path:
     start: int  # start frame of the phone
 
 
+def phone_penalties(model: Topology, scores: NDArray[np.float32]) -> list[float]:
+    """Return the penalty of phones that start at each frame."""
+    first = model.first_state[:-1]
+    phones = np.add.reduceat(np.exp(scores.astype(float)), first, axis=1)
+    roots = np.sqrt(phones / phones.sum(axis=1, keepdims=True))
+    changes = np.append(0.0, 1.0 - (roots[1:] * roots[:-1]).sum(axis=1))
+    rate, penalties = 1.0 / 60.0, []
+    for frame, change in enumerate(changes):
+        rate += (change - rate) / 200.0 if frame else 0.0
+        penalties.append(
+            model.phone_penalty + np.clip(model.rate_weight * (rate - 1.0 / 60.0), -2.0, 2.0)
+        )
+    return penalties
+
+
 def brute_force(
     model: Topology, table: Table, scores: NDArray[np.float32], phones: list[int]
 ) -> list[Segment]:
     """Try every path that the loop allows."""
 
-    def cost(before: tuple[int, ...], phone: int) -> float:
-        log_prob = 0.0 if before == (SIL,) and phone == SIL else table.after(before, phone)
-        return model.lm_scale * log_prob + model.phone_penalty
+    penalties = phone_penalties(model, scores)
 
-    paths = [Path(cost((SIL,), phone), (), phone, 0, 0) for phone in phones]
+    def cost(before: tuple[int, ...], phone: int, frame: int) -> float:
+        log_prob = 0.0 if before == (SIL,) and phone == SIL else table.after(before, phone)
+        return model.lm_scale * log_prob + penalties[frame]
+
+    paths = [Path(cost((SIL,), phone, 0), (), phone, 0, 0) for phone in phones]
     for frame, observed in enumerate(scores):
         longer = []
         for path in paths:
@@ -49,7 +66,13 @@ def brute_force(
             before = (SIL, *(segment.phone for segment in ended))
             is_last = frame + 1 == len(scores)
             longer += [
-                Path(left + (0.0 if is_last else cost(before, phone)), ended, phone, 0, frame + 1)
+                Path(
+                    left + (0.0 if is_last else cost(before, phone, frame + 1)),
+                    ended,
+                    phone,
+                    0,
+                    frame + 1,
+                )
                 for phone in phones
             ]
         paths = longer
@@ -57,19 +80,23 @@ def brute_force(
     return list(max(complete, key=lambda path: path.score).ended)
 
 
+@pytest.mark.parametrize("rate_weight", [0.0, 120.0])
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("order", "kept", "states_per_phone", "num_frames"),
     [(2, 1.0, 2, 8), (2, 1.0, 3, 9), (3, 1.0, 2, 9), (3, 0.5, 2, 9), (4, 0.6, 1, 7)],
 )
 def test_finds_the_best_of_all_paths(
-    seed: int, order: int, kept: float, states_per_phone: int, num_frames: int
+    seed: int, order: int, kept: float, states_per_phone: int, num_frames: int, rate_weight: float
 ) -> None:
     rng = np.random.default_rng(seed)
     phones = [3, 40, SIL]
     table = Table.draw(rng, phones, order=order, kept=kept)
     model = replace(
-        random_topology(states_per_phone, rng, table.tree()), lm_scale=1.5, phone_penalty=1.25
+        random_topology(states_per_phone, rng, table.tree()),
+        lm_scale=1.5,
+        phone_penalty=1.25,
+        rate_weight=rate_weight,
     )
     scores = rng.normal(size=(num_frames, model.num_states)).astype(np.float32)
     others = np.isin(np.arange(NUM_PHONES), phones, invert=True).repeat(states_per_phone)
@@ -77,6 +104,26 @@ def test_finds_the_best_of_all_paths(
     decoder = Decoder(model)
     decoder.advance(scores)
     assert decoder.final_path() == brute_force(model, table, scores, phones)
+
+
+def test_fast_changes_add_phones_in_any_chunking() -> None:
+    rng = np.random.default_rng(0)
+    phones = [3, 40, SIL]
+    table = Table.draw(rng, phones, order=2, kept=1.0)
+    model = replace(random_topology(1, rng, table.tree()), phone_penalty=-2.0)
+    scores = np.full((60, model.num_states), -1e4, np.float32)
+    scores[:, phones] = rng.normal(scale=2.0, size=(60, len(phones)))
+    fixed, whole, first, second = (
+        Decoder(replace(model, rate_weight=weight)) for weight in (0.0, 120.0, 120.0, 120.0)
+    )
+    fixed.advance(scores)
+    whole.advance(scores)
+    assert len(whole.final_path()) > len(fixed.final_path())
+    for frame in range(30):
+        first.advance(scores[frame : frame + 1])
+    second.copy_state(first)
+    second.advance(scores[30:])
+    assert second.final_path() == whole.final_path()
 
 
 def crowded_language() -> PhoneLanguageModel:

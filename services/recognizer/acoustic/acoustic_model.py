@@ -33,6 +33,7 @@ class Topology:
     log_leave: Floats  # (states,) log-probability of leaving it
     lm_scale: float = 1.0  # weight of the phone language model's log-probabilities
     phone_penalty: float = 0.0  # added to the log score at every phone
+    rate_weight: float = 0.0  # how far the phone penalty follows the speaking rate; see Decoder
     duration_mean_s: Floats  # (3, phones) mean by position and phone, seconds
     duration_spread_s: Floats  # (3, phones) standard deviation, seconds
 

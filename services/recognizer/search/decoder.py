@@ -7,6 +7,16 @@ Deviation: the cost of a phone depends on the phones before it, as far as the ph
 looks back. So every context has its own best path, called a token. The token's current phone is the
 last phone of the context. Tokens with a score far below the best one are dropped (beam search).
 
+A fixed penalty for each phone deletes phones in fast speech and inserts phones in slow speech. So
+the penalty can follow the rate at which the phones' scores change::
+
+    change = 1 - sum over phones of sqrt(p(t) p(t - 1))
+    rate = running mean of change over two seconds
+    penalty = phone_penalty + rate_weight (rate - 1/60), at most 2 from phone_penalty
+
+p(t) are the scores of frame t as probabilities. 1/60 is the rate of slow speech. The measure is
+smaller where scores are uncertain, because insertions are more likely there.
+
 ======== ===================================================== =====================
 symbol   meaning                                               shape
 ======== ===================================================== =====================
@@ -46,6 +56,9 @@ from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, Graph
 _NO_TOKEN = -1
 _BEAM = np.float32(20.0)  # in log scores; a wider beam changes nothing on development data
 _MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
+_MEAN_RATE = np.float32(1.0 / 60.0)
+_RATE_FRAMES = np.float32(200.0)
+_MAX_PENALTY_CHANGE = np.float32(2.0)
 _MIN_RECORDS = 4 * _MAX_TOKENS
 _MAX_CHAIN = MAX_ORDER + 1  # contexts from the longest to the empty one
 
@@ -76,6 +89,7 @@ class _Hmms(NamedTuple):
     log_leave: NDArray[np.float32]
     lm_scale: np.float32
     phone_penalty: np.float32
+    rate_weight: np.float32
 
 
 class Decoder:
@@ -89,9 +103,12 @@ class Decoder:
             topology.log_leave,
             np.float32(topology.lm_scale),
             np.float32(topology.phone_penalty),
+            np.float32(topology.rate_weight),
         )
         self._graph = topology.phone_lm.graph
         max_states = int(np.diff(topology.first_state).max())
+        # rate of change, and the square roots of the phones' probabilities at the last frame
+        self._rate = np.empty(len(topology.first_state), dtype=np.float32)
         self._records = np.empty((_MIN_RECORDS, 3), dtype=np.int32)
         self._tokens = Tokens(
             context=np.empty(_MAX_TOKENS, dtype=np.int32),
@@ -108,12 +125,14 @@ class Decoder:
         self._last_shared = NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # confidence in the phone
+        self._rate[:] = _MEAN_RATE
         self._num_records = self._num_tokens = 0
 
     def copy_state(self, other: Decoder) -> None:
         """Continue from the state of another search of the same topology."""
         self.num_frames, self._best = other.num_frames, other._best
         self._shared, self._last_shared = list(other._shared), other._last_shared
+        self._rate[:] = other._rate
         if len(self._records) != len(other._records):
             self._records = np.empty_like(other._records)
         self._records[: other._num_records] = other._records[: other._num_records]
@@ -147,6 +166,7 @@ class Decoder:
                 confidence[num_advanced:],
                 known_phone,
                 min_confidence,
+                self._rate,
                 self._num_tokens,
                 self._tokens,
                 _token_table(len(self._graph.last_phone)),
@@ -255,6 +275,7 @@ def _steps(
     confidence: NDArray[np.float64],
     known_phone: int,
     min_confidence: float,
+    rate: NDArray[np.float32],
     num_tokens: int,
     tokens: Tokens,
     token_of: NDArray[np.int16],
@@ -273,8 +294,17 @@ def _steps(
         token_of[tokens.context[number]] = number
     while num_done < len(observed) and num_records + len(tokens.context) <= len(records):
         num_tokens = _prune(num_tokens, tokens, token_of)
+        penalty = _phone_penalty(frame + num_done, observed[num_done], rate, hmms)
         num_tokens, num_records, entry, entry_link = _start_phones(
-            frame + num_done, num_tokens, tokens, token_of, records, num_records, hmms, graph
+            frame + num_done,
+            penalty,
+            num_tokens,
+            tokens,
+            token_of,
+            records,
+            num_records,
+            hmms,
+            graph,
         )
         token, state = _advance_states(
             observed[num_done], num_tokens, tokens, entry, entry_link, hmms, graph
@@ -287,6 +317,28 @@ def _steps(
     for number in range(num_tokens):
         token_of[tokens.context[number]] = _NO_TOKEN
     return num_done, num_tokens, num_records, token, state
+
+
+@numba.njit(cache=True, nogil=True)
+def _phone_penalty(
+    frame: int, observed: NDArray[np.float32], rate: NDArray[np.float32], hmms: _Hmms
+) -> np.float32:
+    """Update the rate of change by a frame's scores; return the penalty of phones that start."""
+    if hmms.rate_weight == 0.0:
+        return hmms.phone_penalty
+    probabilities = np.exp(observed - observed.max())
+    total = probabilities.sum()
+    overlap = np.float32(0.0)
+    for phone in range(len(hmms.first_state) - 1):
+        states = probabilities[hmms.first_state[phone] : hmms.first_state[phone + 1]]
+        root = np.sqrt(states.sum() / total)
+        overlap += root * rate[1 + phone]
+        rate[1 + phone] = root
+    if frame:
+        rate[0] += (np.float32(1.0) - overlap - rate[0]) / _RATE_FRAMES
+    change = hmms.rate_weight * (rate[0] - _MEAN_RATE)
+    change = min(max(change, -_MAX_PENALTY_CHANGE), _MAX_PENALTY_CHANGE)
+    return np.float32(hmms.phone_penalty + change)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -310,6 +362,7 @@ def _prune(num_tokens: int, tokens: Tokens, token_of: NDArray[np.int16]) -> int:
 @numba.njit(cache=True, nogil=True)
 def _start_phones(
     frame: int,
+    penalty: np.float32,
     num_tokens: int,
     tokens: Tokens,
     token_of: NDArray[np.int16],
@@ -347,7 +400,7 @@ def _start_phones(
         if frame == 0:  # before speech there is silence
             log_prob[hmms.silence] = 0.0
         for phone in range(num_phones):
-            candidate = leaving + hmms.lm_scale * log_prob[phone] + hmms.phone_penalty
+            candidate = leaving + hmms.lm_scale * log_prob[phone] + penalty
             if candidate < -_BEAM:
                 continue
             following = token_of[next_context[phone]]
