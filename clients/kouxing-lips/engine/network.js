@@ -5,7 +5,7 @@
 // leaves no garbage.
 
 import { readGraph } from "./onnx-file.js";
-import { OPERATORS } from "./operators.js";
+import { OPERATORS, tensorOf } from "./operators.js";
 import { ProductMemory, alignedBytes } from "./products.js";
 
 export class Network {
@@ -46,11 +46,6 @@ export class Network {
   run() {
     for (const step of this.#steps) step();
   }
-}
-
-/** Return a tensor without memory, which is allocated later. */
-function tensorOf(shape) {
-  return { shape, length: shape.reduce((a, b) => a * b, 1), values: null };
 }
 
 /** Set the values of a tensor that is a part of another. */

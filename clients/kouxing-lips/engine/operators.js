@@ -344,7 +344,8 @@ function erf(x) {
   return 1 - Math.exp(-x * x) / Math.sqrt(Math.PI) / fraction;
 }
 
-function tensorOf(shape) {
+/** Return a tensor without memory, which is allocated later. */
+export function tensorOf(shape) {
   return { shape, length: shape.reduce((a, b) => a * b, 1), values: null };
 }
 
