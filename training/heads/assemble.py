@@ -16,6 +16,7 @@ from kouxing.training.heads import fitted, paint, parts, subdivision, textures
 from kouxing.training.heads.makehuman import PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
     eye_centers,
+    eye_radius,
     eye_sockets,
     head_weight,
     lip_outline,
@@ -54,10 +55,13 @@ _PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
 _HAIR_TEXTURES = {"afro01": "afro"}
 # styles with a fringe over the right eye, and its distance from the head's axis at the side, dm
 _FRINGES = {"bob01": 0.73, "bob02": 0.73}
+_SOFT_EDGE = 7  # texels across the edges of strands that may blend
 _COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
 _SWEEP = 0.62  # share of the angle to the right ear by which it is turned
 _BROW_RAISE = 0.006  # how far the inner ends rise, dm
 _HAIR_HEIGHT = 0.45  # above the scalp, dm
+_TEAR_HEIGHT = 0.006  # of the wet line above the lower lid, dm
+_TEAR_REACH = 1.015  # distance of its edge from the eye's center, in radii of the eyeball
 _LASH_COLOR = (0.09, 0.07, 0.065)
 
 
@@ -121,6 +125,7 @@ class Builder:
             self._skin_piece(skin, face),
             self._garment(vertices),
             *eye_pieces(vertices, self._mesh, fapu),
+            self._tear_lines(vertices, skin, face),
             *self._mouth_pieces(skin, fapu, person),
             self._brows(vertices, skin, face, person),
             self._lashes(vertices, skin, face, person),
@@ -215,25 +220,49 @@ class Builder:
         return textures.strands(textures.load(self._folder, file), float(contrast))
 
     def _hair(self, vertices: Float, person: Person, alpha: Float) -> HeadPiece:
-        """Fit the hair; its triangles run from the inside outward and from the back to the front.
+        """Fit the hair, with its triangles in the order in which they are drawn.
 
-        Outer strands therefore blend over inner ones. Triangles without strands are removed; they
-        would cast shadows. ``alpha`` (H, W) is that of the texture.
+        Opaque triangles come first, from the outside inward, so that they hide others before these
+        are shaded. Translucent ones follow from the inside outward, so that outer strands blend
+        over inner ones. Triangles without strands are removed; they would cast shadows. ``alpha``
+        (H, W) is that of the texture.
         """
         hair = fitted.read(self._folder, f"hair/{person.hair}/{person.hair}")
         points = hair.fit(vertices) * [person.hair_width, 1, 1]
         if person.hair in _FRINGES:
             points = self._swept_aside(points, vertices, _FRINGES[person.hair])
         quads, uv, welds = hair.quads, hair.uv, hair.welds
+        coarse, num_coarse = None, 0
         if len(quads) < _COARSE_HAIR:
             points, quads, uv, welds = subdivision.smooth_strands(points, quads, uv, welds)
-        triangles = subdivision.triangles_of(quads)
-        triangles = triangles[textures.visible_triangles(triangles, uv, alpha)]
-        middle = points[triangles].mean(axis=1) - PIVOT
-        order = np.argsort(np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2])
+            # the corners of the coarse quads come first
+            used = np.unique(quads[:, 0])
+            order = np.concatenate([used, np.setdiff1d(np.arange(len(points)), used)])
+            number = np.argsort(order)
+            points, quads, uv = points[order], number[quads], uv[order]
+            welds = number[welds[order]]
+            coarse, num_coarse = quads[:, 0].reshape(-1, 4), len(used)
+
+        def drawn(quads: Index) -> Index:
+            triangles = subdivision.triangles_of(quads)
+            triangles = triangles[(textures.density(triangles, uv, alpha) > 0.25).any(axis=1)]
+            inner = ndimage.minimum_filter(alpha, _SOFT_EDGE)
+            opaque = (textures.density(triangles, uv, inner) > 0.9).all(axis=1)
+            middle = points[triangles].mean(axis=1) - PIVOT
+            outward = np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2]
+            return triangles[np.lexsort([np.where(opaque, -outward, outward), ~opaque])]
+
         color = np.tile(textures.tint(person.look.hair), (len(points), 1))
-        part = parts.Geometry(points, triangles[order], uv, color, welds)
-        return HeadPiece("hair", part, "hair", 0.6, np.ones(len(points)))
+        part = parts.Geometry(points, drawn(quads), uv, color, welds)
+        return HeadPiece(
+            "hair",
+            part,
+            "hair",
+            0.6,
+            np.ones(len(points)),
+            coarse_vertices=num_coarse,
+            coarse_triangles=None if coarse is None else drawn(coarse),
+        )
 
     def _swept_aside(self, points: Float, vertices: Float, width: float) -> Float:
         """Turn a fringe that covers the right eye to the side of the head."""
@@ -297,6 +326,37 @@ class Builder:
         color = np.tile(textures.tint(_LASH_COLOR), (len(points), 1))
         part = parts.Geometry(points, lashes.triangles, lashes.uv, color, lashes.welds)
         return HeadPiece("lashes", part, "lashes", 0.9, np.ones(len(points)), shifts)
+
+    def _tear_lines(self, vertices: Float, skin: Skin, fields: Fields) -> HeadPiece:
+        """Make the wet lines: strips from the edges of the lower lids to the eyeballs.
+
+        They follow the lids.
+        """
+        layout = self.reference.vertices
+        left = self.reference.number[np.array(LEFT_LOWER_LID)]
+        right = spatial.cKDTree(layout).query(layout[left] * [-1, 1, 1])[1]
+        rows: list[Index] = []
+        points, triangles = [], []
+        for center, lid in zip(eye_centers(vertices, self._mesh), (left, right[::-1]), strict=True):
+            edge = skin.vertices[lid]
+            inward = edge - center + np.array([0, _TEAR_HEIGHT, 0])
+            inward *= (
+                _TEAR_REACH
+                * eye_radius(vertices, self._mesh)
+                / np.linalg.norm(inward, axis=1, keepdims=True)
+            )
+            triangles.append(parts.grid_triangles(2, len(lid)) + len(lid) * len(rows))
+            rows += [lid, lid]
+            points += [edge, center + inward]
+        at = np.concatenate(rows)
+        part = parts.Geometry(
+            np.concatenate(points),
+            np.concatenate(triangles),
+            np.tile([0.8, 0.5], (len(at), 1)),  # the white of the eye
+            np.ones((len(at), 3)),
+        )
+        shifts = {fap: shift[at] for fap, shift in fields.items() if np.abs(shift[at]).max() > 1e-6}
+        return HeadPiece("tears", part, "eye", 0.05, np.ones(len(at)), shifts)
 
     def _face_map(self) -> paint.FaceMap:
         skin = self.reference

@@ -106,7 +106,7 @@ def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> 
     ``layout`` (V, 3) are the skin's vertices on the reference head, dm. ``cavity`` (V,) are those
     that line the mouth.
     """
-    solid = [p for p in pieces if p.name not in ("lashes", "brows")]
+    solid = [p for p in pieces if p.name not in ("lashes", "brows", "tears")]
     offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
     vertices = np.concatenate([_opened(p) for p in solid])
     normals = np.concatenate([_outward(p) for p in solid])

@@ -95,7 +95,8 @@ PEOPLE = {
             *_both("ears/ear-scale-decr", 0.30), ("mouth/mouth-upperlip-height-decr", 0.40),
             ("mouth/mouth-lowerlip-height-decr", 0.30), *_both("eyes/eye-height2-incr", 0.45),
             *_both("eyes/eye-scale-incr", 0.30), *_both("ears/ear-shape-round", 0.60),
-            *_both("cheek/cheek-volume-decr", 0.30), ("mouth/mouth-angles-up", 0.25)),
+            *_both("cheek/cheek-volume-decr", 0.30), ("mouth/mouth-angles-up", 0.25),
+            ("eyebrows/eyebrows-angle-up", 0.40)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.845, 0.660, 0.550), lip=(0.700, 0.440, 0.400), lip_strength=0.60,
             brow_strength=1.0, blush=0.35, stubble=0.55,
@@ -155,6 +156,7 @@ PEOPLE = {
     ),
     "leo": Person(
         targets=(("macrodetails/caucasian-male-young", 1.0), ("eyebrows/eyebrows-trans-up", 0.5),
+            ("eyebrows/eyebrows-angle-up", 0.60),
             *_both("eyes/eye-height1-incr", 0.2),
             *_both("eyes/eye-height2-incr", 0.6), ("mouth/mouth-trans-down", 0.3),
             ("mouth/mouth-angles-up", 0.35),

@@ -86,13 +86,13 @@ def strands(texture: Float, contrast: float) -> Float:
     return np.stack([np.round(gray * 40) / 40, np.round(alpha * 16) / 16], axis=2)
 
 
-def visible_triangles(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> NDArray[np.bool_]:
-    """Return which triangles (F,) show texels with alpha; ``uv`` (V, 2) has v downward."""
-    steps = np.linspace(0.05, 0.9, 6)
+def density(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float:
+    """Return alpha at points of triangles (F, N); ``uv`` (V, 2) has v downward."""
+    steps = np.linspace(0.02, 0.96, 9)
     share = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])
     at = np.einsum("sk,fkd->fsd", share, uv[triangles]) * (alpha.shape[1], alpha.shape[0])
     column, row = np.clip(at.astype(int), 0, np.array(alpha.shape[::-1]) - 1).transpose(2, 0, 1)
-    return np.asarray((alpha[row, column] > 0.25).any(axis=1))
+    return np.asarray(alpha[row, column])
 
 
 def hairs(texture: Float, strength: float) -> Float:

@@ -15,7 +15,7 @@ Nodes: ``kouxing`` > ``body`` (joint) > ``garment``, ``head`` (joint) > ``eye_le
 next to the root, skinned to both joints. Lengths are in meters, y is up, the face looks along z.
 
 ``extras.coarse`` of a mesh is an accessor of alternative indices for viewers without a graphics
-card: fewer triangles on the first vertices of the mesh. Transparent meshes have no coarse indices.
+card: fewer triangles on the first vertices of the mesh.
 
 With a motion, an animation ``speech`` sets the weights of every mesh and the rotating nodes; it is
 linear between frames.
@@ -258,7 +258,7 @@ def _part_node(
         "material": document.add("materials", _material(part, textures)),
     }
     mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive], "extras": {}}
-    if len(coarse) < len(triangles) and not part.transparent:
+    if len(coarse) < len(triangles):
         mesh["extras"]["coarse"] = add_indices(coarse)
     targets, names = _targets(document, head, part, morphs)
     if targets:

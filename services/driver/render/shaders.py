@@ -97,6 +97,7 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "garment": ((0.25, 0.25, 0.25), 8.0, 0.05),
     "eye_left": ((0.4, 0.36, 0.36), 8.0, 0.0),
     "eye_right": ((0.4, 0.36, 0.36), 8.0, 0.0),
+    "tears": ((0.8, 0.8, 0.8), 10.0, 1.2),
     "teeth_upper": ((0.4, 0.38, 0.36), 30.0, 1.0),
     "teeth_lower": ((0.4, 0.38, 0.36), 30.0, 1.0),
     "tongue": ((0.5, 0.3, 0.3), 14.0, 2.0),
