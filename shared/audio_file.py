@@ -115,7 +115,7 @@ def _open_file(
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     if num_bytes == 0:
-        raise UserError(f"{path}: the file is empty; record it again", "empty-file")
+        raise UserError(f"{path}: the file is empty; record it again")
     begin = file.read(NUM_BEGIN_BYTES)
     if num_parts(file) > 1:  # FFmpeg reads one of them
         if wav := pcm_of_wav(begin):
@@ -230,8 +230,7 @@ def limited_blocks(
         if num_samples > max_duration_s * source.sample_rate_hz:
             raise UserError(
                 f"{source.name}: the sound is longer than {max_duration_s / 3600:g} h; use a"
-                " shorter file",
-                "too-long",
+                " shorter file"
             )
         yield block
 

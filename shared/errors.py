@@ -11,13 +11,8 @@ USER_ERROR = 2  # exit status of a program after a ``UserError``
 class UserError(Exception):
     """A mistake in the user's input. The text names the cause and the remedy.
 
-    The command line prints the text without a traceback and exits with ``USER_ERROR``. The page
-    translates an error by its ``code``, if it has one.
+    The command line prints the text without a traceback and exits with ``USER_ERROR``.
     """
-
-    def __init__(self, text: str, code: str = "") -> None:
-        super().__init__(text)
-        self.code = code
 
 
 def install_command(package: str) -> str:

@@ -134,8 +134,7 @@ class MediaSound:
         if not tracks or len(self._container.streams) > _MAX_STREAMS:
             kinds = {stream.type for stream in self._container.streams}
             only = " and ".join(sorted(kinds))
-            text = f"{self._name}: the file has no audio, only {only}; record the sound"
-            raise UserError(text, "no-audio")
+            raise UserError(f"{self._name}: the file has no audio, only {only}; record the sound")
         listing = "; ".join(f"{place} {_describe(one)}" for place, one in enumerate(tracks, 1))
         if track is not None and not 1 <= track <= len(tracks):
             raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")

@@ -2,7 +2,7 @@
 
 import { LipSync } from "./index.js";
 
-/** An audio node that reports Oculus visemes. Its face is for the sound of 0.12 s ago. */
+/** An audio node that reports Oculus visemes. Its face is for the sound of 0.1 s ago. */
 export class HeadAudio extends GainNode {
   /** Called with (name, weight) when the weight of a viseme changes. */
   onvalue = null;

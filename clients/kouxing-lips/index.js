@@ -2,7 +2,7 @@
 
 import { FrameTrack } from "./frame-track.js";
 
-const SHOW_AFTER_S = 0.12; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
+const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
 const DEFAULT_SHAPES = ["arkit"];
 const MAX_LATE_S = 0.5; // from the sound to its face
 const TELEPHONE_HZ = 8000;

@@ -4,7 +4,7 @@ import { LipSync } from "./index.js";
 
 const VOWELS = { A: "aa", I: "ih", U: "ou", E: "ee", O: "oh" }; // VRM's names
 
-/** An audio node with a volume and weights of vowels. Its face is for the sound of 0.12 s ago. */
+/** An audio node with a volume and weights of vowels. Its face is for the sound of 0.1 s ago. */
 export class WLipSyncAudioNode extends GainNode {
   #lips;
   #names;

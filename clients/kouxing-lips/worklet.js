@@ -1,11 +1,10 @@
 // Passes sound to the worker. Runs in the audio thread.
 //
-// A block ends when the engine can process the next two frames. Fewer messages take less processor time: each wakes
-// a thread, whose caches are cold.
+// A block ends when the engine can process the next frame, because messages cost more than the sound.
 
 const QUANTUM = 128; // samples per call
 const RATE_HZ = sampleRate;
-const BLOCK_S = 0.04; // two frames of the engine
+const BLOCK_S = 0.02; // a frame of the engine
 const RESAMPLER_DELAY_S = 0.002;
 
 class LipSyncInput extends AudioWorkletProcessor {

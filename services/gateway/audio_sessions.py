@@ -139,5 +139,4 @@ def error_text(error: UserError | KouxingError) -> str:
     """Return the message about an error for a browser."""
     if isinstance(error, Refused):
         return wire.error_text(error.text, error.code, error.retry_after_s)
-    code = "no-control" if isinstance(error, KouxingError) else error.code
-    return wire.error_text(str(error), code or "refused")
+    return wire.error_text(str(error))

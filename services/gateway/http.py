@@ -14,7 +14,6 @@ import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.lip_models import lip_models
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
 from kouxing.shared.page_heads import page_heads_folder
@@ -176,11 +175,6 @@ async def discard_body(request: web.Request) -> None:
         async with asyncio.timeout(DISCARD_S):
             while await request.content.readany():
                 pass
-
-
-def error_response(error: UserError, code: str, status: int = 422) -> web.Response:
-    """Return the JSON answer to a request that failed; ``code`` is for errors without one."""
-    return web.json_response({"error": str(error), "code": error.code or code}, status=status)
 
 
 def _modules_folder() -> Path | None:

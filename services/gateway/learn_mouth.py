@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from aiohttp import web
 
 from kouxing.services.gateway.http import discard_body
-from kouxing.services.gateway.uploads import UPLOAD_LIMIT_S, Uploads
+from kouxing.services.gateway.uploads import UPLOAD_LIMIT_S, Uploads, upload_error
 from kouxing.services.mouth_profiles import worker
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import USER_ERROR, UserError
+from kouxing.shared.logs import LOG
 
 MAX_BYTES = 8 << 20
 LEARNING_LIMIT_S = 180.0
@@ -22,12 +23,6 @@ class MouthLearner(Uploads):
     """Answers a recording with the learned mouth profile."""
 
     busy_text = "another mouth profile is being created; try again in a minute"
-    slow_text = (
-        f"receiving the recording took longer than {UPLOAD_LIMIT_S:g} s, or learning longer than"
-        f" {LEARNING_LIMIT_S:g} s; try again later"
-    )
-    failed_text = "learning failed; see the gateway's log"
-    bad_code = "bad-recording"
 
     def __init__(self, command: Sequence[str] = (sys.executable, "-m", worker.__name__)) -> None:
         super().__init__()
@@ -40,7 +35,20 @@ class MouthLearner(Uploads):
             recording = await asyncio.wait_for(upload.read(), UPLOAD_LIMIT_S)
         except web.HTTPRequestEntityTooLarge:
             await discard_body(request)
-            text = f"the recording is larger than {MAX_BYTES >> 20} MiB"
-            raise UserError(text, "too-large") from None
-        profile, _ = await self.run(request, self._command, LEARNING_LIMIT_S, content=recording)
+            return upload_error(413, f"the recording is larger than {MAX_BYTES >> 20} MiB")
+        except TimeoutError:
+            return upload_error(408, f"the recording did not arrive within {UPLOAD_LIMIT_S:g} s")
+        try:
+            status, profile, messages = await self.run(
+                request, self._command, LEARNING_LIMIT_S, content=recording
+            )
+        except TimeoutError:
+            raise UserError(
+                f"learning took longer than {LEARNING_LIMIT_S:g} s; try again later"
+            ) from None
+        if status == USER_ERROR:
+            raise UserError(messages)
+        if status != 0:
+            LOG.error("learning a mouth failed with status %d: %s", status, messages)
+            raise UserError("learning failed; see the gateway's log")
         return web.Response(body=profile, content_type="application/json")

@@ -12,7 +12,6 @@ import numpy as np
 from aiohttp import web
 
 from kouxing.services.gateway import wire
-from kouxing.services.gateway.http import error_response
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.senders import Senders
 from kouxing.services.senders.target import Target, parse_delay_s
@@ -71,10 +70,11 @@ class SendersApi:
             elif isinstance(delay_ms, int | float):
                 self._senders.set_delay(parse_delay_s(delay_ms))
             else:
-                text = "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
-                raise UserError(text)
+                raise UserError(
+                    "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
+                )
         except UserError as error:
-            return error_response(error, "bad-address")
+            return web.json_response({"error": str(error)}, status=422)
         return self._state()
 
     def _allowed_target(self, url: str) -> Target:
@@ -82,8 +82,7 @@ class SendersApi:
         if not (target.is_local or url in self._configured):
             raise UserError(
                 f"{target.host} is another machine; add the address to gateway.senders, "
-                "or use 'kouxing send'",
-                "other-machine",
+                "or use 'kouxing send'"
             )
         return target
 

@@ -1,7 +1,4 @@
-"""The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output.
-
-An error is printed as its code, a tab and its text; otherwise the remarks are printed.
-"""
+"""The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output."""
 
 import resource
 import sys
@@ -43,5 +40,5 @@ if __name__ == "__main__":
     try:
         decode(Path(sys.argv[1]))
     except UserError as error:
-        print(error.code, error, sep="\t", file=sys.stderr)
+        print(error, file=sys.stderr)
         sys.exit(USER_ERROR)

@@ -14,8 +14,9 @@ from aiohttp import web
 
 from kouxing.services.gateway import sound_decoder
 from kouxing.services.gateway.http import discard_body
-from kouxing.services.gateway.uploads import UPLOAD_LIMIT_S, Uploads
-from kouxing.shared.errors import UserError
+from kouxing.services.gateway.uploads import UPLOAD_LIMIT_S, Uploads, upload_error
+from kouxing.shared.errors import USER_ERROR, UserError
+from kouxing.shared.logs import LOG
 
 MAX_BYTES = 200 << 20
 DECODING_LIMIT_S = 60.0
@@ -29,14 +30,14 @@ class SoundUpload(Uploads):
     """Answers a file with its sound."""
 
     busy_text = "another file is being read; try again in a few seconds"
-    slow_text = "reading the file took too long; use a shorter file"
-    failed_text = "the file cannot be decoded; export it again"
-    bad_code = "bad-file"
 
     async def answer(self, request: web.Request) -> web.StreamResponse:
         """Answer a file."""
-        with tempfile.TemporaryDirectory(prefix="kouxing-") as folder:
-            return await self._answer_in(Path(folder), request)
+        try:
+            with tempfile.TemporaryDirectory(prefix="kouxing-") as folder:
+                return await self._answer_in(Path(folder), request)
+        except TimeoutError:
+            return upload_error(408, "reading the file took too long; use a shorter file")
 
     async def _answer_in(self, folder: Path, request: web.Request) -> web.StreamResponse:
         name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME:].lstrip("-. ")
@@ -44,14 +45,19 @@ class SoundUpload(Uploads):
         source.parent.mkdir()
         if not await asyncio.wait_for(_store(request, source), UPLOAD_LIMIT_S):
             await discard_body(request)
-            text = f"the file is larger than {MAX_BYTES >> 20} MiB; use a smaller one"
-            raise UserError(text, "too-large")
-        # -P: the folder of the file must not provide modules
-        command = (sys.executable, "-P", "-m", sound_decoder.__name__, source.name)
-        with target.open("wb") as output:
-            _, messages = await self.run(
-                request, command, DECODING_LIMIT_S, output=output, folder=source.parent
+            return upload_error(
+                413, f"the file is larger than {MAX_BYTES >> 20} MiB; use a smaller one"
             )
+        # Python imports modules from the working folder, so that must not be the file's.
+        command = (sys.executable, "-m", sound_decoder.__name__, str(source))
+        with target.open("wb") as output:
+            status, _, messages = await self.run(request, command, DECODING_LIMIT_S, output=output)
+        messages = messages.replace(f"{source.parent}/", "")
+        if status == USER_ERROR:
+            raise UserError(messages)
+        if status != 0:
+            LOG.error("decoding a sound file failed with status %d: %s", status, messages)
+            raise UserError(f"{source.name}: the file cannot be decoded; export it again")
         headers = {"Content-Type": "audio/wav", REMARKS_HEADER: quote(messages)}
         response = web.StreamResponse(headers=headers)
         response.content_length = target.stat().st_size

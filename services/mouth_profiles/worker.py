@@ -22,5 +22,5 @@ if __name__ == "__main__":
     try:
         main()
     except UserError as error:
-        print(error.code, error, sep="\t", file=sys.stderr)
+        print(error, file=sys.stderr)
         sys.exit(USER_ERROR)

@@ -6,7 +6,7 @@ import socket
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from kouxing.services.senders.camera import CameraInput, open_camera
 from kouxing.services.senders.face_frame import FaceFrame
@@ -14,14 +14,6 @@ from kouxing.services.senders.target import Target
 
 RETRY_S = 1.0
 _REFUSED_S = 1.0  # without a refusal for this time, a program is listening
-
-
-class Problem(NamedTuple):
-    """Why frames do not reach a target; empty: no problem is known."""
-
-    text: str = ""
-    code: str = ""  # by which the page translates it
-
 
 Options = Mapping[str, tuple[str, ...]]
 COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}
@@ -38,7 +30,7 @@ class Connection(ABC):
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self.problem = Problem()
+        self.problem = ""  # why frames do not reach the target, if known
 
     @abstractmethod
     async def run(self) -> None:
@@ -78,10 +70,9 @@ class DatagramConnection(Connection):
                 if self._socket is None:
                     try:
                         self._socket = await self._open()
-                        self.problem = Problem()
+                        self.problem = ""
                     except OSError as error:
-                        text = f"cannot reach {self.target.host}: {error.strerror}"
-                        self.problem = Problem(text, "unreachable")
+                        self.problem = f"cannot reach {self.target.host}: {error.strerror}"
                 if self._camera is None and self.target.camera is not None:
                     await self._open_camera(*self.target.camera)
                 await asyncio.sleep(RETRY_S)
@@ -94,8 +85,7 @@ class DatagramConnection(Connection):
         try:
             self._camera = await open_camera(host, port, self._forward)
         except OSError as error:
-            text = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
-            self.problem = Problem(text, "no-tracker")
+            self.problem = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
 
     def _forward(self, packet: bytes) -> bool:
         if self._newest is None:
@@ -125,15 +115,14 @@ class DatagramConnection(Connection):
             self._refused_s = now_s
             address = f"{self.target.host}:{self.target.port}"
             if error.errno == errno.ECONNREFUSED:
-                text = f"no program listens on {address}: turn its receiver on"
-                self.problem = Problem(text, "no-listener")
+                self.problem = f"no program listens on {address}: turn its receiver on"
             else:
-                self.problem = Problem(f"cannot reach {address}: {error.strerror}", "unreachable")
+                self.problem = f"cannot reach {address}: {error.strerror}"
                 self._close()
             return False
         if now_s - self._refused_s < _REFUSED_S:
             return False
-        self.problem = Problem()
+        self.problem = ""
         return True
 
     def _close(self) -> None:

@@ -37,11 +37,8 @@ class SenderState:
     target: str  # address, as given
     delay_ms: float  # additional delay of each frame
     contents: str  # description of what is sent
-    shapes: str  # "arkit", "vrm", "oculus", or "tracking" for VTube Studio
-    part: str  # "mouth", "face", or "head" for the face and the head's rotation
     rate_hz: float  # frames per second, over the last 2 s
     problem: str  # why frames do not reach the target; empty if no problem is known
-    code: str  # of the problem
 
 
 @dataclass(slots=True, eq=False)
@@ -168,8 +165,7 @@ class Senders:
         if target.url in self._senders:
             return
         if len(self._senders) >= MAX_SENDERS:
-            text = f"already sending to {MAX_SENDERS} programs; stop one first"
-            raise UserError(text, "too-many-senders")
+            raise UserError(f"already sending to {MAX_SENDERS} programs; stop one first")
         connection = connect(target)
         task = self._loop.create_task(connection.run())
         self._senders[target.url] = _Sender(connection, task, target.delay_s)
@@ -196,17 +192,13 @@ class Senders:
         for url, sender in self._senders.items():
             while sender.sent_s and sender.sent_s[0] < since_s:
                 sender.sent_s.popleft()
-            target = sender.connection.target
             states.append(
                 SenderState(
                     target=url,
                     delay_ms=round(1e3 * sender.delay_s, 3),
-                    contents=target.contents,
-                    shapes=target.shapes,
-                    part=target.part,
+                    contents=sender.connection.target.contents,
                     rate_hz=len(sender.sent_s) / RATE_WINDOW_S,
-                    problem=sender.connection.problem.text,
-                    code=sender.connection.problem.code,
+                    problem=sender.connection.problem,
                 )
             )
         return states
@@ -229,7 +221,7 @@ class Senders:
             time_s = self._session_time_s + now_s - self._newest_s
             self._queue(FaceFrame(self._rest.blend(self._newest, share, now_s), time_s), now_s)
         for url, sender in self._senders.items():
-            problem = sender.connection.problem.text
+            problem = sender.connection.problem
             if problem != sender.reported:
                 sender.reported = problem
                 self._report(url, problem)

@@ -7,11 +7,6 @@ from kouxing.shared.endpoints import is_loopback
 from kouxing.shared.errors import UserError
 
 MAX_DELAY_MS = 10_000.0
-_SHAPES = {
-    "arkit": "ARKit shapes", "vrm": "VRM shapes", "oculus": "Oculus visemes",
-    "tracking": "tracking parameters",
-}  # fmt: skip
-_PARTS = {"mouth": " of the mouth", "face": "", "head": " and head"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,20 +27,19 @@ class Target:
 
     @property
     def shapes(self) -> str:
-        """Name of the shape set to send; "tracking" for VTube Studio's parameters."""
-        return "tracking" if self.protocol == "vts" else self.options.get("shapes", "arkit")
-
-    @property
-    def part(self) -> str:
-        """What moves: "mouth", "face", or "head" for the face and the head's rotation."""
-        if self.is_mouth_only:
-            return "mouth"
-        return "head" if self.options.get("head", "on") == "on" else "face"
+        """Name of the shape set to send."""
+        return self.options.get("shapes", "arkit")
 
     @property
     def contents(self) -> str:
         """Description of what the target receives."""
-        return _SHAPES[self.shapes] + _PARTS[self.part]
+        names = {"arkit": "ARKit shapes", "vrm": "VRM shapes", "oculus": "Oculus visemes"}
+        contents = "tracking parameters" if self.protocol == "vts" else names[self.shapes]
+        if self.is_mouth_only:
+            contents += " of the mouth"
+        elif self.options.get("head", "on") == "on":
+            contents += " and head"
+        return contents
 
     @property
     def is_local(self) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 
 import aiohttp
 
-from kouxing.services.senders.connection import RETRY_S, Connection, Problem
+from kouxing.services.senders.connection import RETRY_S, Connection
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
@@ -39,7 +39,7 @@ class VTubeStudioProtocol:
     """The messages of one connection, without I/O.
 
     ``token`` is from an earlier connection; if it is empty, VTube Studio asks the user. Frames may
-    be sent while ``is_ready``.
+    be sent while ``is_ready``. ``problem`` is a text for the user, or empty.
     """
 
     def __init__(self, token: str, save_token: Callable[[str], None]) -> None:
@@ -47,14 +47,13 @@ class VTubeStudioProtocol:
         self._save_token = save_token
         self._known: frozenset[str] = frozenset()
         self.is_ready = False
-        self.problem = Problem()
+        self.problem = ""
 
     def first_message(self) -> str:
         """Return the first message."""
         if self._token:
             return _request("AuthenticationRequest", **PLUGIN, authenticationToken=self._token)
-        text = "VTube Studio asks whether kouxing may move the model: press Allow there"
-        self.problem = Problem(text, "vts-asks")
+        self.problem = "VTube Studio asks whether kouxing may move the model: press Allow there"
         return _request("AuthenticationTokenRequest", **PLUGIN)
 
     def reply(self, text: str) -> str:
@@ -75,8 +74,7 @@ class VTubeStudioProtocol:
             }
             return handlers[kind](data) if kind in handlers else ""
         except (ValueError, KeyError, TypeError, AttributeError):
-            text = "the program at this address is not VTube Studio"
-            raise UserError(text, "vts-unknown") from None
+            raise UserError("the program at this address is not VTube Studio") from None
 
     def frame_message(self, frame: FaceFrame, *, is_mouth_only: bool) -> str:
         """Return the message that shows a frame."""
@@ -101,7 +99,7 @@ class VTubeStudioProtocol:
         if not data["authenticated"]:  # the user revoked it
             self._token = ""
             return self.first_message()
-        self.problem = Problem()
+        self.problem = ""
         return _request("InputParameterListRequest")
 
     def _on_parameters(self, data: Any) -> str:
@@ -111,25 +109,24 @@ class VTubeStudioProtocol:
         return ""
 
     def _on_parameters_injected(self, _data: Any) -> str:
-        self.problem = Problem()
+        self.problem = ""
         return ""
 
     def _on_error(self, data: Any) -> str:
-        number, problem = data["errorID"], Problem(str(data["message"])[:200])
+        number, text = data["errorID"], str(data["message"])[:200]
         if number == _DENIED:
-            text = "access to VTube Studio was denied; stop and start sending to be asked again"
-            raise AccessDenied(text, "vts-denied")
+            raise AccessDenied(
+                "access to VTube Studio was denied; stop and start sending to be asked again"
+            )
         if number == _ACCESS_OFF:
             text = "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings"
-            problem = Problem(text, "vts-off")
         elif number == _ASKING:
-            problem = self.problem  # it still shows the window of an earlier connection
+            text = self.problem  # it still shows the window of an earlier connection
         elif number == _IN_USE:
-            text = f"another plugin sets the same parameters: {problem.text}"
-            problem = Problem(text, "vts-in-use")
+            text = f"another plugin sets the same parameters: {text}"
         if not self.is_ready or number == _UNAUTHENTICATED:  # the token may have been revoked
-            raise UserError(*problem)
-        self.problem = problem
+            raise UserError(text)
+        self.problem = text
         return ""
 
 
@@ -212,18 +209,16 @@ class VTubeStudioConnection(Connection):
             while True:
                 try:
                     await self._run_connection(http)
-                    text = "VTube Studio closed the connection; trying again"
-                    self.problem = Problem(text, "vts-closed")
+                    self.problem = "VTube Studio closed the connection; trying again"
                 except UserError as error:
-                    self.problem = Problem(str(error), error.code)
+                    self.problem = str(error)
                     if isinstance(error, AccessDenied):
                         return
                 except (aiohttp.ClientError, OSError, TimeoutError):
-                    text = (
+                    self.problem = (
                         f"no VTube Studio at {self._address}: start it, and turn on "
                         "'Start API (allow plugins)' in its settings"
                     )
-                    self.problem = Problem(text, "vts-missing")
                 finally:
                     self._is_ready = False
                 await asyncio.sleep(RETRY_S)

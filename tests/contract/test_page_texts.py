@@ -1,35 +1,71 @@
-"""The page has a text for each code of an error that the gateway sends."""
+"""The page translates every text that the gateway sends about files, mouths and other programs."""
 
 import ast
 import re
+from collections.abc import Iterator
 
 from kouxing.shared.wire.session import ErrorCode
 from tests.system import ROOT
 
 PAGE = ROOT / "services" / "gateway" / "page"
-SOURCES = [
-    *PAGE.parent.glob("*.py"),
-    *(ROOT / "services" / "senders").glob("*.py"),
-    *(ROOT / "shared" / name for name in ("audio_file.py", "media_file.py")),
-]
-ERRORS = ("UserError", "AccessDenied", "Problem", "error_response")
+PAGE_TEXTS = PAGE / "gateway-texts.js"
+SOURCES = (
+    *("shared/audio_file.py", "shared/media_file.py", "shared/sound_formats.py"),
+    *("shared/channels.py", "shared/wav_parts.py", "services/gateway/sound_upload.py"),
+    *("services/gateway/uploads.py", "services/gateway/learn_mouth.py"),
+    *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
+    *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),
+    *("services/senders/connection.py", "services/senders/protocols.py"),
+    *("services/senders/senders.py", "services/senders/target.py"),
+    *("services/senders/vtube_studio.py", "clients/python/kouxing_client/base.py"),
+    *("clients/python/kouxing_client/core.py", "clients/python/kouxing_client/session_core.py"),
+)
+# Texts of the command line, of other clients than the page, and of a broken page.
+OTHERS = re.compile(
+    r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|sound arrived|images and audio"
+    r"|a folder|no such file|there is no track|expected 'start'|has disconnected"
+    r"|it is larger|landmark file|header|landmarks a frame|sample rate is|times do|not pixels"
+)
 
 
-def sent_codes() -> set[str]:
-    """Return the second arguments of errors, and what is assigned to codes."""
-    codes = {"file"}  # remarks on a file
-    for source in SOURCES:
-        for node in ast.walk(ast.parse(source.read_text("utf-8"))):
-            parts: list[ast.expr] = []
-            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(ERRORS):
-                parts = node.args[1:2]
-            elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith("code"):
-                parts = [getattr(node.value, "body", node.value)]
-            codes |= {str(part.value) for part in parts if isinstance(part, ast.Constant)}
-    return codes - {""}
+def template(node: ast.expr) -> str:
+    """Return a text with {} for values; empty if it is not a text."""
+    if isinstance(node, ast.JoinedStr):
+        parts = (v.value if isinstance(v, ast.Constant) else "{}" for v in node.values)
+        return "".join(map(str, parts)).removeprefix("{}: ")
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
 
 
-def test_the_page_has_a_text_for_each_error_code() -> None:
+def sent_texts(source: str) -> Iterator[str]:
+    """Yield the texts of errors, remarks and problems in a module."""
+    for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8"))):
+        if isinstance(node, ast.Call) and node.args:
+            name = ast.unparse(node.func)
+            if name.endswith(("UserError", "_error", "remarks.append", "notices.append")):
+                yield template(node.args[-1])
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith(".problem"):
+            yield template(node.value)
+        if isinstance(node, ast.Return) and node.value is not None and "formats" in source:
+            yield template(node.value)
+
+
+def test_the_page_translates_all_texts_of_the_gateway() -> None:
+    keys = re.findall(r'^  "(.+?)":(?: "|$)', PAGE_TEXTS.read_text("utf-8"), re.MULTILINE)
+    translated = {re.sub(r"\{\w+\}", "{}", key) for key in keys}
+    sent = {text for source in SOURCES for text in sent_texts(source) if " " in text}
+    assert not {text for text in sent - translated if not OTHERS.search(text)}
+    everything = "\n".join(
+        template(node)
+        for source in SOURCES
+        for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8")))
+        if isinstance(node, ast.Constant | ast.JoinedStr)
+    )
+    unknown = {
+        key for key in translated if any(part.strip() not in everything for part in key.split("{}"))
+    }
+    assert not unknown, "these texts no longer exist"
+
+
+def test_the_page_has_a_text_for_each_error_of_control() -> None:
     texts = (PAGE / "texts.js").read_text("utf-8")
-    codes = {*re.findall(r'^  "error\.(.+?)": \{', texts, re.MULTILINE)}
-    assert codes == {*ErrorCode} | sent_codes()
+    assert {*re.findall(r'^  "error\.(.+?)": \{', texts, re.MULTILINE)} == {*ErrorCode}

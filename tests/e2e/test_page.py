@@ -488,13 +488,8 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
 @pytest.mark.parametrize(
     ("name", "content", "english", "chinese"),
     [
-        ("broken.wav", b"RIFF" + bytes(40), "broken.wav: cannot read audio", "无法读取此文件"),
-        (
-            "silent.wav",
-            None,
-            "silent.wav: no speech was found; it is silent",
-            "silent.wav：没有找到语音，文件是静音的",
-        ),
+        ("broken.wav", b"RIFF" + bytes(40), "the file is damaged or cut off", "文件损坏或不完整"),
+        ("silent.wav", None, "silent.wav: no speech was found; it is silent", "文件是静音的"),
     ],
 )
 def test_a_file_without_sound_is_explained_in_both_languages(
@@ -507,7 +502,7 @@ def test_a_file_without_sound_is_explained_in_both_languages(
     for language, text in (("zh", chinese), ("en", english)):
         choose(page, "language", language)
         choose_file(page, tmp_path / name)
-        page.wait_for(f"{NOTICE}.startsWith('{text}')")
+        page.wait_for(f"{NOTICE}.includes('{text}')")
 
 
 def test_a_dropped_file_is_streamed(

@@ -3,13 +3,14 @@ import test from "node:test";
 import { LevelMeter, SILENT_DB } from "../../services/gateway/page/level.js";
 import { PhoneTrack } from "../../services/gateway/page/caption.js";
 import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
-import { errorText } from "../../services/gateway/page/language.js";
+import { toChinese } from "../../services/gateway/page/gateway-texts.js";
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 import {
   GatewayState,
   LastingFault,
   delayText,
   drawingText,
+  errorText,
   hintText,
   playoutDelaysText,
   secondsText,
@@ -129,6 +130,15 @@ test("a fault is shown after a second, and its end only if it was shown", () => 
   assert.deepEqual(fault.update(2300, ""), nothing);
 });
 
+test("texts of the gateway are translated with their values", () => {
+  assert.equal(
+    toChinese("a b.mp3: cannot read audio: this is text, not sound: 'x'"),
+    "a b.mp3：无法读取声音：这是文本，不是声音：'x'",
+  );
+  assert.equal(toChinese("a.wav: the file is empty; record it again\n1: unknown: why"), "a.wav：文件是空的，请重新录制\n1：unknown：why");
+  assert.equal(toChinese("ARKit shapes of the mouth"), "嘴部的ARKit 形状");
+});
+
 test("reduced quality and the head's rotation are described", () => {
   const drawing = { isCoarse: true, width: 550, height: 400 };
   assert.match(drawingText(drawing), /No graphics card.*550 × 400/);
@@ -154,7 +164,7 @@ test("sessions restart, end and lose their connection", () => {
 });
 
 test("a sender shows its contents and rate, or its problem", () => {
-  const sender = { shapes: "vrm", part: "face", rate_hz: 49.8, delay_ms: 90, problem: "", code: "" };
+  const sender = { contents: "VRM shapes", rate_hz: 49.8, delay_ms: 90, problem: "" };
   assert.equal(senderText(sender), "VRM shapes, 50 frames/s, delayed 90 ms");
   assert.equal(senderText({ ...sender, problem: "no program is listening" }), "no program is listening");
 });

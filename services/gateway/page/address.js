@@ -1,8 +1,6 @@
 // Addresses of the gateway. The page's URL contains the token after "#", which browsers do not send
 // to servers. The page removes the token from the URL and keeps it only in memory.
 
-import { UserError, errorText, say } from "./language.js";
-
 let token = null;
 
 function takeToken() {
@@ -23,20 +21,6 @@ export function pathOf(path, fields = {}) {
 export function socketUrl(path, fields) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   return `${scheme}://${location.host}${pathOf(path, fields)}`;
-}
-
-/**
- * Post a body to the gateway and return the response.
- *
- * @throws {UserError} if the gateway does not answer or answers with an error
- */
-export async function post(path, body, signal) {
-  const response = await fetch(path, { method: "POST", body, signal }).catch(() => null);
-  if (response === null) throw new UserError(say("gatewaySilent"));
-  if (response.ok) return response;
-  const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
-  const { error: text, code } = isJson ? await response.json() : { error: await response.text() };
-  throw new UserError(errorText({ code, text }));
 }
 
 /** Return whether the page's URL shows that the gateway runs on this computer. */

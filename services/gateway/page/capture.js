@@ -1,7 +1,7 @@
 // Captures the audio of a microphone or a file in chunks, with an audio worklet.
 
-import { pathOf, post } from "./address.js";
-import { UserError, say } from "./language.js";
+import { pathOf } from "./address.js";
+import { UserError, say, sayReceived } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
 const MAX_FILE_BYTES = 200 << 20;
@@ -44,7 +44,17 @@ export function capture(context, stream, onChunk) {
  */
 export async function openFileSpeech(context, file) {
   if (file.size > MAX_FILE_BYTES) throw new UserError(say("fileTooLarge"));
-  const response = await post(pathOf("sound", { name: file.name }), file);
+  let response;
+  try {
+    response = await fetch(pathOf("sound", { name: file.name }), { method: "POST", body: file });
+  } catch {
+    throw new UserError(say("gatewaySilent"));
+  }
+  if (!response.ok) {
+    const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
+    const reason = isJson ? (await response.json()).error : await response.text();
+    throw new UserError(sayReceived(reason));
+  }
   const buffer = await context.decodeAudioData(await response.arrayBuffer());
   if (buffer.getChannelData(0).every((sample) => Math.abs(sample) < QUIET_PEAK)) {
     throw new UserError(say("noSpeechSilent", { file: file.name }));

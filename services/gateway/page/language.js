@@ -1,5 +1,6 @@
 // The page's language, English or Chinese: the chosen one, else the browser's.
 
+import { toChinese } from "./gateway-texts.js";
 import { TEXTS } from "./texts.js";
 
 const ATTRIBUTES = { title: "title", label: "aria-label" }; // by their data- attributes
@@ -21,9 +22,9 @@ export function say(key, values = {}) {
   return text.replace(/\{(\w+)\}/g, (_, name) => values[name]);
 }
 
-/** Return the text of an error of the gateway in the page's language. Unknown codes keep the text. */
-export function errorText({ code, text }) {
-  return TEXTS[`error.${code}`] === undefined ? text : say(`error.${code}`, { text });
+/** Return a text of the gateway in the page's language. */
+export function sayReceived(text) {
+  return language === "zh" ? toChinese(text) : text;
 }
 
 /** Set the page's language and translate all elements that name a text (data-text etc.). */

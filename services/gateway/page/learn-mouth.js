@@ -1,12 +1,12 @@
 // The dialog "Learn my mouth": it records lips and voice, sends the recording to the gateway, shows
 // the learned result, and stores it if the user keeps it.
 
-import { pathOf, post } from "./address.js";
+import { pathOf } from "./address.js";
 import { capture, openCaptureContext } from "./capture.js";
 import { element } from "./elements.js";
 import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
-import { UserError, say } from "./language.js";
+import { UserError, say, sayReceived } from "./language.js";
 import { curvePath, extent, figures, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
@@ -220,16 +220,23 @@ export class MouthLesson {
     this.#abort = new AbortController();
     const { signal } = this.#abort;
     this.#show("learning");
+    let answer;
     try {
-      const answer = await (await post(pathOf("learn-mouth"), this.#recording, signal)).json();
-      if (signal.aborted) return;
-      const { mouth_profile: profile, before, after } = answer;
-      this.#learned = { profile, learntOn: Date.now(), before, after };
-      this.#recording = null;
-      this.#showResult(answer);
-    } catch (error) {
-      if (!signal.aborted) this.#fail(error.message);
+      const response = await fetch(pathOf("learn-mouth"), { method: "POST", body: this.#recording, signal });
+      const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
+      answer = isJson ? await response.json() : { error: await response.text() };
+    } catch {
+      answer = { error: say("gatewaySilent") };
     }
+    if (signal.aborted) return;
+    if (answer.error !== undefined) {
+      this.#fail(sayReceived(answer.error));
+      return;
+    }
+    const { mouth_profile: profile, before, after } = answer;
+    this.#learned = { profile, learntOn: Date.now(), before, after };
+    this.#recording = null;
+    this.#showResult(answer);
   }
 
   #showResult({ before, after, curves }) {

@@ -3,7 +3,7 @@
 import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
-import { errorText, say } from "./language.js";
+import { say } from "./language.js";
 import { MouthLesson } from "./learn-mouth.js";
 import { LevelMeter } from "./level.js";
 import { Player } from "./player.js";
@@ -12,7 +12,7 @@ import { MOTIONS, Settings } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
-import { GatewayState, Notice, StatusBar, showLevel } from "./status.js";
+import { GatewayState, Notice, StatusBar, errorText, showLevel } from "./status.js";
 import { MouthProfileStore, Preferences } from "./storage.js";
 import { ViewerSocket } from "./viewer-socket.js";
 

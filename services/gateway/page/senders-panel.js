@@ -1,19 +1,18 @@
 // The panel of senders: other programs that show the face. It lists them with buttons to start, stop
 // and delay them.
 
-import { pathOf, post } from "./address.js";
+import { pathOf } from "./address.js";
 import { element, setText } from "./elements.js";
-import { errorText, say } from "./language.js";
+import { say, sayReceived } from "./language.js";
 import { roundToTens } from "./status.js";
 
 const PERIOD_MS = 1000; // while the panel is open
 const TOLERANCE_MS = 15; // smaller differences of delays are ignored
 
-/** Return the text of a sender's state, an item of `senders` in proto/GATEWAY.md. */
-export function senderText({ shapes, part, rate_hz: rateHz, delay_ms: delay, problem, code }) {
-  if (problem !== "") return errorText({ code, text: problem });
-  const contents = say(`part.${part}`, { shapes: say(`shapes.${shapes}`) });
-  const values = { contents, rate: Math.round(rateHz), delay };
+/** Return the text of a sender's state: { contents, rate_hz, delay_ms, problem } of the gateway. */
+export function senderText({ contents, rate_hz: rateHz, delay_ms: delay, problem }) {
+  if (problem !== "") return sayReceived(problem);
+  const values = { contents: sayReceived(contents), rate: Math.round(rateHz), delay };
   return say(delay === 0 ? "senderState" : "senderStateDelayed", values);
 }
 
@@ -76,14 +75,13 @@ export class SendersPanel {
 
   /** Send a command; return whether it succeeded. */
   async #post(command) {
-    let problem = "";
-    try {
-      this.#show(await (await post(pathOf("senders"), JSON.stringify(command))).json());
-    } catch (error) {
-      problem = error.message;
-    }
-    setText(element("send-problem"), problem);
-    return problem === "";
+    const options = { method: "POST", body: JSON.stringify(command) };
+    const response = await fetch(pathOf("senders"), options).catch(() => null);
+    if (response === null) return false; // the notice reports that the gateway has stopped
+    const answer = await response.json();
+    setText(element("send-problem"), sayReceived(answer.error ?? ""));
+    if (response.ok) this.#show(answer);
+    return response.ok;
   }
 }
 

@@ -1,0 +1,117 @@
+// Chinese for the texts of the gateway. {name} is a placeholder for a value, which is also translated.
+
+const CHINESE = {
+  // Files: the same texts as those of the commands
+  "the file is empty; record it again": "文件是空的，请重新录制",
+  "cannot read audio: this is {kind}": "无法读取声音：这是{kind}",
+  "text, not sound: {text}": "文本，不是声音：{text}",
+  "a zip archive; unpack it first": "zip 压缩包，请先解压",
+  "a gzip archive; unpack it first": "gzip 压缩包，请先解压",
+  "a 7z archive; unpack it first": "7z 压缩包，请先解压",
+  "a rar archive; unpack it first": "rar 压缩包，请先解压",
+  "a PDF document, not sound": "PDF 文档，不是声音",
+  "a picture, not sound": "图片，不是声音",
+  "a SILK voice message; convert it to wav first": "SILK 语音消息，请先转成 wav",
+  "a MIDI file: notes without sound; render it to wav with a synthesizer": "MIDI 文件，只有音符没有声音；请先用合成器转成 wav",
+  "cannot read audio: the file has only zeros; copy or record it again": "无法读取声音：文件里全是零，请重新复制或录制",
+  "cannot read audio: the file is cut off before its index; copy or record it again": "无法读取声音：文件不完整，缺少索引；请重新复制或录制",
+  "cannot read audio: the file is damaged or cut off ({reason}); copy it again": "无法读取声音：文件损坏或不完整，请重新复制",
+  "cannot read audio from this file ({reason}); use wav, flac, mp3, m4a, mp4, webm or ogg. Raw samples need: kouxing speak --raw":
+    "无法从此文件读取声音，请用 wav、flac、mp3、m4a、mp4、webm 或 ogg。原始采样请用 kouxing speak --raw",
+  "these are samples without a header; convert them to wav with FFmpeg, stating their format and rate": "文件只有采样，没有文件头；请用 FFmpeg 按其格式和采样率转成 wav",
+  "the file contains no samples; record it again": "文件里没有声音数据，请重新录制",
+  "the sound is encrypted (DRM); use a copy without protection": "声音已加密（DRM），请用没有保护的副本",
+  "the sound is damaged or encrypted; nothing can be decoded; export it again": "声音已损坏或加密，无法解码；请重新导出",
+  "the file has no audio, only {kinds}; record the sound": "文件里没有声音，请录制带声音的文件",
+  "the codec of audio track {track} is unknown; export the sound as wav, flac, mp3 or m4a": "无法识别第 {track} 条音轨的编码，请导出为 wav、flac、mp3 或 m4a",
+  "{codec} is not supported; export the sound as 16-bit PCM": "不支持 {codec}，请导出为 16 位 PCM",
+  "{count} audio tracks: {tracks}. This reads track {track}; choose another with --track":
+    "有 {count} 条音轨：{tracks}。现在播放第 {track} 条；其他音轨可用 kouxing speak --track 播放",
+  "the file is cut off after {read} s of {whole} s": "文件不完整：只有 {read} 秒，应有 {whole} 秒",
+  "the file is cut off after {read} s": "文件不完整：只有 {read} 秒",
+  "the file has several parts of sound; convert them separately": "文件里有几段声音，请分别转换",
+  "the encoding of the sound changes; convert each part separately": "声音的编码中途改变，请分别转换",
+  "the file cannot be read after {read} s; export it again": "{read} 秒之后无法读取，请重新导出",
+  "cannot be read to its end: {reason}": "无法读到结尾，请重新导出",
+  "damaged near {place} s; the damaged part is silent": "{place} 秒附近已损坏，损坏部分无声",
+  "mixing all channels would lose the sound of one; only channel {channel} is used": "如混合所有声道，会丢失其中一个声道的声音，因此只用第 {channel} 声道",
+  "{share} of the samples are clipped; record at a lower level": "{share} 的采样过载失真，请降低录音音量",
+  "{rate} Hz is too low for speech; use {least} Hz or more": "采样率 {rate} Hz 太低，请用 {least} Hz 以上",
+  "NaN or infinite samples near {place} s; export the file again, for example as 16-bit PCM":
+    "{place} 秒附近有无效采样，请重新导出，例如 16 位 PCM",
+  "the sound is longer than {hours} h; use a shorter file": "声音长于 {hours} 小时，请用较短的文件",
+  "another file is being read; try again in a few seconds": "正在读取另一个文件，请几秒后重试",
+  "the file is larger than {size} MiB; use a smaller one": "文件大于 {size} MiB，请用较小的文件",
+  "this is a big-endian WAV file; export it as wav or flac": "这是大端序的 WAV 文件，请导出为 wav 或 flac",
+  "the file cannot be decoded; export it again": "文件无法解码，请重新导出",
+  "reading the file took too long; use a shorter file": "读取时间太长，请用较短的文件",
+
+  // Sessions
+  "control at {address} does not answer. Start it with 'kouxing run'": "控制服务（{address}）没有应答，请运行 kouxing run",
+  "control at {address} does not accept this key. If it runs on this machine, restart it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here": "控制服务（{address}）不接受网关的密钥，请在两台机器上运行 kouxing doctor",
+  "control has closed the session: {reason}": "控制服务关闭了会话（{reason}）",
+  "the session is closed": "会话已关闭",
+  "another program opened this session, and sends its audio": "另一个程序在使用此会话",
+
+  // Learn my mouth
+  "the gateway is stopping": "网关正在停止",
+  "another mouth profile is being created; try again in a minute": "正在学习另一个口型，请一分钟后重试",
+  "learning failed; see the gateway's log": "学习失败，请查看网关日志",
+  "the recording is larger than {size} MiB": "录制大于 {size} MiB",
+  "the recording did not arrive within {limit} s": "录制未在 {limit} 秒内传完",
+  "learning took longer than {limit} s; try again later": "学习超过 {limit} 秒，请稍后重试",
+  "the landmarks do not form an upright face; film the face from the front": "看不出正面的脸，请正对摄像头",
+  "the landmarks of a frame coincide; omit frames without a face": "有的画面里没有脸，请重录",
+  "a face is visible in only {count} frames; film it for 20 s or more": "只有 {count} 帧能看到脸，请录 20 秒以上",
+  "it has less than a second of audio": "声音不到一秒",
+  "only {speech} s of speech show the lips; film {least} s or more, preferably a minute":
+    "只有 {speech} 秒语音能看到嘴唇，请录 {least} 秒以上，最好一分钟",
+
+  // Other programs
+  "VRM shapes": "VRM 形状",
+  "ARKit shapes": "ARKit 形状",
+  "Oculus visemes": "Oculus 口型",
+  "tracking parameters": "追踪参数",
+  "{contents} of the mouth": "嘴部的{contents}",
+  "{contents} and head": "{contents}和头部",
+  "no program listens on {address}: turn its receiver on": "{address} 没有程序接收，请在该程序中打开接收",
+  "cannot receive from a tracker on {host}:{port}: {reason}": "无法在 {host}:{port} 接收面部追踪数据：{reason}",
+  "camera must be a port such as 39541, or ADDRESS:PORT, not {text}":
+    "camera 应为端口（例如 39541）或 地址:端口，而不是 {text}",
+  "cannot reach {address}: {reason}": "无法连接 {address}",
+  "VTube Studio asks whether kouxing may move the model: press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
+  "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings":
+    "VTube Studio 的 API 未打开，请在其设置中打开“Start API (allow plugins)”",
+  "access to VTube Studio was denied; stop and start sending to be asked again": "VTube Studio 拒绝了访问；停止后再开始发送会重新询问",
+  "the program at this address is not VTube Studio": "此地址的程序不是 VTube Studio",
+  "another plugin sets the same parameters: {text}": "另一个插件在设置同样的参数：{text}",
+  "VTube Studio closed the connection; trying again": "VTube Studio 断开了连接，正在重试",
+  "no VTube Studio at {address}: start it, and turn on 'Start API (allow plugins)' in its settings":
+    "{address} 没有 VTube Studio，请启动它并在设置中打开“Start API (allow plugins)”",
+  "already sending to {count} programs; stop one first": "已在向 {count} 个程序发送，请先停止一个",
+  "{host} is another machine; add the address to gateway.senders, or use 'kouxing send'":
+    "{host} 是另一台机器；请把地址加入 gateway.senders，或用 kouxing send",
+  "{url} is not a valid address; write {forms}": "地址 {url} 无效，请写 {forms}",
+  "prefix must start with '/'": "prefix 必须以“/”开头",
+  "unknown option {name}; use {options}": "没有选项 {name}，可用 {options}",
+  "{name} must be {values}": "{name} 必须是 {values}",
+  "{name} is longer than {count} characters": "{name} 超过 {count} 个字符",
+  "the delay {delay} is not a number of milliseconds between 0 and {most}": "延迟 {delay} 不是 0 到 {most} 毫秒的数",
+};
+
+const PATTERNS = Object.entries(CHINESE).map(([english, chinese]) => {
+  const literals = english.split(/\{\w+\}/).map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&"));
+  const names = [...english.matchAll(/\{(\w+)\}/g)].map(([, name]) => name);
+  return { pattern: new RegExp(`^${literals.join("(.+?)")}$`), names, chinese };
+});
+
+/** Translate lines of the form "text" or "file: text". Unknown texts stay English. */
+export function toChinese(text) {
+  if (text.includes("\n")) return text.split("\n").map(toChinese).join("\n");
+  for (const { pattern, names, chinese } of PATTERNS) {
+    const values = pattern.exec(text)?.slice(1).map(toChinese);
+    if (values) return chinese.replace(/\{(\w+)\}/g, (_, name) => values[names.indexOf(name)]);
+  }
+  const [, subject, rest] = /^(.+?): (.+)$/.exec(text) ?? [];
+  return subject === undefined ? text : `${subject}：${toChinese(rest)}`;
+}
