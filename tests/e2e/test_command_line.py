@@ -237,7 +237,8 @@ def test_a_command_writes_each_line_at_once() -> None:
     code = """
 import os, signal
 from kouxing.services.cli import main as command_line
-command_line.app = lambda **_: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
+run = lambda **_: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
+command_line.typer.main.get_command = lambda _: run
 command_line.main()
 """
     done = subprocess.run(
