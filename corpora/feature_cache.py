@@ -35,7 +35,7 @@ def cache_folder() -> Path:
     return folder
 
 
-def kept_arrays(
+def load_or_compute(
     path: Path, compute: Callable[[], Mapping[str, ArrayLike]]
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays in a file (.npz). If it does not exist, compute and write it first."""

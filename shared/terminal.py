@@ -146,7 +146,7 @@ def check_output(
             with path.open("a"):
                 pass
             if is_new:
-                path.resolve().unlink()  # of a link, only what it names
+                path.resolve().unlink()  # deletes the target of a link, not the link
         except OSError as error:
             raise write_error(path, error) from None
 

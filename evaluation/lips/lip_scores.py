@@ -153,8 +153,8 @@ def takes_of(
         }
         if reference is None:
             aligned = aligned_phones(model, clip)
-            heard = next(iter(events.values()))[delays_s[0]]
-            reference = reference_of(clip, heard, model.inventory, aligned)
+            first_events = next(iter(events.values()))[delays_s[0]]
+            reference = reference_of(clip, first_events, model.inventory, aligned)
             yield REAL, condition, Take(reference, reference.mouth)
             for title, mouth_of in programs.items():
                 yield title, condition, Take(reference, mouth_of(clip))

@@ -23,7 +23,7 @@ FRAME_RATE_HZ = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class _AtSeveralDelays:
+class _MultiDelayPredictor:
     """A lip predictor that predicts for several delays in one run of the recognizer."""
 
     predictor: LipFrameModel
@@ -52,7 +52,7 @@ def live_events(
     if lips is None:
         return dict.fromkeys(delays_s, sound_events(model, samples, None, config=config))
     chosen_s = {delay_s: choose_delay(lips.delays_s, delay_s) for delay_s in delays_s}
-    several = _AtSeveralDelays(lips, [*chosen_s.values()])
+    several = _MultiDelayPredictor(lips, [*chosen_s.values()])
     events = sound_events(model, samples, several, config=config)
     return {
         delay_s: [

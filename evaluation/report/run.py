@@ -23,7 +23,7 @@ from kouxing.shared.terminal import print_message
 _DROPPED = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
 _DROPPED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
-# The report itself writes these files, so changes of them do not make a commit dirty.
+# The report itself writes these files, so their changes do not make a commit dirty.
 _WRITTEN = (":!docs/results", ":!docs/results.md", ":!docs/*.png")
 
 
@@ -75,7 +75,7 @@ def describe_run() -> dict[str, Any]:
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
     models = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
     commit = _git("describe", "--always")
-    if commit and _git("status", "--porcelain", "--", ".", *_WRITTEN):
+    if commit and _git("status", "--porcelain", "--untracked-files=no", "--", ".", *_WRITTEN):
         commit += "-dirty"
     return {
         "machine": f"{models[0] if models else platform.processor()}, {os.cpu_count()} cores",

@@ -2,8 +2,8 @@
 
 The services run as under ``kouxing run``, with keys, on free ports. During each attack a session
 is streamed in real time: before, during and after it. The attacker is a separate process, which
-starts over whenever it is cut off. It has a process session of its own, like any other program:
-in the caller's session, it would have the caller's priority, which can exceed the services'. The
+starts over whenever it is cut off. It has a process session of its own, like any other program.
+In the caller's session, it would have the caller's priority, which can exceed the services'. The
 first row is a process that only keeps a core busy, because an attacker also takes processor time.
 
 On Linux only: memory is read from ``/proc``.
@@ -197,8 +197,10 @@ def _attacker(
     end.start()
     try:
         yield
-    finally:
-        end.join()
+    finally:  # after an error or Ctrl-C, the attack must not continue
+        begin.cancel()
+        end.cancel()
+        process.terminate()
         process.join()
 
 

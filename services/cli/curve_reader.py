@@ -60,7 +60,7 @@ def read_table(path: Path) -> FapAnimation:
     is_shapes = names[columns[0]] not in FAP_NUMBER
     expected = {*_OTHER_COLUMNS, *(names[column] for column in columns)}
     if ignored := [name for name in written if name.lower() not in expected]:
-        print_message(f"{path}: columns that no face has were ignored: {', '.join(ignored)}")
+        print_message(f"{path}: ignored unknown columns: {', '.join(ignored)}")
     count = names.index("blendshapecount") if "blendshapecount" in names else None
     times: list[str] = []
     values: list[Float64] = []

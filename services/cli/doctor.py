@@ -80,10 +80,10 @@ def _check_key(name: str, key: Key | None, address: str) -> Finding:
     control = with_key(address, key.control if key else "")
     try:
         with Bus(key) as bus:
-            reach = bus.probe(control)
+            result = bus.probe(control)
     except UserError as error:
         return Finding(f"key {name}", "cannot be used", str(error))
-    if reach is ProbeResult.ACCEPTED:
+    if result is ProbeResult.ACCEPTED:
         return Finding(f"key {name}", "control accepts it")
     running, _, running_key = find_control().partition(" ")
     if key is not None and running == address and running_key not in ("", key.control):

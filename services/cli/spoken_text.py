@@ -91,7 +91,7 @@ def text_of(text: str) -> str:
         name = "the text" if path is None else str(path)
         print_message(f"{name} was read as {' in '.join(forms)}")
     elif time := _CLOCK_TIME.match(spoken.text):
-        print_message(f"{time[0]} is read as a spoken time of day; delete it if nobody says it")
+        print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
     return spoken.text
 
 

@@ -66,7 +66,7 @@ _FIRST_TIME = rf"0?0[:：]\d{{2}}(?:[ \t]*[-–—~～→][ \t]*{_TIME})?"  # of
 _TIMED_LINE = (  # also the line of a speaker, with the time at its end
     rf"(?:(?:{_TIME_IN_BRACKETS})+|{_TIMES}(?=[ \t]|$)|\S.{{,30}}?[ \t]+{_TIMES}[ \t]*$)[ \t]*"
 )
-_SPEAKER = (  # SPEAKER_00: or 说话人 1：, as programs number them
+_SPEAKER = (  # number of a speaker, such as SPEAKER_00: or 说话人 1：
     rf"[ \t]*(?:[A-Za-z]+[ _]?|(?:说话人|說話人|发言人|發言人)[ ]?)\d+(?:[ \t]+{_TIME})?[ \t]*[:：]"
 )
 _LYRICS_TIME = r"\[\d+,\d+\]"

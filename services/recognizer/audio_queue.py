@@ -7,7 +7,7 @@ from kouxing.services.recognizer.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.overload import Overload
 
-_MIN_CHUNK_S = 0.001  # a shorter chunk takes as much time to decode
+_MIN_CHUNK_S = 0.001  # a shorter chunk counts as this long: decoding it takes as much time
 
 
 class AudioQueue:
@@ -25,8 +25,8 @@ class AudioQueue:
 
     @property
     def duration_s(self) -> float:
-        """Duration of the queued audio."""
-        return self._num_samples / self._rate_hz
+        """Duration of the queued audio. Each chunk counts as at least 1 ms, also an empty one."""
+        return max(self._num_samples / self._rate_hz, _MIN_CHUNK_S * len(self._chunks))
 
     def append(self, chunk: Chunk, now_s: float) -> None:
         """Add a chunk that has arrived."""

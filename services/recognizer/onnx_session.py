@@ -1,13 +1,13 @@
 """Opens ONNX files with onnxruntime, on one thread.
 
-onnxruntime is kept from sending usage data to its maker. The thread that would do so can also keep
-a process from ending (onnxruntime-genai, pull request 2363).
+Telemetry is disabled: onnxruntime would store usage data and send it to its maker. The telemetry
+thread can also keep a process from ending (onnxruntime-genai, pull request 2363).
 """
 
 import os
 from typing import Any
 
-os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # it is read during the import
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read during the import
 import onnxruntime
 
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from operator import attrgetter
 
 from kouxing.services.recognizer.acoustic.languages import LANGUAGES_OF_MODELS
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -114,9 +115,9 @@ class RecognizerService(Service):
         has_unpaced = self._has_unpaced_audio and not self._is_unpaced_blocked
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
         self._read_late_audio()
-        self._live.decode(self._paced(True))
-        is_blocked = self._is_unpaced_blocked or not self._has_unpaced_audio
-        if not is_blocked and not self._is_live_waiting:
+        self._live.decode(self._select_sessions(paced=True))
+        has_unpaced = self._has_unpaced_audio and not self._is_unpaced_blocked
+        if has_unpaced and not self._is_live_waiting:
             self._decode_unpaced()
 
     def wait(self, timeout_s: float) -> list[Socket]:
@@ -219,7 +220,7 @@ class RecognizerService(Service):
             self.report_skipped(session.name, session.audio.overload.take_report_s(now_s))
             if session.link.is_full:
                 blocked.add(session.start.paced)
-        self._is_live_blocked = True in blocked or self._queued_s(True) > MAX_QUEUED_S
+        self._is_live_blocked = True in blocked or self._queued_s(paced=True) > MAX_QUEUED_S
         self._is_unpaced_blocked = False in blocked
         self.pause(self._audio, paused=self._is_live_blocked)
         self._limit_unpaced()
@@ -236,7 +237,7 @@ class RecognizerService(Service):
     def on_drain(self) -> bool:
         """Let other recognizers take the sessions; finish those that stay."""
         sessions = self._sessions.values()
-        self._live.decode_all(self._paced(True))
+        self._live.decode_all(self._select_sessions(paced=True))
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
         while self._has_unpaced_audio:
@@ -261,7 +262,7 @@ class RecognizerService(Service):
         """Return figures about queued audio, unacknowledged messages and the light model."""
         backlogs = [session.link.backlog for session in self._sessions.values()]
         return {
-            "queued_audio_seconds": self._queued_s(True) + self._queued_s(False),
+            "queued_audio_seconds": self._queued_s(paced=True) + self._queued_s(paced=False),
             "unacknowledged_messages": max(backlogs, default=0),
             "network_hop": self._live.hop,
             "light_sessions": sum(session.stream.is_light for session in self._sessions.values()),
@@ -281,12 +282,12 @@ class RecognizerService(Service):
         if not session.is_decoding:
             self._finish(session)
 
-    def _paced(self, is_paced: bool) -> list[RecognizerSession]:
-        return [one for one in self._sessions.values() if one.start.paced == is_paced]
+    def _select_sessions(self, *, paced: bool) -> list[RecognizerSession]:
+        return [one for one in self._sessions.values() if one.start.paced == paced]
 
-    def _queued_s(self, is_paced: bool) -> float:
+    def _queued_s(self, *, paced: bool) -> float:
         """Duration of the paced or unpaced audio that is not decoded yet."""
-        return sum(session.audio.duration_s for session in self._paced(is_paced))
+        return sum(session.audio.duration_s for session in self._select_sessions(paced=paced))
 
     @property
     def _has_live_audio(self) -> bool:
@@ -331,11 +332,11 @@ class RecognizerService(Service):
     @property
     def _max_unpaced_s(self) -> float:
         """Duration of unpaced audio that is decoded, and read, at a time."""
-        return MAX_UNPACED_S if self._paced(True) else MAX_BATCH_S
+        return MAX_UNPACED_S if self._select_sessions(paced=True) else MAX_BATCH_S
 
     def _limit_unpaced(self) -> None:
         """Stop reading unpaced audio while enough of it is queued."""
-        is_full = self._queued_s(False) >= self._max_unpaced_s
+        is_full = self._queued_s(paced=False) >= self._max_unpaced_s
         is_paused = is_full or self._is_unpaced_blocked
         self.pause(self._unpaced_audio, paused=is_paused)
         if not is_paused:
@@ -346,7 +347,9 @@ class RecognizerService(Service):
         before = self._live.work
         left_s = self._max_unpaced_s
         batch = []
-        for session in self._paced(False):
+        # the session that has waited longest comes first, so that none starves
+        waiting = sorted(self._select_sessions(paced=False), key=attrgetter("accepted_s"))
+        for session in waiting:
             if session.audio and left_s > 0.0:
                 queued_s = session.audio.duration_s
                 session.accept_waveform(left_s, time.monotonic(), hop=1)

@@ -41,7 +41,7 @@ MAX_LEAD_S = 15.0  # limit for a paced client ahead of the clock; a delayed one 
 ACKNOWLEDGE_EVERY_S = 0.1  # interval between acknowledgements to a client that sends audio
 STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has stalled
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
-RESEND_WAIT_S = 1.0  # for missing audio messages; then the session continues after the gap
+RESEND_WAIT_S = 1.0  # time for resending missing audio; then the session continues after the gap
 M = TypeVar("M", bound=Message)
 
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
@@ -105,7 +105,7 @@ class RecognizerSession:
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
-        self._gap_since_s: float | None = None  # when a message behind a gap arrived
+        self._gap_since_s: float | None = None  # since when messages behind a gap are dropped
         self.client = NO_PEER  # sender of the newest audio
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded
@@ -140,10 +140,11 @@ class RecognizerSession:
         return min(self.last_sequence, self.end.sequence - 1)
 
     def take_next(self, message: AudioChunk, now_s: float) -> bool:
-        """Return whether to accept a message newer than the last, which then is the last.
+        """Accept a message newer than the last, unless messages before it are missing.
 
         ZeroMQ loses messages in flight when a connection ends. A client that asks for
-        acknowledgements resends them; until then, later messages are ignored.
+        acknowledgements resends them. Until then, or for ``RESEND_WAIT_S``, later messages are
+        dropped. Returns whether the message was accepted.
         """
         is_next = self.last_sequence in (0, message.sequence - 1)
         if message.acknowledge and not is_next:

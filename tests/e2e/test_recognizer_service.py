@@ -67,7 +67,7 @@ class Recognizer(RecognizerService):
 
     def decode_all(self) -> None:
         while self._has_live_audio:
-            self._live.decode([*self._sessions.values()])
+            self._live.decode(self._select_sessions(paced=True))
         while self._has_unpaced_audio:
             self._decode_unpaced()
             self.send_heartbeat_if_due()

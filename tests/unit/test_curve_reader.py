@@ -130,7 +130,7 @@ def test_reads_the_names_of_other_programs(
     weights = np.zeros(len(ARKIT.names), np.float32)
     weights[[ARKIT.names.index(shape) for shape in shapes]] = 0.5, 0.25
     assert np.abs(read_table(path).faps[0] - ARKIT.faps(weights)).max() < 1e-3
-    assert capsys.readouterr().err == f"{path}: columns that no face has were ignored: nose\n"
+    assert capsys.readouterr().err == f"{path}: ignored unknown columns: nose\n"
 
 
 @pytest.mark.parametrize(

@@ -101,11 +101,11 @@ def test_hair_keeps_strands_but_not_the_painted_light() -> None:
     assert np.corrcoef(gray[128], strand)[0, 1] > 0.9
 
 
-def test_the_density_of_a_triangle_is_its_alpha() -> None:
+def test_samples_the_alpha_of_triangles() -> None:
     alpha = np.zeros((8, 8))
     alpha[:, 4:] = 1.0  # the right half
     uv = np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
     triangles = np.array([[0, 1, 2], [1, 3, 4]])
-    density = textures.density(triangles, uv, alpha)
-    np.testing.assert_array_equal(density.max(axis=1), [0.0, 1.0])
-    assert density[1].mean() > 0.9
+    sampled = textures.sample_alpha(triangles, uv, alpha)
+    np.testing.assert_array_equal(sampled.max(axis=1), [0.0, 1.0])
+    assert sampled[1].mean() > 0.9

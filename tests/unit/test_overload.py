@@ -158,6 +158,14 @@ def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
     assert not audio
 
 
+def test_empty_chunks_fill_the_queue() -> None:
+    audio = AudioQueue(RATE_HZ, Overload(MAX_BEHIND_S))
+    for _ in range(100):
+        audio.append((0, np.zeros((0, 1), np.float32)), 0.0)
+    assert audio.duration_s == pytest.approx(0.1)
+    assert len(list(audio.take(0.05))) == 50
+
+
 def test_a_session_that_is_slightly_behind_uses_the_light_model() -> None:
     session = Session()
     session.run(2.0, speed=3.0)

@@ -264,7 +264,7 @@ def test_reads_a_subtitle_file_and_names_its_format(
     assert "said.srt was read as SubRip (SRT) in GB18030" in capsys.readouterr().err
 
 
-def test_says_that_a_time_of_day_is_spoken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_warns_about_a_spoken_time_of_day(capsys: pytest.CaptureFixture[str]) -> None:
     assert text_of("12:30 我们走") == "12:30 我们走"
     assert "12:30 is read as a spoken time of day" in capsys.readouterr().err
     text_of("我们12:30走")

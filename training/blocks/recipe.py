@@ -22,7 +22,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats, as_integers, kept_arrays
+from kouxing.corpora.feature_cache import as_floats, as_integers, load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors
@@ -140,7 +140,7 @@ def train_blocks(
         )
         return _Labeled([*recordings, *_sung_copies(recordings, seed)], *statistics).arrays()
 
-    labeled = _Labeled.of(kept_arrays(labels, compute_labels))
+    labeled = _Labeled.of(load_or_compute(labels, compute_labels))
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
     readout = BlockReadout(whole.shape.width * len(whole.kept_layers), num_states, READOUT)

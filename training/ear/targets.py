@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats, as_integers, kept_arrays
+from kouxing.corpora.feature_cache import as_floats, as_integers, load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.ear import Voice
@@ -118,7 +118,7 @@ class TargetStore:
         self.num_chunks = -(-len(recordings) // CHUNK_SIZE)
         folder.mkdir(parents=True, exist_ok=True)
         self._check_key()
-        self._basis = kept_arrays(folder / "basis.npz", self._compute_basis)
+        self._basis = load_or_compute(folder / "basis.npz", self._compute_basis)
 
     @property
     def lips_mean(self) -> Floats:

@@ -64,13 +64,15 @@ def phone_table(
     crossings: dict[str, list[float]] = defaultdict(list)
     shares: dict[str, list[float]] = defaultdict(list)
     for recording in speech:
-        hiss = OnsetCrossings(recording.slices)
+        onset_crossings = OnsetCrossings(recording.slices)
         remaining = iter(recording.phones)
         for syllable in recording.syllables:
             phones = list(islice(remaining, len(syllable)))
             for phone in phones:
                 durations[phone.symbol].append(phone.duration_s)
-            crossings[syllable[0]].append(float(hiss.at(np.array([phones[0].onset_s]))[0]))
+            crossings[syllable[0]].append(
+                float(onset_crossings.at(np.array([phones[0].onset_s]))[0])
+            )
             if len(syllable) > 1 and syllable[0] in inventory.initials:
                 length_s = phones[0].duration_s + phones[1].duration_s
                 shares[syllable[1]].append(phones[0].duration_s / length_s)

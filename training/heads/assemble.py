@@ -243,17 +243,17 @@ class Builder:
             welds = number[welds[order]]
             coarse, num_coarse = quads[:, 0].reshape(-1, 4), len(used)
 
-        def drawn(quads: Index) -> Index:
+        def order_triangles(quads: Index) -> Index:
             triangles = subdivision.triangles_of(quads)
-            triangles = triangles[(textures.density(triangles, uv, alpha) > 0.25).any(axis=1)]
+            triangles = triangles[(textures.sample_alpha(triangles, uv, alpha) > 0.25).any(axis=1)]
             inner = ndimage.minimum_filter(alpha, _SOFT_EDGE)
-            opaque = (textures.density(triangles, uv, inner) > 0.9).all(axis=1)
+            opaque = (textures.sample_alpha(triangles, uv, inner) > 0.9).all(axis=1)
             middle = points[triangles].mean(axis=1) - PIVOT
             outward = np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2]
             return triangles[np.lexsort([np.where(opaque, -outward, outward), ~opaque])]
 
         color = np.tile(textures.tint(person.look.hair), (len(points), 1))
-        part = parts.Geometry(points, drawn(quads), uv, color, welds)
+        part = parts.Geometry(points, order_triangles(quads), uv, color, welds)
         return HeadPiece(
             "hair",
             part,
@@ -261,7 +261,7 @@ class Builder:
             0.6,
             np.ones(len(points)),
             coarse_vertices=num_coarse,
-            coarse_triangles=None if coarse is None else drawn(coarse),
+            coarse_triangles=None if coarse is None else order_triangles(coarse),
         )
 
     def _swept_aside(self, points: Float, vertices: Float, width: float) -> Float:

@@ -86,8 +86,8 @@ def strands(texture: Float, contrast: float) -> Float:
     return np.stack([np.round(gray * 40) / 40, np.round(alpha * 16) / 16], axis=2)
 
 
-def density(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float:
-    """Return alpha at points of triangles (F, N); ``uv`` (V, 2) has v downward."""
+def sample_alpha(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float:
+    """Return alpha at N points of each triangle (F, N); ``uv`` (V, 2) has v downward."""
     steps = np.linspace(0.02, 0.96, 9)
     share = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])
     at = np.einsum("sk,fkd->fsd", share, uv[triangles]) * (alpha.shape[1], alpha.shape[0])

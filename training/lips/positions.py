@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.feature_cache import cache_folder, kept_arrays
+from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.positions import record_positions
 from kouxing.services.recognizer.ear import EAR_PATH
@@ -75,7 +75,7 @@ def _positions(of_ear: hashlib._Hash, samples: Floats) -> dict[str, NDArray[Any]
             "features": np.array(recorded.features, dtype=np.float16),
         }
 
-    return kept_arrays(cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz", compute)
+    return load_or_compute(cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz", compute)
 
 
 def features_of(speech: Sequence[Speech]) -> Floats:

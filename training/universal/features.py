@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import kept_arrays, read_audio
+from kouxing.corpora.feature_cache import load_or_compute, read_audio
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks.network import MAX_DEVIATIONS
@@ -72,7 +72,7 @@ class FeatureStore:
             joined = np.concatenate(features)
             return {"mean": joined.mean(axis=0), "deviation": joined.std(axis=0) + 1e-3}
 
-        kept = kept_arrays(self._folder / "standard.npz", compute)
+        kept = load_or_compute(self._folder / "standard.npz", compute)
         self.mean, self.deviation = kept["mean"], kept["deviation"]
 
     def read(self, recordings: Sequence[Utterance]) -> Iterator[Features]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kouxing.corpora.feature_cache import kept_arrays
+from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
@@ -69,7 +69,7 @@ def train_universal(
         one.utterance_id: weight for one, weight in zip(data.recordings, data.weights, strict=True)
     }
     aligner = Aligner(by_name, inventory)
-    kept = kept_arrays(states_file, partial(_aligned_states, aligner, stored, seed))
+    kept = load_or_compute(states_file, partial(_aligned_states, aligner, stored, seed))
     pieces = np.split(kept["states"].astype(np.int64), np.cumsum(kept["lengths"])[:-1])
     states = dict(zip(kept["names"].tolist(), pieces, strict=True))
     aligned = [one for one in stored if one.name in states]

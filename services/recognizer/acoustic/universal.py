@@ -14,7 +14,7 @@ from kouxing.services.recognizer.acoustic.blocks import BlockModel, model_of
 from kouxing.services.recognizer.acoustic.model_file import Archive, write_model
 
 FORMAT = "universal 1"
-_RATE_WEIGHT = 120.0  # chosen on other recordings than those of the scores
+_RATE_WEIGHT = 120.0  # chosen on recordings that are not in the published results
 
 
 def universal_model_from(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:

@@ -7,15 +7,15 @@ Deviation: the cost of a phone depends on the phones before it, as far as the ph
 looks back. So every context has its own best path, called a token. The token's current phone is the
 last phone of the context. Tokens with a score far below the best one are dropped (beam search).
 
-A fixed penalty for each phone deletes phones in fast speech and inserts phones in slow speech. So
-the penalty can follow the rate at which the phones' scores change::
+A fixed penalty for each phone deletes phones in fast speech and inserts phones in slow speech. The
+penalty can therefore follow the rate at which the phones' scores change::
 
     change = 1 - sum over phones of sqrt(p(t) p(t - 1))
     rate = running mean of change over two seconds
     penalty = phone_penalty + rate_weight (rate - 1/60), at most 2 from phone_penalty
 
-p(t) are the scores of frame t as probabilities. 1/60 is the rate of slow speech. The measure is
-smaller where scores are uncertain, because insertions are more likely there.
+p(t) are the scores of frame t as probabilities. 1/60 is the rate of slow speech. The rate is lower
+where scores are uncertain. There, insertions are more likely.
 
 ======== ===================================================== =====================
 symbol   meaning                                               shape
@@ -56,7 +56,7 @@ from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, Graph
 _NO_TOKEN = -1
 _BEAM = np.float32(20.0)  # in log scores; a wider beam changes nothing on development data
 _MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
-_MEAN_RATE = np.float32(1.0 / 60.0)
+_SLOW_RATE = np.float32(1.0 / 60.0)
 _RATE_FRAMES = np.float32(200.0)
 _MAX_PENALTY_CHANGE = np.float32(2.0)
 _MIN_RECORDS = 4 * _MAX_TOKENS
@@ -125,7 +125,7 @@ class Decoder:
         self._last_shared = NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # confidence in the phone
-        self._rate[:] = _MEAN_RATE
+        self._rate[:] = _SLOW_RATE
         self._num_records = self._num_tokens = 0
 
     def copy_state(self, other: Decoder) -> None:
@@ -336,7 +336,7 @@ def _phone_penalty(
         rate[1 + phone] = root
     if frame:
         rate[0] += (np.float32(1.0) - overlap - rate[0]) / _RATE_FRAMES
-    change = hmms.rate_weight * (rate[0] - _MEAN_RATE)
+    change = hmms.rate_weight * (rate[0] - _SLOW_RATE)
     change = min(max(change, -_MAX_PENALTY_CHANGE), _MAX_PENALTY_CHANGE)
     return np.float32(hmms.phone_penalty + change)
 

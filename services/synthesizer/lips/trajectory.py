@@ -32,7 +32,7 @@ def still(value: Array) -> FapState:
 
 
 def clip(state: FapState, lowest: Array, highest: Array) -> FapState:
-    """Keep FAPs within limits; those at a limit do not move."""
+    """Clip FAPs to their limits. The velocity of a clipped FAP is 0."""
     value = np.minimum(np.maximum(state.value, lowest), highest)
     return FapState(value, np.where(value == state.value, state.velocity, 0.0))
 

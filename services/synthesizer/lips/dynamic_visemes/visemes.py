@@ -64,10 +64,8 @@ def check_visemes(inventory: PhoneInventory) -> None:
 
 
 def static_targets() -> NDArray[np.float64]:
-    """Return the static targets T (num_visemes, num_mouth_faps), FAP units, as MOUTH_FAPS."""
+    """Return the static targets T (num_visemes, num_mouth_faps), FAP units, by MOUTH_FAPS."""
     table = (list(row.values()) for row in read_table(__package__, "targets.tsv"))
-    rows = {
-        viseme: [float(value) for value in values] for viseme, *values in table
-    }  # as MOUTH_FAPS
+    rows = {viseme: [float(value) for value in values] for viseme, *values in table}
     trained = np.array([rows[viseme] for viseme in TRAINED_VISEMES])
     return np.concatenate([trained, derived_targets(trained, VISEME_INDEX)])

@@ -163,7 +163,7 @@ class OnsetCrossings:
 
 
 def _cheapest_assignment(
-    segments: Sequence[Segment], text: _Text, hiss: OnsetCrossings
+    segments: Sequence[Segment], text: _Text, onset_crossings: OnsetCrossings
 ) -> list[_Group]:
     """Assign every syllable; total_cost[n, s] is for the first n segments and s syllables."""
     num_segments, num_syllables = len(segments), len(text.duration_s)
@@ -184,7 +184,7 @@ def _cheapest_assignment(
     def hiss_cost(times_s: Array, first: int, num: int) -> Array:
         """Return the cost of onsets of the ``first``-th of ``num`` syllables at some times."""
         typical = text.crossings[first : num_syllables + 1 - num + first]
-        misfit = 0.5 * ((hiss.at(times_s) - typical) / _HISS_SD) ** 2
+        misfit = 0.5 * ((onset_crossings.at(times_s) - typical) / _HISS_SD) ** 2
         return np.minimum(misfit, _MAX_HISS_COST)
 
     for row in range(1, num_segments + 1):
