@@ -143,8 +143,8 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
     share its FAPs.
     """
     fap_rows = np.eye(NUM_FAPS)
-    tables = [{name: fap_rows[FAP_NUMBER[name.lower()] - 1] for name in names
-               if name.lower() in FAP_NUMBER}]  # fmt: skip
+    faps = [name for name in names if name.lower() in FAP_NUMBER]
+    tables = [{name: fap_rows[FAP_NUMBER[name.lower()] - 1] for name in faps}]
     for set_name, shapes in SHAPE_SETS.items():
         shape_of = find_shapes(set_name, names)
         parts = Counter(shape_of.values())

@@ -139,7 +139,7 @@ def main() -> None:
     """Run the command line. A user error gives one line on standard error and exit status 2.
 
     Ctrl-C gives exit status 130, whatever exception a library turns it into. Python's shutdown is
-    skipped, because native libraries can hang or crash in it.
+    skipped, because native libraries can hang or crash during a shutdown.
     """
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # also when it is a log file

@@ -69,6 +69,7 @@ def test_saved_and_loaded_scores_are_the_same(
     again = load_model(tmp_path / "model.npz")
     np.testing.assert_array_equal(score_segment(again, frames), score_segment(model, frames))
     assert again.topology.lm_scale == model.topology.lm_scale
+    assert again.topology.rate_weight == model.topology.rate_weight
 
 
 NUM_STATES = 2 * NUM_PHONES
@@ -88,7 +89,7 @@ def random_gmm(seed: int = 0) -> GmmModel:
     rng = np.random.default_rng(seed)
     hmms = random_topology(2, rng, Table.draw(rng, [0, 21, 30, SIL], order=3).tree())
     return GmmModel(
-        topology=replace(hmms, lm_scale=1.5, phone_penalty=-0.25),
+        topology=replace(hmms, lm_scale=1.5, phone_penalty=-0.25, rate_weight=7.0),
         mixtures=random_mixtures(rng),
         rotation=np.eye(NUM_FEATURES, dtype=np.float32),
         prior_mean=np.zeros(NUM_STATIC, np.float32),

@@ -31,7 +31,8 @@ from kouxing.training.universal.features import LAYERS, Features, FeatureStore
 from kouxing.training.universal.recordings import TrainingSet, read_training_set
 from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
 
-_ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE = 0.6, 6.0, 1.0  # chosen on held-out recordings
+# chosen on held-out recordings
+_ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE, _RATE_WEIGHT = 0.6, 6.0, 1.0, 120.0
 _LM_ORDER, _LM_NGRAMS = 3, 20_000
 
 
@@ -88,7 +89,12 @@ def train_universal(
     extension = extension_of(readout, model, LAYERS)
     universal = replace(
         model,
-        topology=replace(topology, lm_scale=_LM_SCALE, phone_penalty=_PHONE_PENALTY),
+        topology=replace(
+            topology,
+            lm_scale=_LM_SCALE,
+            phone_penalty=_PHONE_PENALTY,
+            rate_weight=_RATE_WEIGHT,
+        ),
         network=np.concatenate([model.network, extension]),
         log_prior=log_prior,
         acoustic_scale=_ACOUSTIC_SCALE,

@@ -299,7 +299,7 @@ def forward_errors(future: Future[Any]) -> Iterator[None]:
 
 
 def then(asked: Future[T], make: Callable[[T], U], made: Future[U] | None = None) -> Future[U]:
-    """Return a future of ``make(answer)``: ``made``, or a new one if that is None."""
+    """Return a future of ``make(answer)``. Without ``made``, this is a new future."""
     made = new_future() if made is None else made
 
     def on_answer(answer: Future[T]) -> None:

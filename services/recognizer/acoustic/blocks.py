@@ -45,7 +45,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -389,11 +389,9 @@ def block_model_from(archive: Archive) -> BlockModel:
     return model_of(archive, archive.array("network", None).astype(np.uint8))
 
 
-def model_of(
-    archive: Archive, network: NDArray[np.uint8], *, rate_weight: float = 0.0
-) -> BlockModel:
+def model_of(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
     """Build the model of a file with this network; errors as of :func:`block_model_from`."""
-    topology = replace(topology_from(archive), rate_weight=rate_weight)
+    topology = topology_from(archive)
     model = BlockModel(
         topology=topology,
         network=network,

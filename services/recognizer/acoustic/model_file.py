@@ -23,6 +23,7 @@ MAX_BYTES = 256 * 1024 * 1024  # limit for a file, packed or not
 _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0
+_MAX_RATE_WEIGHT = 1000.0
 _LANGUAGE = ("language", "phones")  # arrays
 Part = TypeVar("Part")
 _LOG_STEP = np.float32(0.05)  # nats; a phone language model's logs are stored in 8 bits
@@ -101,6 +102,7 @@ def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
         **arrays,
         "lm_scale": np.array(topology.lm_scale, np.float32),
         "phone_penalty": np.array(topology.phone_penalty, np.float32),
+        "rate_weight": np.array(topology.rate_weight, np.float32),
         "first_state": topology.first_state,
         "log_stay": topology.log_stay,
         "log_leave": topology.log_leave,
@@ -121,6 +123,9 @@ def topology_from(archive: Archive) -> Topology:
     phone_penalty = float(archive.floats("phone_penalty"))
     if not 0 <= lm_scale <= _MAX_WEIGHT or abs(phone_penalty) > _MAX_WEIGHT:
         raise ValueError(f"lm_scale is {lm_scale:g}, phone_penalty {phone_penalty:g}")
+    rate_weight = float(archive.floats("rate_weight")) if "rate_weight" in archive else 0.0
+    if not 0 <= rate_weight <= _MAX_RATE_WEIGHT:
+        raise ValueError(f"rate_weight is {rate_weight:g}")
     return Topology(
         phone_lm=phone_lm,
         first_state=first_state,
@@ -128,6 +133,7 @@ def topology_from(archive: Archive) -> Topology:
         log_leave=archive.floats("log_leave", num_states),
         lm_scale=lm_scale,
         phone_penalty=phone_penalty,
+        rate_weight=rate_weight,
         duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_phones),
         duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_phones),
     )

@@ -14,7 +14,6 @@ from kouxing.services.recognizer.acoustic.blocks import BlockModel, model_of
 from kouxing.services.recognizer.acoustic.model_file import Archive, write_model
 
 FORMAT = "universal 1"
-_RATE_WEIGHT = 120.0  # chosen on recordings that are not in the published results
 
 
 def universal_model_from(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
@@ -22,7 +21,7 @@ def universal_model_from(archive: Archive, network: NDArray[np.uint8]) -> BlockM
     if str(archive.array("block_network", ())) != _hash_of(network):
         raise ValueError("it belongs to another version of the block model")
     extension = archive.array("extension", None).astype(np.uint8)
-    return model_of(archive, np.concatenate([network, extension]), rate_weight=_RATE_WEIGHT)
+    return model_of(archive, np.concatenate([network, extension]))
 
 
 def save_universal(path: Path, model: BlockModel, extension: NDArray[np.uint8]) -> None:
