@@ -69,7 +69,6 @@ def test_saved_and_loaded_scores_are_the_same(
     again = load_model(tmp_path / "model.npz")
     np.testing.assert_array_equal(score_segment(again, frames), score_segment(model, frames))
     assert again.topology.lm_scale == model.topology.lm_scale
-    assert again.topology.rate_weight == model.topology.rate_weight
 
 
 NUM_STATES = 2 * NUM_PHONES
@@ -106,6 +105,12 @@ def test_densities_match_scipy() -> None:
     expected = logsumexp(log_parts + np.log(mixtures.weights), axis=-1)
     found = mixture_scores(x, mixtures.score_matrix(), 3)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_search_weights_are_saved(tmp_path: Path) -> None:
+    random_gmm().save(tmp_path / "model.npz")
+    topology = load_model(tmp_path / "model.npz").topology
+    assert (topology.lm_scale, topology.phone_penalty, topology.rate_weight) == (1.5, -0.25, 7.0)
 
 
 def test_rejects_broken_files(tmp_path: Path) -> None:
