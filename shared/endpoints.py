@@ -42,7 +42,10 @@ def is_loopback(host: str) -> bool:
 
 
 def is_local(host: str) -> bool:
-    """Return whether a host name or address belongs to this machine."""
+    """Return whether a host name or address belongs to this machine.
+
+    Raises ``UserError`` if the name is unknown.
+    """
     if host in WILDCARDS:
         return True
     try:
@@ -50,33 +53,13 @@ def is_local(host: str) -> bool:
         for family, kind, _, _, address in found:
             with socket.socket(family, kind) as probe:
                 probe.bind(address)
-    except OSError:  # the name is unknown, or it is the address of another machine
+    except (socket.gaierror, UnicodeError):  # UnicodeError: a label of the name is too long
+        raise UserError(
+            f"control's host name {host!r} is unknown; correct it, or write an IP address"
+        ) from None
+    except OSError:  # the address of another machine
         return False
     return True
-
-
-def reach_error(host: str, port: str, timeout_s: float = 3.0, *, is_zeromq: bool = False) -> str:
-    """Return why a TCP port, or a ZeroMQ socket, cannot be reached from here; empty if it can."""
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout_s) as connection:
-            if is_zeromq and not _greets(connection):
-                return "no kouxing service answers there; correct the address, or restart kouxing"
-    except TimeoutError:
-        return "no answer; open this port in the firewalls between the machines"
-    except ConnectionRefusedError:
-        return "nothing listens there; start the service, or correct its address"
-    except socket.gaierror:
-        return "the host name is unknown; correct it, or write an IP address"
-    except OSError as error:
-        return f"{error.strerror}; check the address and the network"
-    return ""
-
-
-def _greets(connection: socket.socket) -> bool:
-    """Return whether a peer sends the first byte of ZeroMQ's greeting."""
-    with contextlib.suppress(OSError):
-        return connection.recv(1) == b"\xff"
-    return False
 
 
 def with_host(endpoint: str, host: str) -> str:

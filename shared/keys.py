@@ -85,7 +85,6 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
     """
     if credential := _credential(f"{name}.key"):
         return read_key(credential)
-    is_here = not control or is_local(split_endpoint(control, CONTROL)[0])
     with _locked_folder() as folder:
         path, control_path = folder / f"{name}.key", folder / "control.key"
         if not path.exists():
@@ -96,7 +95,7 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
                         f"{path} is missing, but other keys need it. Run this on control's machine."
                         f" To run control here, first run: {_replace_hint(path)}"
                     )
-                if has_keys or not is_here:
+                if has_keys or (control and not is_local(split_endpoint(control, CONTROL)[0])):
                     raise UserError(
                         f"{path} is missing, and a new key can be created only on control's"
                         f" machine. Run there: {_add_key_hint(roles)} and try again"

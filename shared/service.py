@@ -20,12 +20,13 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar
 
 from kouxing_client.keys import Key
+from kouxing_client.reach import reach_error
 
 from kouxing.shared import parent_process
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
-from kouxing.shared.endpoints import is_loopback, reach_error, split_endpoint, with_key
+from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Grant, Peer, load_key, rejection_hint, save_grants
 from kouxing.shared.logs import LOG
@@ -406,6 +407,10 @@ class Service(MessageLoop):
 
     def _warn_about_control(self) -> None:
         """Log why control does not answer, and what to do; runs on a thread, as it waits."""
+        host, port = split_endpoint(self.config.control, "control")
+        if reason := reach_error(host, port, is_zeromq=True):
+            LOG.warning("waiting for control at %s: %s", self.config.control, reason)
+            return
         with contextlib.suppress(UserError), Bus(self.key) as bus:
             if bus.probe(self.control_endpoint) is ProbeResult.REFUSED:
                 if self.key is not None and self._load_key() != self.key:
@@ -413,8 +418,6 @@ class Service(MessageLoop):
                     self.has_new_key = self._exit_requested = True
                     return
                 LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))
-            elif reason := reach_error(*split_endpoint(self.config.control, "control")):
-                LOG.warning("waiting for control at %s: %s", self.config.control, reason)
 
     def _log_ready(self) -> None:
         LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))

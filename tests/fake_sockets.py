@@ -36,6 +36,10 @@ class FakeSockets:
         self.resumed_at_s = -math.inf
         self.connect_ms = 300
         self.connections: list[FakeConnection] = []
+        self.reach_error = ""
+
+    def explain(self, endpoint: str, on_reason: Callable[[str], None]) -> None:
+        on_reason(self.reach_error)
 
     def at(self, endpoint: str) -> list[FakeConnection]:
         """Return the open connections to an endpoint, oldest first."""

@@ -8,13 +8,14 @@ from urllib.parse import urlsplit
 
 from kouxing_client import ServiceState
 from kouxing_client.keys import Key
+from kouxing_client.reach import reach_error
 
 from kouxing.services.cli.clients import find_system
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.control_client import connect
-from kouxing.shared.endpoints import reach_error, split_endpoint, with_key
+from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT, CLIENT_ROLES, local_keys, rejection_hint, user_key
 from kouxing.shared.terminal import plural

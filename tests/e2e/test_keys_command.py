@@ -73,7 +73,7 @@ def test_doctor_recognizes_another_program(command: Command) -> None:
     assert command("keys", "init")[0] == 0
     with socket.create_server(("127.0.0.1", 0)) as other:
         checked = kouxing("doctor", control=f"tcp://127.0.0.1:{other.getsockname()[1]}")
-    assert "no kouxing service answers there" in checked.stdout
+    assert "another program answers there" in checked.stdout
 
 
 def test_a_service_waits_for_control_and_says_why(command: Command) -> None:
@@ -81,7 +81,7 @@ def test_a_service_waits_for_control_and_says_why(command: Command) -> None:
     addresses = own_addresses(["control", "synthesizer"])
     started = [start_python(*SERVICE, "synthesizer", **addresses)]
     try:
-        log = read_until("nothing listens there; start the service", started[0])
+        log = read_until("nothing listens there; start kouxing there", started[0])
         assert "waiting for control at tcp://127.0.0.1" in log
         assert '"ready' not in log
         checked = kouxing("doctor", environment=addresses)

@@ -5,6 +5,7 @@ The other end is the product's own, so it checks what the package sends.
 
 import asyncio
 import os
+import socket
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -153,3 +154,27 @@ def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeCont
             return values
 
     assert asyncio.run(run()) == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("host", "is_listening", "reason"),
+    [
+        ("no-such-host.invalid", True, "the host name 'no-such-host.invalid' is unknown"),
+        ("127.0.0.1", True, "another program answers there"),
+        ("127.0.0.1", False, "nothing listens there"),
+    ],
+)
+def test_the_client_reports_why_control_does_not_answer(
+    host: str, *, is_listening: bool, reason: str
+) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        if is_listening:
+            other.listen()
+        control = f"tcp://{host}:{other.getsockname()[1]}"
+        with (
+            Client(control, insecure=True, timeout_s=0.1) as client,
+            pytest.raises(KouxingError, match=reason) as failure,
+        ):
+            client.status()
+    assert str(failure.value).startswith(f"control at {control} does not answer: ")

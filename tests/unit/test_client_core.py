@@ -113,6 +113,10 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     answer = scene.core.request("flush-session", "s")
     scene.pass_time(10.1)
     assert "refuses this client" in str(answer.exception(0))
+    scene.sockets.reach_error = "another program answers there"
+    answer = scene.core.request("flush-session", "s")
+    scene.pass_time(10.1)
+    assert "control does not answer: another program" in str(answer.exception(0))
 
 
 def test_status_collects_all_pages() -> None:

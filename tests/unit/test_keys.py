@@ -124,6 +124,8 @@ def test_an_added_key_works_on_another_machine(
 def test_creates_no_key_for_control_on_another_machine() -> None:
     with pytest.raises(UserError, match=r"lamp\.key is missing.*kouxing keys add NAME --role"):
         load_key("lamp", ("service:lamp",), control="tcp://192.0.2.1:5550")
+    with pytest.raises(UserError, match=r"host name .no-such-host.* is unknown"):
+        load_key("lamp", ("service:lamp",), control="tcp://no-such-host.invalid:5550")
     assert not list(key_folder().glob("*"))
     assert load_key("lamp", ("service:lamp",), control="tcp://127.0.0.1:5550")
 

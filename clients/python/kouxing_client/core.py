@@ -61,6 +61,7 @@ class ClientCore:
         self._make_signal = make_signal
         self._requests: dict[str, _Request] = {}
         self._refused_s = math.inf  # when control started to reject this key
+        self._is_explaining = False  # why control does not answer
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
         self._asked_s: dict[str, float] = {}  # when control was asked about a silent session
         self._events: Connection | None = None
@@ -126,14 +127,15 @@ class ClientCore:
     def tick(self) -> None:
         """Repeat requests and ask about silent sessions; call this regularly."""
         now_s = self._sockets.now_s
-        for name, request in list(self._requests.items()):
+        has_failed = self._is_refused()
+        for request in self._requests.values():
             if now_s > request.end_s:
-                self._requests.pop(name).answer.set_exception(KouxingError(self._timeout_error()))
+                has_failed = True
             elif now_s >= request.retry_s:
                 self._send(request)
-        if now_s > self._refused_s + self._timeout_s:  # shorter rejections are temporary penalties
-            for session in self.sessions:
-                session.end(KouxingError(self._timeout_error()))
+        if has_failed and not self._is_explaining:
+            self._is_explaining = True
+            self._sockets.explain(self._control, self._give_up)
         for session in list(self.sessions):
             session.tick()
             if session.is_over:
@@ -166,8 +168,26 @@ class ClientCore:
             self._commands = self._connect()
             self._sockets.send(self._commands, request.parts)
 
-    def _timeout_error(self) -> str:
+    def _is_refused(self) -> bool:
+        """Return whether control rejects this key, longer than a temporary penalty."""
+        return self._sockets.now_s > self._refused_s + self._timeout_s
+
+    def _give_up(self, reason: str) -> None:
+        """End requests without an answer, and all sessions if control rejects this key."""
+        self._is_explaining = False
+        failure = KouxingError(self._failure(reason))
+        for name, request in list(self._requests.items()):
+            if self._sockets.now_s > request.end_s:
+                self._requests.pop(name).answer.set_exception(failure)
+        if self._is_refused():
+            for session in self.sessions:
+                session.end(failure)
+
+    def _failure(self, reason: str) -> str:
+        """Return the text of an error; ``reason``: why control cannot be reached, if known."""
         address, _, key = self._control.partition(" ")
+        if reason:
+            return f"control at {address} does not answer: {reason}"
         if self._refused_s == math.inf:
             return f"control at {address} does not answer. Start it with 'kouxing run'"
         return f"control at {address} " + (

@@ -4,6 +4,7 @@ import contextlib
 import math
 import secrets
 import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
@@ -14,12 +15,14 @@ from zmq.utils.monitor import parse_monitor_message
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
 from kouxing_client.messages import Decoders, Joined, Message, topic
+from kouxing_client.reach import reach_error
 
 QUEUE = 20_000  # messages
 LIVE_BUFFER = 65_536  # bytes in the kernel: some seconds of FAP frames, over any distance
 RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
+_REACH_S = 1.0  # limit for finding out why an address does not answer
 SUSPENDED_S = 0.5  # a wait that takes this much longer than requested: the process was suspended
 _MONITORED = zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CONNECT_RETRIED
 
@@ -159,6 +162,17 @@ class Sockets:
         self._poller.unregister(connection)
         del self._handlers[connection]
         connection.close()
+
+    def explain(self, endpoint: str, on_reason: Callable[[str], None]) -> None:
+        """Call ``on_reason`` soon with why an endpoint cannot be reached; empty if it can."""
+        address = endpoint.partition(" ")[0]
+        host, _, port = address.removeprefix("tcp://").rpartition(":")
+
+        def run() -> None:  # looking up a name takes seconds if no name server answers
+            reason = reach_error(host, port, _REACH_S, is_zeromq=True) if port.isdigit() else ""
+            self.call(lambda: on_reason(reason))
+
+        threading.Thread(target=run, daemon=True).start()
 
     def close(self) -> None:
         """Close all connections."""
