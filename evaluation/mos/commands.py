@@ -8,7 +8,6 @@ import typer
 from rich.console import Console
 
 from kouxing.services.cli.options import Assignments, ConfigFile, Output
-from kouxing.shared.errors import naming_option
 from kouxing.shared.terminal import (
     Force,
     JsonFile,
@@ -29,14 +28,13 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the video
 @app.command()
 def new(
     folder: Folder,
-    title: Annotated[str, typer.Option(help="Title of the page. Default: the folder.")] = "",
     reference: Annotated[str, typer.Option(help="Condition used as hidden reference.")] = "",
     anchor: Annotated[str, typer.Option(help="Condition used as low anchor.")] = "",
 ) -> None:
     """Create a study from videos named CONDITION/SENTENCE.mp4."""
     from kouxing.evaluation.mos.study import new_study
 
-    study = new_study(folder, title=title, reference=reference, anchor=anchor)
+    study = new_study(folder, reference=reference, anchor=anchor)
     sizes = plural(len(study.sentences), "sentence"), plural(len(study.conditions), "condition")
     print_message(f"created a study of {' in '.join(sizes)}; next: kouxing mos serve {folder}")
 
@@ -54,7 +52,6 @@ def heads(
         list[str] | None,
         typer.Option(help="Name of a built-in head; repeatable. Default: all heads."),
     ] = None,
-    title: Annotated[str, typer.Option(help="Title of the page.")] = "Heads",
 ) -> None:
     """Create a study of the built-in heads, with a one-minute video of each head."""
     from kouxing.evaluation.mos.heads import write_head_videos
@@ -63,7 +60,7 @@ def heads(
 
     check_no_study(folder)
     write_head_videos(folder, load_model(), recordings, head or [])
-    study = new_study(folder, title=title)
+    study = new_study(folder)
     count = plural(len(study.conditions), "head")
     print_message(f"created a study of {count}; next: kouxing mos serve {folder}")
 
@@ -71,10 +68,6 @@ def heads(
 @app.command()
 def serve(
     folder: Folder,
-    port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Port, instead of gateway.port; 0: any free port."),
-    ] = None,
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
@@ -90,15 +83,12 @@ def serve(
 
     assigned = parse_assignments(assignments or [])
     overrides = {key.removeprefix("gateway."): value for key, value in assigned.items()}
-    if port is not None:
-        overrides["port"] = str(port)
     gateway = read_settings(config).load(GatewayConfig, overrides)
     study, store = load_study(folder), Store(folder)
     try:
-        with naming_option("--port", "gateway.port", is_given=port is not None):
-            asyncio.run(
-                server.serve(study, store, gateway, lambda url: print_message(f"judges open {url}"))
-            )
+        asyncio.run(
+            server.serve(study, store, gateway, lambda url: print_message(f"judges open {url}"))
+        )
     finally:
         store.close()
 

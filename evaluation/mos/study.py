@@ -47,7 +47,7 @@ def check_no_study(folder: Path) -> None:
         raise UserError(f"{file} exists, and answers may refer to it; use another folder")
 
 
-def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str = "") -> Study:
+def new_study(folder: Path, *, reference: str = "", anchor: str = "") -> Study:
     """Find the videos ``CONDITION/SENTENCE.mp4`` of a folder and write ``study.json``.
 
     Raises UserError if the folder already is a study, lacks videos, or has one without sound.
@@ -55,7 +55,7 @@ def new_study(folder: Path, *, title: str = "", reference: str = "", anchor: str
     check_no_study(folder)
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
     content = {
-        "title": title or folder.resolve().name,
+        "title": folder.resolve().name,
         "reference": reference,
         "anchor": anchor,
         "videos": [f"{path.parent.name}/{path.name}" for path in videos],

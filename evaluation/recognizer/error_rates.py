@@ -159,13 +159,11 @@ def evaluate_recognizer(
     references: Sequence[Reference],
     disturbances: Mapping[str, Disturb],
     rule: OutputRuleConfig,
-    *,
-    rules: Sequence[OutputRuleConfig] = RULES,
 ) -> dict[str, Any]:
     """Measure a model; return figures for a JSON file.
 
     ``speech`` in the figures contains the scores with ``rule``, by disturbance and speaking rate.
-    ``rules`` contains the scores of the other ``rules`` in clean speech.
+    ``rules`` contains the scores with ``RULES`` in clean speech.
     """
     speech: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
     by_rule: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
@@ -177,7 +175,7 @@ def evaluate_recognizer(
             speech[name].add(reference, recognition)
             if name == CLEAN:
                 speech[reference.group].add(reference, recognition)
-                for other in rules:
+                for other in RULES:
                     by_rule[_rule_name(other)].add(reference, recognize_live(model, scored, other))
     rng = np.random.default_rng(0)
     return {

@@ -184,7 +184,7 @@ class Chromium:
 
 
 @contextlib.contextmanager
-def serve_folder(folder: Path, port: int = 0) -> Iterator[str]:
+def serve_folder(folder: Path) -> Iterator[str]:
     """Serve a folder like ``python -m http.server``; yield the origin."""
 
     class Handler(http.server.SimpleHTTPRequestHandler):
@@ -192,7 +192,7 @@ def serve_folder(folder: Path, port: int = 0) -> Iterator[str]:
             pass
 
     handler = functools.partial(Handler, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

@@ -64,9 +64,6 @@ def chain(
 @app.command(name="lips-page")
 def lips_page(
     audio: AudioFile,
-    package: Annotated[Path, typer.Option(help="Folder of kouxing-lips in a source tree.")] = Path(
-        "clients/kouxing-lips"
-    ),
     clips: Annotated[
         Path | None,
         typer.Option(help="Folder of clips with tracked lips, to also measure the accuracy."),
@@ -82,7 +79,7 @@ def lips_page(
     from kouxing.evaluation.system.lips_page import measure, show
 
     check_output(json_file, force=force)
-    figures = measure(audio, package, clips)
+    figures = measure(audio, clips)
     show(figures, Console())
     ours, *others = (asdict(page) for page in figures)
     write_json(json_file, ours | {"others": others})
@@ -157,7 +154,6 @@ def busy(
 
 
 def attacks(
-    audio: AudioFile = SENTENCE,
     attack: Annotated[
         list[str] | None, typer.Option(help="Name of an attack; repeatable. Default: all.")
     ] = None,
@@ -168,13 +164,12 @@ def attacks(
     from kouxing.evaluation.system.attacks import measure, show
 
     check_output(json_file, force=force)
-    damages = measure(audio, attack or (), CONSOLE)
+    damages = measure(SENTENCE, attack or (), CONSOLE)
     show(damages, Console())
     write_json(json_file, [asdict(damage) for damage in damages])
 
 
 def faults(
-    audio: AudioFile = SENTENCE,
     fault: Annotated[
         list[str] | None, typer.Option(help="Name of a fault; repeatable. Default: all.")
     ] = None,
@@ -194,6 +189,6 @@ def faults(
     from kouxing.evaluation.system.faults import TIMING, measure, show
 
     check_output(json_file, force=force)
-    outcomes = list(measure(audio, fault or (), logs, CONSOLE, TIMING))
+    outcomes = list(measure(SENTENCE, fault or (), logs, CONSOLE, TIMING))
     show(outcomes, Console())
     write_json(json_file, [asdict(outcome) for outcome in outcomes])

@@ -44,6 +44,8 @@ from kouxing.shared.terminal import print_table
 Array = NDArray[np.float64]
 
 OURS = "kouxing-lips"
+_ROOT = Path(__file__).resolve().parents[2]  # root of the source tree, behind its links
+_OURS_FOLDER = _ROOT / "clients" / OURS
 MEASURE_S = 20.0
 _SIZE_PX = (400, 300)
 _CODE = ("index.js", "worker.js", "worklet.js", "frame-track.js", "engine")
@@ -139,20 +141,20 @@ class LipsPage:
     closure_f1: float | None = None
 
 
-def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsPage]:
-    """Measure the package in a folder, first, and its rivals, if ``npm ci`` has installed them.
+def measure(audio: Path, clips: Path | None = None) -> list[LipsPage]:
+    """Measure kouxing-lips, then other packages if ``npm ci`` has installed them.
 
     Raises ``UserError`` if Chromium or Node is not installed.
     """
-    has_rivals = (package / "node_modules" / "wlipsync").is_dir()
+    has_rivals = (_OURS_FOLDER / "node_modules" / "wlipsync").is_dir()
     if clips and not has_rivals:
-        raise UserError(f"the packages to compare are missing; run npm ci in {package}")
+        raise UserError("the packages to compare are missing; run npm ci in clients/kouxing-lips")
     names, profile = [OURS], None
     held_out, training = read_parts(clips) if clips else ([], [])
     if has_rivals:
         names = [*_DOWNLOADS]
-        profile = _wlipsync_profile(package, _recordings(training) if clips else _samples(package))
-    with _site(package, profile) as folder:
+        profile = _wlipsync_profile(_recordings(training) if clips else _samples())
+    with _site(profile) as folder:
         voice = folder / "voice.wav"
         write_microphone(audio, voice)
         try:
@@ -167,18 +169,17 @@ def measure(audio: Path, package: Path, clips: Path | None = None) -> list[LipsP
 
 
 @contextmanager
-def _site(package: Path, profile: bytes | None) -> Iterator[Path]:
+def _site(profile: bytes | None) -> Iterator[Path]:
     """Write the page with all packages, and the profile of wLipSync, to a temporary folder."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         for file in _CODE:
-            if not (package / file).exists():
-                raise UserError(f"{package} is not a folder of kouxing-lips: it has no {file}")
-            (folder / file).symlink_to((package / file).resolve())
-        (folder / _PACKAGES).symlink_to((package / "node_modules").resolve())
-        (folder / "rivals.js").symlink_to((package / "demo" / "rivals.js").resolve())
-        table = package / "../../shared/face/high_level.tsv"
-        (folder / "visemes.tsv").symlink_to(table.resolve())
+            if not (_OURS_FOLDER / file).exists():
+                raise UserError("this command needs the source tree; run it there")
+            (folder / file).symlink_to(_OURS_FOLDER / file)
+        (folder / _PACKAGES).symlink_to(_OURS_FOLDER / "node_modules")
+        (folder / "rivals.js").symlink_to(_OURS_FOLDER / "demo" / "rivals.js")
+        (folder / "visemes.tsv").symlink_to(_ROOT / "shared/face/high_level.tsv")
         (folder / "models").mkdir()
         for file, content in web_model().items():
             (folder / "models" / file).write_bytes(content)
@@ -192,17 +193,17 @@ def _recordings(clips: Sequence[LipClip]) -> list[NDArray[np.float32]]:
     return [clip.samples for clip in clips[:: -(-len(clips) // _NUM_PROFILE_CLIPS)]]
 
 
-def _samples(package: Path) -> list[NDArray[np.float32]]:
-    files = sorted((package / "../../shared/demo").glob("*.wav"))
+def _samples() -> list[NDArray[np.float32]]:
+    files = sorted((_ROOT / "shared/demo").glob("*.wav"))
     return [read_audio(file)[0].reshape(-1) for file in files]
 
 
-def _wlipsync_profile(package: Path, recordings: Iterable[NDArray[np.float32]]) -> bytes:
+def _wlipsync_profile(recordings: Iterable[NDArray[np.float32]]) -> bytes:
     """Return a profile for wLipSync from recordings, samples at 16 kHz."""
     with tempfile.TemporaryDirectory() as name:
         for number, samples in enumerate(recordings):
             samples.astype("<f4").tofile(Path(name) / f"{number}.f32")
-        script = package / "demo" / "wlipsync-profile.mjs"
+        script = _OURS_FOLDER / "demo" / "wlipsync-profile.mjs"
         done = subprocess.run(  # noqa: S603
             [find_node(), script, name], capture_output=True, check=False
         )

@@ -18,7 +18,6 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.audio_intake import AudioIntake
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
-from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_batches import MAX_BATCH_S, SESSIONS_TOGETHER, LiveBatches
 from kouxing.services.recognizer.load_numba import load_numba
@@ -58,9 +57,7 @@ class RecognizerService(Service):
 
     kind = KIND
 
-    def __init__(
-        self, config: RecognizerConfig, lip_predictor: LipFrameModel | None = None
-    ) -> None:
+    def __init__(self, config: RecognizerConfig) -> None:
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
@@ -90,7 +87,7 @@ class RecognizerService(Service):
         self.facts = SessionFacts(language=model.inventory.language)
         self.languages = [*LANGUAGES_OF_MODELS]
         self._starting = StartingSessions(model.inventory.language, self.waker.wake)
-        self._lip_predictor = lip_predictor or load_lip_predictor()
+        self._lip_predictor = load_lip_predictor()
         self._recognizer.warm_up()
         self._live = LiveBatches(
             self._sessions,

@@ -33,7 +33,7 @@ class Served:
 
     def start(self) -> None:
         code = "from kouxing.evaluation.mos.commands import app; app()"
-        command = [sys.executable, "-c", code, "serve", str(self.folder), "--port", str(self.port)]
+        command = [sys.executable, "-c", code, "serve", str(self.folder), f"--set=port={self.port}"]
         self._process = subprocess.Popen(
             [*command, *self._options], cwd=ROOT, stderr=subprocess.PIPE, text=True
         )
@@ -80,7 +80,7 @@ def folder(tmp_path: Path, video: Path) -> Path:
     for sentence, condition in product(SENTENCES, CONDITIONS):
         (folder / condition).mkdir(parents=True, exist_ok=True)
         shutil.copy(video, folder / condition / f"{sentence}.mp4")
-    new_study(folder, title="Faces", reference="good", anchor="bad")
+    new_study(folder, reference="good", anchor="bad")
     return folder
 
 
@@ -146,7 +146,7 @@ def test_the_gateways_token_protects_everything_but_the_page(served: Served) -> 
         assert served.ask(path)[0] == 403
     for path in ("/judges", "/answers", "/judges?token=wrong"):
         assert served.ask(path, {})[0] == 403
-    assert served.state("/state?token=secret") == {"title": "Faces", "videos": 4}
+    assert served.state("/state?token=secret") == {"title": "study", "videos": 4}
     assert served.ask("/judges?token=secret", {})[0] == 200
 
 

@@ -173,7 +173,7 @@ SAMPLES = samples_of_file(VOWELS_FILE)
 @pytest.fixture
 def programs(tmp_path: Path) -> list[list[str]]:
     """The commands of the programs."""
-    shutil.copy(FOLDER / "follow.mjs", tmp_path)
+    shutil.copytree(ROOT / "examples" / "node", tmp_path, dirs_exist_ok=True)
     (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
     program = tmp_path / "follow"
     options = ["-std=c11", "-Wall", "-Werror", "-lzmq"]
@@ -188,8 +188,7 @@ def programs(tmp_path: Path) -> list[list[str]]:
 @pytest.fixture
 def client(tmp_path: Path, programs: list[list[str]]) -> list[str]:
     """The command of the program that streams a file."""
-    shutil.copy(ROOT / "examples" / "stream" / "client.mjs", tmp_path)
-    return [str(NODE), str(tmp_path / "client.mjs")]
+    return [str(NODE), str(tmp_path / "stream.mjs")]
 
 
 @pytest.mark.parametrize("wav", ["stereo 24", "float 48k"])

@@ -138,7 +138,6 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("evaluate schemes --anchor", "add --videos FOLDER"),
         ("evaluate schemes --from-csv . --videos .", "add --clips"),
         ("evaluate schemes --split dev", "add --manifest"),
-        ("train phone-lm -o lm.npz --words 9", "--words applies to sampled words"),
     ],
 )
 def test_refuses_an_option_without_effect(

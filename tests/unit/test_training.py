@@ -193,5 +193,3 @@ def test_trains_models_and_writes_cards(tmp_path: Path, capsys: pytest.CaptureFi
     np.testing.assert_array_equal(known[again].phone, welcome.phone)
     np.testing.assert_array_equal(known[again].log_prob, welcome.log_prob)
     assert len(known[gmm].phone) < len(welcome.phone)
-    with pytest.raises(UserError, match="power of two"):
-        train_gmm([tmp_path / "corpus"], gmm, MANDARIN, num_mixtures=3)

@@ -182,6 +182,7 @@ class FrameSet:
 _VARIANCE_FLOOR = 0.05  # relative to the variance of all speech
 _MIN_FRAMES = 8.0  # a component with fewer frames is dropped
 _BLOCK_FRAMES = 4096
+_NUM_ROTATION_STEPS = 15
 _MIN_STAY, _MAX_STAY = 0.05, 0.99
 
 
@@ -325,9 +326,7 @@ def topology_of(hmm: Hmm, phone_lm: PhoneLanguageModel, frames: FrameSet) -> Top
     )
 
 
-def decorrelate(
-    frames: FrameSet, hmm: Hmm, num_iterations: int = 15
-) -> tuple[Hmm, NDArray[np.float32]]:
+def decorrelate(frames: FrameSet, hmm: Hmm) -> tuple[Hmm, NDArray[np.float32]]:
     """Rotate the features, in place, so that diagonal covariances fit best (Gales 1999, eq. 20-24).
 
     Returns the rotated model and the rotation, (39, 39), for ``x @ rotation``.
@@ -338,7 +337,7 @@ def decorrelate(
         return hmm, np.eye(num, dtype=np.float32)
     flat = scatter.reshape(-1, num * num)
     transform = np.eye(num)  # rows a_i
-    for _ in range(num_iterations):
+    for _ in range(_NUM_ROTATION_STEPS):
         covars = np.einsum("ij,gjk,ik->gi", transform, scatter, transform, optimize=True)
         covars = np.maximum(covars, 1e-4)
         moments = ((counts[:, None] / covars).T @ flat).reshape(num, num, num)

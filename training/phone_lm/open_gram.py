@@ -57,7 +57,12 @@ class _Level:
 
 
 def draw_phones(
-    ngrams: Path, dictionary: Path, inventory: PhoneInventory, *, num_words: int, seed: int = 0
+    ngrams: Path,
+    dictionary: Path,
+    inventory: PhoneInventory,
+    *,
+    num_words: int = 30_000_000,
+    seed: int = 0,
 ) -> Stream:
     """Draw about ``num_words`` words; return their phones, with pauses between sentences.
 

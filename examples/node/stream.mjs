@@ -1,31 +1,15 @@
-// Streams a wav file and prints how far the jaw opens.
+// Streams a wav file and prints the opening of the jaw.
 //
-// usage: node client.mjs FILE.wav [CONTROL-ADDRESS]
-// (Node 18 or newer; npm install zeromq @msgpack/msgpack)
+// usage: node stream.mjs FILE.wav [CONTROL-ADDRESS]
 
-import { randomBytes } from "node:crypto";
 import { readFile } from "node:fs/promises";
-import { homedir } from "node:os";
-import { join } from "node:path";
-import { decode, encode } from "@msgpack/msgpack";
-import { Dealer, Subscriber } from "zeromq";
+import { ask, connectControl, connectDealer, fail, read, send, subscribe } from "./kouxing.mjs";
 
 const EXTENSIBLE = 0xfffe;
-const [file, controlAddress = "tcp://127.0.0.1:5550"] = process.argv.slice(2);
-if (!file) fail("usage: node client.mjs FILE.wav [CONTROL-ADDRESS]");
-const state = process.env.XDG_STATE_HOME || join(homedir(), ".local", "state");
-const keyFile = join(state, "kouxing", "client.key");
-const key = JSON.parse(await readFile(keyFile, "utf8").catch(() => {
-  fail(`${keyFile} does not exist; start kouxing, or copy the file from its machine`);
-}));
-process.stdout.on("error", () => process.exit()); // its reader has ended, such as `head`
+const [file, controlAddress] = process.argv.slice(2);
+if (!file) fail("usage: node stream.mjs FILE.wav [CONTROL-ADDRESS]");
 
-function fail(text) {
-  console.error(text);
-  process.exit(1);
-}
-
-/** Return the format of a wav file as open-session takes it, and its PCM. */
+/** Return the PCM of a wav file, its format as fields of open-session, and the size of a frame. */
 async function readWav(path) {
   const wav = await readFile(path).catch((error) => fail(error.message));
   const chunks = {};
@@ -58,44 +42,17 @@ async function readWav(path) {
   };
 }
 
-function connect(Kind, endpoint) {
-  const [address, curveServerKey] = endpoint.split(" ");
-  const socket = new Kind({ curveServerKey, curvePublicKey: key.public, curveSecretKey: key.secret });
-  if (Kind === Dealer) socket.routingId = randomBytes(16).toString("hex");
-  try {
-    socket.connect(address);
-  } catch (error) {
-    fail(`${address}: ${error.message}; an address looks like tcp://127.0.0.1:5550`);
-  }
-  return socket;
-}
-
-function send(socket, kind, session, fields) {
-  return socket.send([`${kind}/${session}/`, encode({ version: 3, session, ...fields })]);
-}
-
-function read([topic, body]) {
-  return [topic.toString().split("/")[0], decode(body)];
-}
-
 const { format, pcm, frameBytes } = await readWav(file);
-const control = connect(Dealer, `${controlAddress} ${key.control}`);
-control.receiveTimeout = 15_000; // ms
-await send(control, "open-session", "", { request: "1", paced: false, ...format });
-const [answer, opened] = read(await control.receive().catch(() => {
-  fail(`control does not answer at ${controlAddress}; start it with: kouxing run`);
-}));
+const control = connectControl(controlAddress);
+const [answer, opened] = await ask(control, "open-session", "", { paced: false, ...format });
 if (answer !== "session-opened") fail(opened.text);
 const { session, token } = opened;
 
-const faps = connect(Subscriber, opened.faps);
-for (const kind of ["fap-frame", "end-of-faps", "joined"]) { // joined last
-  faps.subscribe(`${kind}/${session}/`);
-}
+const faps = subscribe(opened.faps, session, ["fap-frame", "end-of-faps", "joined"]); // joined last
 await faps.receive(); // joined: no later frame is missed
 
 async function speak() {
-  const audio = connect(Dealer, opened.audio);
+  const audio = connectDealer(opened.audio);
   const rate = format.sample_rate_hz;
   const numFrames = Math.floor(pcm.length / frameBytes);
   const step = Math.floor(rate / 50); // 20 ms
@@ -122,5 +79,4 @@ for await (const message of faps) {
 }
 
 await speaking;
-await send(control, "close-session", session, { request: "2", token });
-await control.receive();
+await ask(control, "close-session", session, { token });
