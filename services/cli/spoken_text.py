@@ -16,6 +16,11 @@ _MAX_CHARACTERS = 150_000
 _MAX_DIGITS = 10_000  # converting numbers to words is slow
 _MAX_NAMED = 20  # words in a message
 _CLOCK_TIME = re.compile(r"\d{1,2}[:：]\d{2}(?=[ \t])")  # or the time of a recording
+_LABEL = re.compile(  # a speaker, the number of a line, or a stage direction
+    r"^[ \t]*(\w{1,12}(?: \w{1,12})?[:：](?!\d)|\d{1,3}[.、)](?!\d)"
+    r"|[\[【（(][^\n]{1,12}?[\]】）)])",
+    re.MULTILINE,
+)
 _TEXT_SUFFIXES = {
     *(".txt", ".text", ".md", ".markdown", ".html", ".htm", ".xml", ".ssml", ".json", ".textgrid"),
     *(".srt", ".vtt", ".lrc", ".ass", ".ssa", ".sbv", ".sub", ".ttml", ".dfxp", ".smi", ".tsv"),
@@ -92,6 +97,10 @@ def text_of(text: str) -> str:
         print_message(f"{name} was read as {' in '.join(forms)}")
     elif time := _CLOCK_TIME.match(spoken.text):
         print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
+    elif len(labels := _LABEL.findall(spoken.text)) > 1:
+        print_message(
+            f"{labels[0]!r} is read as spoken text; delete such labels if nobody says them"
+        )
     return spoken.text
 
 

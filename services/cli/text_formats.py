@@ -82,7 +82,9 @@ _BRACES = re.compile(r"\{[^{}]*\}")
 _CUE_NUMBER = re.compile(rf"^\d+[ \t]*\n\s*(?={_TIME}[ \t]*-->)", re.MULTILINE)
 _SOUND_NAME = re.compile(r"\[[^][\n]*\]|【[^【】\n]*】|[♪♫]")
 _INLINE_TIME = re.compile(r"<\d{1,3}:[\d:.]+>")
-_TAG = re.compile(r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--")
+_TAG = re.compile(
+    r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--|&(?:[A-Za-z]{2,8}|#\d+|#x[0-9A-Fa-f]+);"
+)
 _MARKUP = re.compile(  # matches in linear time
     r"<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
     r"|(?P<data><?[^<]+|<)"

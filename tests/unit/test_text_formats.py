@@ -193,6 +193,7 @@ def test_extracts_the_spoken_text(form: str) -> None:
         ("大家#1好，#3你好#4", "大家好你好"),
         ("[laughter]大家好[pause:500]，<#0.5#>你好<|end|>", "大家好你好"),
         ("8:00 起床\n9:00 上课", "八点起床九点上课"),
+        ("&#20320;&#22909;&nbsp;吧&amp;", "你好吧"),
         ("下午3:30见，8:00到", "下午三点三十分见八点到"),
         ("１２：３０，２个", "十二点三十分两个"),
     ],
@@ -269,6 +270,24 @@ def test_warns_about_a_spoken_time_of_day(capsys: pytest.CaptureFixture[str]) ->
     assert "12:30 is read as a spoken time of day" in capsys.readouterr().err
     text_of("我们12:30走")
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "label"),
+    [
+        ("张三：你好\n李四：再见", "'张三：'"),
+        ("【旁白】你好\n（笑）再见", "'【旁白】'"),
+        ("1. 你好\n2、再见", "'1.'"),
+        ("他说：你好", ""),
+        ("八点：出发\n1.5度\n3:2获胜\n", ""),
+    ],
+)
+def test_warns_about_labels_that_may_not_be_spoken(
+    text: str, label: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert text_of(text) == text
+    message = capsys.readouterr().err
+    assert message.startswith(f"{label} is read as spoken text") if label else not message
 
 
 @pytest.mark.parametrize("name", ["no.srt", "no.TextGrid", "no.docx"])

@@ -79,6 +79,7 @@ _NUMBER_SPELLINGS = tuple(
     (re.compile(pattern), replacement)
     for pattern, replacement in (
         (r"(?<=\d)：(?=\d)", ":"),
+        (r"(?<=[一二三四五六七八九〇○])○|○(?=[一二三四五六七八九])", "〇"),
         (r"(?<![\d.,])(\d{1,3}(?:,\d{3})+)(?![\d,])", lambda match: match[1].replace(",", "")),
         (r"(?<=[%℃度])[-−–—－~～](?=\d)", "到"),
         (r"(?<=\d)[–—－～](?=\d)", "~"),

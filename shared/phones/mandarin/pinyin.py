@@ -18,6 +18,8 @@ Decisions beyond these sources:
 
 import re
 import unicodedata
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 from kouxing.shared.errors import UserError
@@ -65,8 +67,19 @@ _SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
 
 _CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
 _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
-_TONED_WORDS = r"[(（]?(?<![A-Za-z])[a-zü:]+[1-5](?:[ ']?[a-zü:]+[1-5])*(?![A-Za-z\d])[)）]?"
+_LETTER = "[A-Za-z\u00c0-\u024f\u0300-\u036f]"
+_MARKED = "[āáǎàēéěèīíǐìōóǒòūúǔùǖǘǚǜńňǹḿĀÁǍÀĒÉĚÈŌÓǑÒ\u0300\u0301\u0304\u030c]"
+_TONED_WORD = f"(?:[a-zü:]+[1-5]|(?={_LETTER}*{_MARKED}){_LETTER}++)"
+_TONELESS = (
+    "(?:de|le|ma|ba|ne|zi|men|tou|zhe|guo|a|ya|me|er|r|ge|li|shang)"  # after other syllables
+)
+_TONED_WORDS = (
+    rf"[(（]?(?<!{_LETTER}){_TONED_WORD}"
+    rf"(?:[\s'’,.!?;，。！？；：、…“”-]{{0,3}}(?:{_TONED_WORD}|{_TONELESS}(?!{_LETTER}|\d)))*"
+    rf"(?!{_LETTER}|\d)[)）]?"
+)
 _ANNOTATION = re.compile(f"{WORDS_IN_BOPOMOFO.pattern}|{_TONED_WORDS}")
+_MIN_ALIKE = 0.7  # share of equal syllables: characters may have several readings
 _MAX_WORD_LETTERS = 500
 _MAX_LETTERS = 10  # limit for a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
@@ -77,6 +90,7 @@ _READ_AS = (
     (re.compile("乾(?![隆坤卦])"), "干"),
 )
 _KEYCAP = re.compile("[0-9#*]\ufe0f?\u20e3")  # emoji of a key, a bullet
+_NUMERAL = re.compile("[①-⒛Ⅰ-Ⅻⅰ-ⅻ㈠-㈩㊀-㊉]")  # a number as one character
 _LETTERS = str.maketrans("ɑɡ\u0306", "ag\u030c")  # schoolbook letters; a breve instead of a caron
 _TONES = {"\u0304": 1, "\u0301": 2, "\u030c": 3, "\u0300": 4}  # combining marks
 
@@ -172,8 +186,8 @@ def write(spelling: str) -> str:
 def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
 
-    Bopomofo, or pinyin with digits, gives the reading of the characters before it if it is in
-    brackets or sounds like them.
+    Among characters, bopomofo and pinyin with tones are read too. They give the reading of the
+    characters before or after them if they sound alike, or are in brackets after them.
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
     dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
     (``nihao``) are split only if most letters are pinyin, because words of other languages may look
@@ -186,6 +200,7 @@ def transcribe(text: str) -> Transcript:
     >>> transcribe("ni3 hao3, Tom").dropped
     ('Tom',)
     """
+    text = _NUMERAL.sub(lambda match: f" {unicodedata.numeric(match[0]):.0f} ", text)
     text = _KEYCAP.sub(" ", text)
     if _CHINESE.search(text):
         return _read_annotated(text)
@@ -271,25 +286,56 @@ def _is_syllable(word: str) -> bool:
 
 
 def _read_annotated(text: str) -> Transcript:
-    """Read characters with words in bopomofo or pinyin with digits, or with such readings."""
+    """Read characters with words in bopomofo or toned pinyin, or with readings of characters.
+
+    A reading follows its characters, or precedes them, such as the lines of pinyin in textbooks.
+    """
     syllables: list[SpokenSyllable] = []
     dropped: list[str] = []
     end = 0
-    for match in _ANNOTATION.finditer(text):
-        reading = transcribe(match[0])
-        if reading.dropped and match[0].isascii():  # not pinyin, such as mp3
+    announced: tuple[SpokenSyllable, ...] = ()  # a reading whose characters may follow
+    for match in (*_ANNOTATION.finditer(text), None):
+        reading = transcribe(match[0]) if match else Transcript(())
+        if match and reading.dropped and re.search("[A-Za-z]", match[0]):  # not pinyin, as mp3
             continue
-        before = _read_characters(text[end : match.start()])
-        syllables += before.syllables
-        dropped += before.dropped + reading.dropped
-        first = max(0, len(syllables) - len(reading.syllables))
-        annotated = [syllable.phones for syllable in syllables[first:]]
-        if match[0][0] in "(（" or annotated == reading.phones:
-            del syllables[first:]
-        syllables += reading.syllables
-        end = match.end()
-    rest = _read_characters(text[end:])
-    return Transcript((*syllables, *rest.syllables), (*dropped, *rest.dropped))
+        characters = _read_characters(text[end : match.start() if match else None])
+        following = characters.syllables[: len(announced)]
+        if _sound_alike(following, announced):
+            syllables[-len(announced) :] = _annotate(following, announced)
+            syllables += characters.syllables[len(announced) :]
+        else:
+            syllables += characters.syllables
+        dropped += characters.dropped + reading.dropped
+        if match:
+            end, announced = match.end(), reading.syllables
+            preceding = syllables[max(0, len(syllables) - len(announced)) :]
+            if match[0][0] in "(（" or _sound_alike(preceding, announced):
+                syllables[len(syllables) - len(preceding) :] = _annotate(preceding, announced)
+                announced = ()
+            else:
+                syllables += announced
+    return Transcript(tuple(syllables), tuple(dropped))
+
+
+def _sound_alike(characters: Sequence[SpokenSyllable], reading: Sequence[SpokenSyllable]) -> bool:
+    if not reading or len(characters) != len(reading):
+        return False
+    num_equal = sum(
+        one.phones == other.phones for one, other in zip(characters, reading, strict=True)
+    )
+    return num_equal >= _MIN_ALIKE * len(reading)
+
+
+def _annotate(
+    characters: Sequence[SpokenSyllable], reading: Sequence[SpokenSyllable]
+) -> Sequence[SpokenSyllable]:
+    """Return characters with the phones of a reading."""
+    if len(characters) != len(reading):
+        return reading
+    return [
+        replace(one, text=character.text)
+        for character, one in zip(characters, reading, strict=True)
+    ]
 
 
 def _read_characters(text: str) -> Transcript:
