@@ -37,7 +37,7 @@ UPPER = np.array([4, 8, 9, 51, 55, 56]) - 1  # positive is down
 LOWER = np.array([5, 10, 11, 52, 57, 58]) - 1  # positive is up; same points as in UPPER
 
 _VISIBLE = 0.01  # FAP units
-_EASE_S, _FADE_S = 0.09, 0.3  # time constants of each filter pole
+_EASE_S, _FADE_S = 0.09, 0.3  # time constants of each filter pole, at the start and the end
 _FREE_S, _BIND_S = 0.15, 0.04  # time constant of freeing the lips; time for binding them
 _ARKIT_EXPRESSIONS = {
     ExpressionName.SMILE: ("mouthSmileLeft", "mouthSmileRight"),
@@ -57,9 +57,10 @@ _LIPS = np.concatenate([UPPER, LOWER, [JAW]])
 
 
 class ExpressionMotion:
-    """The current expressions of the face."""
+    """The current expressions of the face. ``ease_s`` is the time constant of each filter pole."""
 
-    def __init__(self) -> None:
+    def __init__(self, ease_s: float = _EASE_S) -> None:
+        self._ease_s = ease_s
         self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
         self._shown = TwoPoleFilter(self._goal)
         self._remaining_s = 0.0  # time until the expressions fade
@@ -96,7 +97,7 @@ class ExpressionMotion:
             self._free += (1.0 - self._free) * smoothing_share(step_s, _FREE_S)
         if is_held or self._is_shown:
             goal = is_held * self._goal
-            shown = self._shown.step(goal, step_s, _EASE_S if is_held else _FADE_S)
+            shown = self._shown.step(goal, step_s, self._ease_s if is_held else _FADE_S)
             mix(faps, shown, self._free)
             self._is_shown = bool(np.abs(shown).max() > _VISIBLE)
 

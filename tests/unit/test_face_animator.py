@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import find_peaks
 
 from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
@@ -97,6 +98,23 @@ def test_laughs_while_someone_laughs() -> None:
     assert corners[shown : shown + 25].max() > 100.0
     assert np.array(faps)[shown : shown + 25, JAW].max() > 150.0
     assert abs(corners[-1]) < 1.0
+
+
+def test_the_mouth_follows_the_notes_of_a_laugh_and_the_pauses_between_them() -> None:
+    face = make_face()
+    jaw = []
+    for number in range(400):
+        time_s = number * FRAME_S
+        is_note = time_s % 0.22 < 0.12 and time_s % 2.0 < 1.5  # "ha" 4.5 times a second
+        progress = Progress(time_s=time_s, level_db=-20.0 if is_note else -45.0, is_laughter=True)
+        jaw += [faps[JAW] for _, faps in face.process(progress)]
+    notes = [jaw[start : start + 70] for start in (104, 204, 304)]
+    pauses = [jaw[start : start + 15] for start in (82, 182, 282)]
+    for note, pause in zip(notes, pauses, strict=True):
+        peaks, _ = find_peaks(note, prominence=15.0)
+        assert 5 <= len(peaks) <= 7
+        assert max(pause) < 0.5 * max(note)
+    assert np.abs(np.diff(jaw)).max() < 0.2 * max(jaw)  # it does not flutter
 
 
 def test_end_of_sound_completes_the_frames_and_leads_to_rest() -> None:

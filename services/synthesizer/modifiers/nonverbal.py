@@ -1,43 +1,54 @@
 """Shows laughter and audible breaths of the voice on the face.
 
 Laughter opens the mouth, raises the corners and narrows the eyes; the head leans back (Ruch & Ekman
-2001, "The expressive pattern of laughter"). A breath parts the lips, widens the nostrils and lifts
-the head. It usually precedes speech. Lips that speech has closed stay closed.
+2001, "The expressive pattern of laughter"). A laugh is a series of notes ("ha"), about 4.8 per
+second, with pauses for breath (Provine & Yong 1991, "Laughter: a stereotyped human vocalization").
+Mouth and head follow the level ``L`` of the notes relative to the loudest recent note ``P``, in dB:
+
+    loudness = 1 + (L - P) / 30    limited to 0 to 1
+
+A breath parts the lips, widens the nostrils and lifts the head. It usually precedes speech. Lips
+that speech has closed stay closed.
 """
 
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.services.synthesizer.modifiers.prosody import take_until
 from kouxing.shared.face.expression_motion import EXPRESSION_FAPS
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
-_LAUGHTER_OPENING, _BREATH_OPENING = 0.55, 0.3  # share of an open vowel's opening
-_LAUGHTER_DEG, _BREATH_DEG = -4.0, -1.2  # the head's pitch; upwards
+_BREATH_OPENING = 0.3  # share of an open vowel's opening
+_LAUGH_OPENING = (0.12, 0.58)  # of silence, and additionally of the loudest notes
+_LAUGH_DEG, _BREATH_DEG = (-2.5, -2.0), -1.2  # the head's pitch; upwards
+_LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
+_LAUGH_EASE_S = 0.045  # time constant of each filter pole; notes remain visible
+_LOUDNESS_DB, _FORGET_DB_S = 30.0, 6.0  # range of the loudness; fall of P per second
 _NOSTRILS = 60.0  # FAP units
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 _OPEN_VOWEL = VISEMES[VISEME_NAMES.index("A:")]
 _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
 
 
-def _laughter() -> NDArray[np.float32]:
-    faps: NDArray[np.float32]
-    faps = EXPRESSION_FAPS[ExpressionName.JOY] + np.float32(_LAUGHTER_OPENING) * _OPEN_VOWEL
-    faps[_HEAD_PITCH] = _LAUGHTER_DEG * _DEGREE
+def _opened(share: float, pitch_deg: float) -> NDArray[np.float32]:
+    """Return FAPs (68,) of an open mouth and a lifted head."""
+    faps: NDArray[np.float32] = np.float32(share) * _OPEN_VOWEL
+    faps[_HEAD_PITCH] = pitch_deg * _DEGREE
     return faps
 
 
 def _breath() -> NDArray[np.float32]:
-    faps: NDArray[np.float32] = np.float32(_BREATH_OPENING) * _OPEN_VOWEL
+    faps = _opened(_BREATH_OPENING, _BREATH_DEG)
     for name in ("stretch_l_nose", "stretch_r_nose"):
         faps[FAP_NUMBER[name] - 1] = _NOSTRILS
-    faps[_HEAD_PITCH] = _BREATH_DEG * _DEGREE
     return faps
 
 
@@ -45,16 +56,27 @@ class NonverbalSounds:
     """Shows laughter and breaths while they last."""
 
     def __init__(self) -> None:
-        self._laughter, self._breath = SpeechExpression(), SpeechExpression()
+        self._laughter, self._breath = SpeechExpression(_LAUGH_EASE_S), SpeechExpression()
+        self._levels: deque[tuple[float, float]] = deque()
+        self._loudest_db = -math.inf
+        self._loudness = 0.0
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add laughter and breath to a frame, FAPs (68,), in place."""
+        self._levels += [level for level in context.levels if math.isfinite(level[1])]
+        until_s = min(context.known_s, context.time_s + _LEAD_S)
+        self._loudest_db -= _FORGET_DB_S * context.step_s
+        for _, level_db in take_until(self._levels, until_s):
+            self._loudest_db = max(self._loudest_db, level_db)
+            self._loudness = max(1.0 + (level_db - self._loudest_db) / _LOUDNESS_DB, 0.0)
         if context.is_laughter:
-            self._laughter.show_faps(_LAUGHTER, _HOLD_S)
+            self._laughter.show_faps(_SMILING + np.float32(self._loudness) * _LOUD_NOTE, _HOLD_S)
         elif context.is_breath:
             self._breath.show_faps(_BREATH, _HOLD_S)
         self._laughter.apply(faps, context)
         self._breath.apply(faps, context)
 
 
-_LAUGHTER, _BREATH = _laughter(), _breath()
+_BREATH = _breath()
+_SMILING = EXPRESSION_FAPS[ExpressionName.JOY] + _opened(_LAUGH_OPENING[0], _LAUGH_DEG[0])
+_LOUD_NOTE = _opened(_LAUGH_OPENING[1], _LAUGH_DEG[1])

@@ -68,9 +68,9 @@ class ProsodyTracker:
         until_s = min(context.known_s, context.time_s + _LEAD_S)
         before_s = now.silence_s
         now.silence_s += context.step_s
-        for time_s, pitch_hz in _take(self._pitches, until_s):
+        for time_s, pitch_hz in take_until(self._pitches, until_s):
             self._add_pitch(time_s, pitch_hz)
-        for time_s, level_db in _take(self._levels, until_s):
+        for time_s, level_db in take_until(self._levels, until_s):
             if context.is_speaking:  # otherwise it is noise
                 self._add_level(time_s, level_db)
         now.has_ended = now.phrase_s > _PHRASE_S and before_s < _PHRASE_END_S <= now.silence_s
@@ -121,7 +121,7 @@ class ProsodyTracker:
         return final_st > max(high_st, lowest_st + _RISE_ST)
 
 
-def _take(values: deque[tuple[float, float]], until_s: float) -> Iterable[tuple[float, float]]:
+def take_until(values: deque[tuple[float, float]], until_s: float) -> Iterable[tuple[float, float]]:
     """Remove and yield the values up to a media time."""
     while values and values[0][0] <= until_s:
         yield values.popleft()
