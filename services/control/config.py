@@ -27,6 +27,8 @@ class ControlConfig(ServiceConfig):
     """Maximum number of open sessions. One key can open at most three quarters of them."""
     max_load: Annotated[float, Field(ge=0.1, le=1000)] = 0.8
     """Fraction of a worker's time that new sessions can use; the rest is reserved for moves."""
+    idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
+    """Seconds without audio after which control closes a session."""
     lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9
     """Seconds without a heartbeat after which control declares a service lost. For drivers,
     gateways and workers without sessions, the limit is 0.75 s longer."""

@@ -45,7 +45,6 @@ from kouxing.shared.wire.speech import Speech
 
 STOPPED = "stopped"  # reason for a service that shut down
 CHECK_S = 0.5  # interval of checking waiting sessions and the list of keys
-IDLE_LIMIT_S = 60.0  # a session without audio for longer is closed
 MAX_PAUSE_S = 0.1  # delay of a tick; any longer delay was caused by control itself
 # events that a service may publish
 SERVICE_EVENTS = (
@@ -73,6 +72,7 @@ class ControlService(Service):
         self._faults = Faults()
         self._resting_face = CurrentFace(FaceSettings(), now_s)
         self._takeover = Takeover(self._registry, now_s)
+        self._idle_limit_s = config.idle_limit_s
         self._keys_version = (0, 0)  # version of the list whose revoked keys have no sessions
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._sleep_s = 0.0  # planned time until the next tick
@@ -295,8 +295,8 @@ class ControlService(Service):
                 continue  # its new worker is starting
             if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
-            elif self._sessions.record_input(record, heartbeat) > IDLE_LIMIT_S:
-                self._lifecycle.end(record, f"no audio for {IDLE_LIMIT_S:g} s")
+            elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:
+                self._lifecycle.end(record, f"no audio for {self._idle_limit_s:g} s")
 
     def _on_session_started(self, started: SessionStarted, instance: str) -> None:
         record = self._sessions.get(started.session)
