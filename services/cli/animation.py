@@ -34,6 +34,7 @@ from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
 from kouxing.shared.records import replace
+from kouxing.shared.terminal import print_message
 
 T = TypeVar("T", Phone, TimedSyllable)
 _IMAGE_RATE_HZ = 25.0  # for a video made from sound
@@ -94,6 +95,7 @@ def animate(
     *,
     live: bool,
     text: str | None,
+    text_may_differ: bool = False,
     mouth: Path | None,
     expressiveness: float | None,
     track: int | None = None,
@@ -104,7 +106,8 @@ def animate(
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
     are those of the live services with their default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
-    it, if given. ``language`` is the language of the speech.
+    it, if given. ``language`` is the language of the speech. With ``text_may_differ``, a text that
+    cannot be read or does not fit the sound is reported and ignored.
 
     Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
     """
@@ -113,7 +116,13 @@ def animate(
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
     models = [load_lip_model(model.inventory.language, name) for name in lip_models]
     settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
-    transcript = None if text is None else read_text(text, load_inventory(language))
+    transcript = None
+    try:
+        transcript = None if text is None else read_text(text, load_inventory(language))
+    except UserError as error:
+        if not text_may_differ:
+            raise
+        print_message(f"the text is ignored: {error}")
     progress.remove_task(loading)
     samples = read_mono_16k(source, track, progress)
     events: Sequence[SoundEvent]
@@ -126,16 +135,20 @@ def animate(
         faces = [chain.animate(samples, with_progress) for chain in chains]
         events = chains[-1].events
     else:
-        if transcript is None:
-            with_progress = partial(progress.track, description="recognizing")
-            phones = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
-        else:
+        phones = None
+        if transcript is not None:
             with_progress = partial(progress.track, description="aligning")
             alignment = align_syllables(
                 model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress
             )
             report_mismatch(source, alignment)
-            phones = alignment.phones
+            if alignment.fits or not text_may_differ:
+                phones = alignment.phones
+            else:
+                transcript = None
+        if phones is None:
+            with_progress = partial(progress.track, description="recognizing")
+            phones = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
         with_progress = partial(progress.track, description="finding the lips")
         recording = analyze_recording(
             samples,

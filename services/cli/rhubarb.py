@@ -5,9 +5,11 @@ README of Rhubarb Lip Sync 1.13, "Command-line options" and "Machine-readable st
 """
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import redirect_stderr
 from importlib.metadata import version
 from pathlib import Path
 
@@ -38,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result = _format(motion, options)
         if options.output is None:
             sys.stdout.write(result)
+            sys.stdout.flush()  # plug-ins read the result when the success is reported
         else:
             write_text(options.output, result)
     except UserError as error:
@@ -74,18 +77,25 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _animate(options: argparse.Namespace) -> Motion:
+    """Animate the recording; report messages about its text as Rhubarb reports warnings."""
     text = "" if options.dialogFile is None else read_text(options.dialogFile, _MAX_TEXT_BYTES)
-    with Progress(disable=True) as progress:
-        return animate(
+    language = find_language(options.language)
+    messages = io.StringIO()
+    with redirect_stderr(messages), Progress(disable=True) as progress:
+        motion = animate(
             Path(options.input),
             [DEFAULT_LIP_MODEL],
             progress,
             live=False,
             text=text.strip() or None,
+            text_may_differ=True,
             mouth=None,
             expressiveness=None,
-            language=find_language(options.language),
+            language=language,
         )
+    for message in messages.getvalue().splitlines():
+        _report(options, "log", message)
+    return motion
 
 
 def _format(motion: Motion, options: argparse.Namespace) -> str:

@@ -1,6 +1,8 @@
 """Drawn mouths: their letters, cues over time, and the files of Rhubarb Lip Sync."""
 
+import io
 import json
+import sys
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -115,3 +117,45 @@ def test_reports_errors_like_rhubarb(tmp_path: Path, capsys: pytest.CaptureFixtu
     failure = json.loads(capsys.readouterr().err.splitlines()[-1])
     assert failure["type"] == "failure"
     assert "no such file" in failure["reason"]
+
+
+class Status(io.StringIO):
+    """Standard error that notes the size of a file whenever a status is printed."""
+
+    def __init__(self, result: Path) -> None:
+        super().__init__()
+        self._result = result
+        self.sizes: list[int] = []
+
+    def write(self, text: str) -> int:
+        self.sizes.append(self._result.stat().st_size)
+        return super().write(text)
+
+
+def test_the_result_is_complete_when_the_success_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = tmp_path / "result.json"
+    status = Status(result)
+    with result.open("w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        monkeypatch.setattr(sys, "stderr", status)
+        rhubarb.main(["-f", "json", "--machineReadable", str(VOWELS_FILE)])
+        monkeypatch.undo()
+    assert json.loads(status.getvalue().splitlines()[-1])["type"] == "success"
+    assert status.sizes[-1] == result.stat().st_size > 0
+
+
+@pytest.mark.parametrize("text", ["मर", "مرحبا", "bibidi bobidi bu"])
+def test_a_text_that_does_not_fit_is_ignored(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dialog = tmp_path / "dialog.txt"
+    dialog.write_text(text)
+    rhubarb.main(["--machineReadable", str(VOWELS_FILE)])
+    without_text, _ = capsys.readouterr()
+    rhubarb.main(["--machineReadable", "-d", str(dialog), str(VOWELS_FILE)])
+    with_text, status = capsys.readouterr()
+    assert with_text == without_text
+    events = [json.loads(line) for line in status.splitlines()]
+    assert [event["type"] for event in events] == ["start", "log", "progress", "success"]
