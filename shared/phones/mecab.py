@@ -1,4 +1,7 @@
-"""Splits Japanese into words with their readings, by MeCab, which runs as a separate process."""
+"""Splits Japanese into words with their readings, by MeCab, which runs as a separate process.
+
+wetext converts numbers to Chinese characters first.
+"""
 
 import shutil
 import subprocess
@@ -42,3 +45,14 @@ def split_words(texts: Sequence[str]) -> list[list[tuple[str, str]]]:
     parts = result.stdout.split("\n\n")[: len(texts)]
     rows = [[line.partition("\t") for line in part.splitlines() if line] for part in parts]
     return [[(word, spoken or word) for word, _, spoken in row] for row in rows]
+
+
+def read_number(number: str) -> str:
+    """Return the kana of a number with its sign and counter, such as 3時 or -5度.
+
+    Raises ``UserError`` like ``split_words``.
+    """
+    from wetext import Normalizer  # noqa: PLC0415 (takes 0.3 s)
+
+    (words,) = split_words([Normalizer(lang="ja", operator="tn").normalize(number)])
+    return "".join(spoken for _, spoken in words)

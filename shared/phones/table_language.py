@@ -11,24 +11,30 @@ voice    voice of espeak-ng
 scripts  scripts of the words, as in the Unicode names of letters, such as ``LATIN``
 words    how words are found: ``spaced`` (the default), ``character`` (each is a word), or ``mecab``
          (MeCab splits Japanese)
+numbers  spoken forms of numbers: pairs of a pattern and a replacement, applied in order to a number
+         with its sign and unit
+units    spoken forms of what follows a number, such as km
+short    spoken forms of abbreviations and signs, such as Dr.
 rules    corrections of the voice's IPA: pairs of a pattern and a replacement, applied in order
 =======  ===========================================================================================
 
 ``phones.tsv`` lists the universal phones of the language in the column ``phone``. Other columns
-are for readers. A phone that espeak-ng takes from another language becomes the nearest one.
+are for readers. A phone that espeak-ng takes from another language becomes the nearest one. If the
+language has no Latin letters, Latin words are read as English.
 """
 
 import re
 import tomllib
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import resources
+from itertools import chain
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.espeak import transcribe_phrases
-from kouxing.shared.phones.mecab import has_mecab, split_words
+from kouxing.shared.phones.mecab import has_mecab, read_number, split_words
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 from kouxing.shared.phones.universal.segments import (
     ipa_of,
@@ -40,13 +46,16 @@ from kouxing.shared.tables import read_table
 
 SETTINGS = "language.toml"
 _SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words
+_UNITS = ("%", "€", "£", "°")  # espeak-ng speaks them after numbers
 _SPACED, _CHARACTER, _MECAB = "spaced", "character", "mecab"
 _LETTER = r"(?:[^\W\d_]|[\u0900-\u0963])"  # letters, and the vowel signs of Devanagari
-_LATIN_EDGE = re.compile(r"(?<=[A-Za-z])(?![\x00-\x7f])|(?<![\x00-\x7f])(?=[A-Za-z])")
-_TOKENS = re.compile(
-    r"(?P<number>[€$£¥]?[0-9]+(?:[.,:][0-9]+)*(?: ?[%€£°])?)"
-    rf"|(?P<word>{_LETTER}+(?:['’·-]{_LETTER}+)*['’]?|[{_SIGNS}])|(?P<other>\S)"
-)
+_LATIN_EDGE = re.compile(r"(?<=[A-Za-z])(?=[^\W\x00-\x7f])|(?<=[^\W\x00-\x7f])(?=[A-Za-z])")
+_CAMEL_CASE = re.compile(r"[a-z][A-Z]")  # espeak-ng speaks iPhone as two words
+_LATIN, _ENGLISH = "LATIN", "en-us"
+_PLAIN = str.maketrans("⁄−", "/-")
+_GROUPS = r"(?<![0-9] )[0-9]{1,3}(?: [0-9]{3})+(?:[.,][0-9]+)?(?! ?[0-9])"  # 1 000
+_DIGITS = rf"{_GROUPS}|[0-9]+(?:[.,:][0-9]+)*"
+_WORD = rf"(?P<word>{_LETTER}+(?:['’·-]{_LETTER}+)*['’]?|[{re.escape(_SIGNS)}])|(?P<other>\S)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +67,9 @@ class TableLanguage:
     voice: str
     scripts: tuple[str, ...]
     words: str
+    numbers: tuple[tuple[str, str], ...]
+    units: Mapping[str, str]
+    short: Mapping[str, str]
     rules: tuple[tuple[str, str], ...]
     phones: tuple[str, ...]
 
@@ -80,9 +92,11 @@ class TableLanguage:
         phrases, dropped = self._phrases_of(text)
         spoken = [[sound for _, sound in phrase] for phrase in phrases]
         words = []
+        latin = [[sound] for sound in chain(*spoken) if self._is_foreign(sound)]
+        english = dict(zip(chain(*latin), transcribe_phrases(latin, _ENGLISH), strict=True))
         for phrase, sounds in zip(phrases, transcribe_phrases(spoken, self.voice), strict=True):
-            for (word, _), ipa in zip(phrase, sounds, strict=True):
-                phones = self._phones_of(ipa)
+            for (word, sound), ipa in zip(phrase, sounds, strict=True):
+                phones = self._phones_of(*english.get(sound, [ipa]))
                 if phones:
                     words.append(SpokenSyllable(word, "".join(map(ipa_of, phones)), phones))
                 else:
@@ -96,26 +110,53 @@ class TableLanguage:
         """
         phrases: list[list[tuple[str, str]]] = [[]]
         dropped = []
-        plain = unicodedata.normalize("NFKC", text)
+        plain = unicodedata.normalize("NFKC", text).translate(_PLAIN)
         plain = "".join(str(unicodedata.decimal(sign, sign)) for sign in plain)  # १२ is 12
-        if self.words != _SPACED:
+        if _LATIN not in self.scripts:
             plain = _LATIN_EDGE.sub(" ", plain)
-        tokens = list(_TOKENS.finditer(plain))
-        readable = [token[0] for token in tokens if token["word"] and self._is_readable(token[0])]
-        readings = iter(self._split(readable))
+        tokens = list(self._tokens.finditer(plain))
+        readings = iter(self._split([token["word"] for token in tokens if self._is_split(token)]))
         for token in tokens:
             word = token[0]
             if token["number"]:
-                phrases += [(word, word)], []
+                phrases += [(word, self._say_number(token))], []
+            elif token["short"]:
+                phrases += [(word, self.short[word])], []
             elif token["other"]:
                 phrases.append([])
                 if unicodedata.category(word)[0] not in "PM":
                     dropped.append(word)
-            elif self._is_readable(word):
+            elif self._is_split(token):
                 phrases[-1] += next(readings)
+            elif self._is_foreign(word) or self._is_readable(word):
+                phrases += [(word, word)], []
             else:
                 dropped.append(word)
         return [phrase for phrase in phrases if phrase], dropped
+
+    @cached_property
+    def _tokens(self) -> re.Pattern[str]:
+        """Finds abbreviations, numbers with sign and unit, words, and other signs."""
+        endings = [unit for unit, spoken in self.units.items() if unit.isascii() and unit == spoken]
+        units = {*self.units, *_UNITS} - {*endings}
+        return re.compile(
+            rf"(?P<short>{_any_of([*self.short])})"
+            rf"|(?P<number>(?P<sign>(?<![A-Za-z0-9])-)?(?P<currency>[€$£¥])?(?P<digits>{_DIGITS})"
+            rf"(?P<unit>{_any_of(endings)}| ?{_any_of([*units])})?)|{_WORD}"
+        )
+
+    def _say_number(self, token: re.Match[str]) -> str:
+        """Return a number as text for espeak-ng: $5 is 5 dollars."""
+        unit = (token["unit"] or "").strip()
+        spoken = self.units.get(unit, unit)
+        number = token["digits"].replace(" ", "")
+        number += spoken if spoken == unit else f" {spoken}"
+        if currency := token["currency"]:
+            number += f" {self.units.get(currency, currency)}"
+        number = (token["sign"] or "") + number
+        for pattern, replacement in self.numbers:
+            number = re.sub(pattern, replacement, number)
+        return read_number(number) if self.words == _MECAB and has_mecab() else number
 
     def _split(self, texts: list[str]) -> list[list[tuple[str, str]]]:
         """Return the words of each text without spaces, each with the text for espeak-ng."""
@@ -124,8 +165,17 @@ class TableLanguage:
         pieces = [list(text) if self.words == _CHARACTER else [text] for text in texts]
         return [[(piece, piece) for piece in some] for some in pieces]
 
+    def _is_split(self, token: re.Match[str]) -> bool:
+        """Return whether a token is words of a phrase; other readable words are phrases."""
+        word = token["word"]
+        return bool(word) and self._is_readable(word) and not _CAMEL_CASE.search(word)
+
     def _is_readable(self, word: str) -> bool:
         return word in _SIGNS or all(map(self._has_letter, filter(str.isalpha, word)))
+
+    def _is_foreign(self, word: str) -> bool:
+        """Return whether a word is Latin and the language is not; it is read as English."""
+        return _LATIN not in self.scripts and word.isascii() and word[0].isalpha()
 
     def _has_letter(self, letter: str) -> bool:
         return unicodedata.name(letter, "").startswith(self.scripts)
@@ -137,6 +187,13 @@ class TableLanguage:
             ipa = re.sub(pattern, replacement, ipa)
         phones, unknown = read_ipa(ipa)
         return () if unknown else tuple(nearest_phone(phone, self.phones) for phone in phones)
+
+
+def _any_of(forms: Sequence[str]) -> str:
+    """Return a pattern for any of some forms, which are not parts of Latin words or numbers."""
+    either = "|".join(map(re.escape, sorted(forms, key=len, reverse=True))) or "(?!)"
+    after = r"(?<![A-Za-z](?=[A-Za-z]))(?<![0-9/.](?=[0-9]))"
+    return rf"{after}(?:{either})(?!(?<=[A-Za-z])[^\W\d_]|(?<=[0-9])[0-9/])"
 
 
 def _has_character(text: str) -> bool:
@@ -153,6 +210,9 @@ def load_table_language(package: str) -> TableLanguage:
         voice=settings["voice"],
         scripts=tuple(settings["scripts"]),
         words=settings.get("words", _SPACED),
-        rules=tuple((pattern, replacement) for pattern, replacement in settings.get("rules", ())),
+        numbers=tuple(map(tuple, settings.get("numbers", ()))),
+        units=settings.get("units", {}),
+        short=settings.get("short", {}),
+        rules=tuple(map(tuple, settings.get("rules", ()))),
         phones=tuple(row["phone"] for row in read_table(package, "phones.tsv")),
     )
