@@ -64,7 +64,7 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecord
             if may_ship(recording.license) or not shipping:
                 recordings.append(recording)
     except ValueError as error:
-        raise UserError(f"{manifest}: {error}; give the seconds as a number") from error
+        raise UserError(f"{manifest}: {error}; write the seconds as a number") from error
     if not any(recording.emotion for recording in recordings):
         raise UserError(f"{manifest} names no emotion; add notes such as 'emotion anger'")
     return recordings

@@ -142,7 +142,7 @@ def read_clips(
     ]
     if not clips:
         what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
-        raise UserError(f"no {what} in {folder}; give a folder with .flac, .csv and .json files")
+        raise UserError(f"no {what} in {folder}; use a folder with .flac, .csv and .json files")
     return clips
 
 
@@ -156,14 +156,14 @@ def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> li
 def no_clip_error(folder: Path) -> UserError:
     """Make the error that a model cannot be trained on any clip of a folder."""
     return UserError(
-        f"no clip in {folder} may be used; give clips with a free license, or --any-license"
+        f"no clip in {folder} may be used; use clips with a free license, or add --any-license"
     )
 
 
 def read_clip(path: Path) -> LipClip:
     """Read the clip that a file belongs to; UserError if it cannot be read."""
     if path.suffix not in (".json", ".flac", ".csv"):
-        raise UserError(f"{path}: not a clip; give the .json file that kouxing track wrote")
+        raise UserError(f"{path}: not a clip; use the .json file that kouxing track wrote")
     clip = _read_clip(path.with_suffix(".json"), None, any_license=True)
     assert clip is not None  # noqa: S101 - in any language
     return clip

@@ -86,7 +86,7 @@ def count_errors(reference: Sequence[str], recognized: Sequence[str]) -> ErrorCo
 def feature_errors(reference: Sequence[str], recognized: Sequence[str]) -> float:
     """Return the feature edit distance between universal phones.
 
-    A substitution costs the share of panphon's features that differ; an insertion or a deletion
+    A substitution costs the fraction of panphon's features that differ; an insertion or a deletion
     costs 1. Divided by the number of reference phones, it is the phonetic feature error rate.
     Source: Mortensen et al. 2016, "PanPhon: a resource for mapping IPA segments to articulatory
     feature vectors" (Hamming distance).

@@ -101,7 +101,7 @@ class RowErrors:
     def no_recording_error(self, where: str) -> UserError:
         """Make the error that no recording can be used, with the reason for the last one."""
         last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
-        return UserError(f"no usable recordings {where}{last}; give other recordings")
+        return UserError(f"no usable recordings {where}{last}; use other recordings")
 
 
 def may_ship(license_name: str) -> bool:
@@ -138,7 +138,7 @@ def read_corpus(
         rows = _aishell_rows(folder)
     else:
         raise UserError(
-            f"{folder} is not a corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
+            f"{folder} is not a corpus; use a folder with manifest.tsv, with Kaldi's wav.scp and "
             "text, or with AISHELL's wav and transcript folders"
         )
     with check_content(folder, "a corpus"):
@@ -151,7 +151,7 @@ def audio_files(folder: Path) -> list[Path]:
     """Find and sort the recordings in a folder, at any depth; UserError if it contains no audio."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
     if not files:
-        raise UserError(f"{folder} contains no wav, flac, ogg or opus files; give another folder")
+        raise UserError(f"{folder} contains no wav, flac, ogg or opus files; use another folder")
     return files
 
 

@@ -27,5 +27,5 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     for row in table:
         if len(rows) == _MAX_ROWS:
             raise UserError(f"{path} has more than {_MAX_ROWS} rows; split it")
-        rows.append({name: cell for name, cell in row.items() if name})  # without surplus cells
+        rows.append({name: cell for name, cell in row.items() if name})  # without extra cells
     return rows

@@ -130,7 +130,7 @@ def voice(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure the share of time with voice activity, by kind of audio.
+    """Measure the fraction of time with voice activity, by kind of audio.
 
     The audio consists of clean and disturbed speech, held-out sounds, and synthesized voices and
     noises.

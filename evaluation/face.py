@@ -7,7 +7,7 @@ second face is at rest for a minute.
 - Rank correlations (Spearman) with the feeling of the named emotion, mean over speakers. They cover
   the estimated arousal and valence, the size of the mouth's motion, and the height of the brows.
 - Nods and brow raises: peaks of the head's pitch and of the brows. Those during a recording match a
-  stressed vowel if the last one started 0.1 to 0.3 s before the peak. The chance is the share of
+  stressed vowel if the last one started 0.1 to 0.3 s before the peak. The chance is the fraction of
   all times that match. Movements within 0.6 s after a recording mark the end of the phrase.
 - Blinks per minute and their median duration.
 - Still frames: no FAP moves by more than 0.01 degrees or 0.5 FAP units.
@@ -74,7 +74,7 @@ class Movements:
 
     per_minute: float  # rate per minute of speech
     at_end: float  # share after a phrase
-    matched: float | None  # share of the others; None without any or without stressed vowels
+    matched: float | None  # fraction of the others; None without any or without stressed vowels
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class FaceFigures:
     chance: float | None  # probability of matching a stressed vowel by chance
     blinks_per_minute: float
     blink_s: float  # median duration
-    still_speaking: float  # shares of frames
+    still_speaking: float  # fractions of frames
     still_at_rest: float
     longest_still_s: float
 
@@ -216,7 +216,7 @@ def _movements(times: Sequence[Times], sessions: Sequence[_Session], minutes: fl
 
 
 def _matched(times: Sequence[Times], sessions: Sequence[_Session]) -> float | None:
-    """Return the share of times that follow the start of a stressed vowel."""
+    """Return the fraction of times that follow the start of a stressed vowel."""
     shortest_s, longest_s = _MATCH_S
     lags_s = []
     for one_s, session in zip(times, sessions, strict=True):

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
 
-_LOST_SHARE = 0.01  # share of the loudest channel's energy; a mix with less has lost the channel
+_LOST_SHARE = 0.01  # fraction of the loudest channel's energy; a mix with less has lost the channel
 _LOST_SHARE_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one voice
 _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 

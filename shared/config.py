@@ -181,7 +181,7 @@ Layer = dict[Address, _RawValue]  # the values of one source
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A key of a service with its present value."""
+    """A key of a service with its current value."""
 
     key: str
     value: object
@@ -240,7 +240,7 @@ class Settings:
     def describe(
         self, config_type: type[ServiceConfig], overrides: Mapping[str, str] | None = None
     ) -> list[Setting]:
-        """Return all keys of a service with their present values; raises as ``load``."""
+        """Return all keys of a service with their current values; raises as ``load``."""
         config, given = self._resolve(config_type, overrides or {})
         return [
             Setting(
@@ -313,7 +313,7 @@ def variable(table: str, key: str) -> str:
 
 
 def allowed(field: FieldInfo) -> str:
-    """Describe the allowed values of a key, such as "a whole number from 1 to 20"."""
+    """Describe the allowed values of a key, such as "an integer from 1 to 20"."""
     kind = field.annotation
     marks: dict[type, Any] = {type(mark): mark for mark in field.metadata}
     if ValueHint in marks:
@@ -326,7 +326,7 @@ def allowed(field: FieldInfo) -> str:
         return "true or false"
     if kind is str:
         return "text"
-    number = "a number" if kind is float else "a whole number"
+    number = "a number" if kind is float else "an integer"
     if MultipleOf in marks:
         number = f"a multiple of {marks[MultipleOf].multiple_of}"
     return f"{number} from {marks[Ge].ge} to {marks[Le].le}"

@@ -6,7 +6,7 @@ message until the last one arrives. So a thread checks every connection within 5
 arrives, and at least once a second. It compares the bytes that the kernel received (Linux only)
 with the delivered messages. Until it is clear which bytes belong to an incomplete message, it
 checks 20 times a second. It disconnects a peer that exceeds a limit. libzmq then frees the peer's
-memory. An honest client is never disconnected, at any speed: its queue fills up, libzmq stops
+memory. A well-behaved client is never disconnected, at any speed: its queue fills up, libzmq stops
 reading, and the client waits.
 """
 
@@ -51,7 +51,7 @@ MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
 PENALTY_S = 1.0  # a disconnected peer cannot connect again for this time
-LONG_PENALTY_S = 3.0  # if no honest peer could have done what it did
+LONG_PENALTY_S = 3.0  # if no well-behaved peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
@@ -74,7 +74,7 @@ class Limits:
 
     @property
     def undelivered_bytes(self) -> int:
-        """Bytes that libzmq reads from an honest peer while nothing is delivered."""
+        """Bytes that libzmq reads from a well-behaved peer while nothing is delivered."""
         return (self.queue_length + 1) * self.message_bytes
 
     @property

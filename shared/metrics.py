@@ -133,7 +133,7 @@ class LoadMeter:
         self._busy_s += duration_s
 
     def share(self, now_s: float) -> float:
-        """Return the share of time, 0 to 1, since an earlier call. Call this regularly."""
+        """Return the fraction of time, 0 to 1, since an earlier call. Call this regularly."""
         busy_s = self._busy_at(now_s)
         self._marks.append((now_s, busy_s))
         while len(self._marks) > 2 and self._marks[1][0] <= now_s - self._period_s:

@@ -4,7 +4,7 @@ import contextlib
 import os
 from pathlib import Path
 
-NICENESS = -10  # gives several times the processor share of an ordinary program
+NICENESS = -10  # gives several times the processor time of an ordinary program
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 AUTOGROUP = Path("/proc/self/autogroup")
 

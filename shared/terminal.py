@@ -137,7 +137,7 @@ def check_output(
             raise UserError("-: the output needs a name; standard output is not supported")
         is_new = not _exists(path)
         if not is_new and any(path.samefile(source) for source in sources):
-            raise UserError(f"{path}: the output is also an input; give the output another name")
+            raise UserError(f"{path}: the output is also an input; use another name for the output")
         if path.is_file() and not force:
             if not (sys.stdin.isatty() and CONSOLE.is_terminal):
                 raise UserError(f"{path} exists; add --force to overwrite it")

@@ -27,9 +27,9 @@ def open_file(path: Path, max_bytes: int, *, pipe: bool = False) -> BinaryIO:
     try:
         status = path.stat()
         if stat.S_ISDIR(status.st_mode):
-            raise UserError(f"{path}: this is a folder; give a file")
+            raise UserError(f"{path}: this is a folder; expected a file")
         if not (stat.S_ISREG(status.st_mode) or (pipe and stat.S_ISFIFO(status.st_mode))):
-            raise UserError(f"{path}: this is a pipe or device; give a regular file")
+            raise UserError(f"{path}: this is a pipe or device; expected a regular file")
         if status.st_size > max_bytes:
             limit = f"{max_bytes >> 20} MiB" if max_bytes >> 20 else f"{max_bytes >> 10} KiB"
             raise UserError(f"{path}: the file is larger than {limit}; split or reduce it")

@@ -87,7 +87,7 @@ def phone_lm(
     inputs = [*(corpus or []), *(text or []), ngrams, dictionary]
     check_output(output, inputs=inputs, force=force)
     if (ngrams is None) != (dictionary is None):
-        raise UserError("--ngrams needs --dictionary; give both or neither")
+        raise UserError("use --ngrams and --dictionary together")
     inventory = load_inventory(language)
     drawn = None
     if ngrams and dictionary:

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 
-const MIN_SHARE = 0.1; // share of the largest displacement; vertices that move less are not in the region
+const MIN_SHARE = 0.1; // fraction of the largest displacement; vertices that move less are not in the region
 const MAX_HEAD = 3; // height of a head, relative to the region from chin to brows
 const MAX_APART = 2; // distance of the parts of one face, in sizes of a part
 const STEEPER = 1.5; // how much farther the mouth is below the eyes along an axis that replaces y

@@ -293,7 +293,7 @@ function sourceNode(context, source) {
   if (source instanceof AudioNode) return Object.assign(source, { isPlayed: false });
   if (source instanceof MediaStreamTrack) source = new MediaStream([source]);
   if (source instanceof MediaStream) {
-    if (source.getAudioTracks().length === 0) throw new Error("the stream has no sound; give one with an audio track");
+    if (source.getAudioTracks().length === 0) throw new Error("the stream has no audio track");
     return Object.assign(new MediaStreamAudioSourceNode(context, { mediaStream: source }), { isPlayed: false });
   }
   if (source instanceof AudioBuffer) {
@@ -303,5 +303,5 @@ function sourceNode(context, source) {
     if (!elementNodes.has(source)) elementNodes.set(source, new MediaElementAudioSourceNode(context, { mediaElement: source }));
     return Object.assign(elementNodes.get(source), { isPlayed: true });
   }
-  throw new TypeError("give a MediaStream, a track, an AudioBuffer, an audio element or an audio node");
+  throw new TypeError("expected a MediaStream, a track, an AudioBuffer, an audio element or an audio node");
 }

@@ -24,7 +24,7 @@ def closure_detections(takes: Takes) -> Detections:
 
 
 def class_precision(takes: Takes, name: str) -> float | None:
-    """Return the share of the closures at a class of phones at which real lips are closed."""
+    """Return the fraction of the closures at a class of phones at which real lips are closed."""
     hits = [
         contact.is_true
         for take in takes
@@ -44,7 +44,7 @@ def closure_class(reference: Reference, time_s: float) -> str:
 
 
 def labials_shut(takes: Takes) -> float | None:
-    """Return the share of b p m whose lips are closed within 40 ms of the quietest moment."""
+    """Return the fraction of b p m whose lips are closed within 40 ms of the quietest moment."""
     shut = [
         is_closed_at(take.reference.quietest_moments(take.reference.labials()), take.made)
         for take in takes
@@ -54,7 +54,7 @@ def labials_shut(takes: Takes) -> float | None:
 
 
 def share_shut(takes: Takes) -> float | None:
-    """Return the share of the frames in speech in which the lips are closed."""
+    """Return the fraction of the frames in speech in which the lips are closed."""
     flags = [take.made.is_closed[take.reference.is_speech(take.made.time_s)] for take in takes]
     together = np.concatenate([np.zeros(0, bool), *flags])
     return float(together.mean()) if len(together) else None

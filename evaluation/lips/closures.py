@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.04
 _OPEN = 100.0  # opening of made lips in FAP units: 3 mm on a face
-_OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2  # share of a real mouth's range
+_OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)

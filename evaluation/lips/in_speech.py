@@ -1,4 +1,4 @@
-"""Measures of curves while somebody speaks: correlation with real lips, and changes of direction.
+"""Measures of curves during speech: correlation with real lips, and changes of direction.
 
 Pauses are left out, because they raise correlations.
 """

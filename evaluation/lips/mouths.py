@@ -19,7 +19,7 @@ CURVES: dict[str, Callable[[Array], Array]] = {  # functions of FAPs (num_frames
     "jaw": lambda faps: faps[:, 2],
 }
 _CLOSED = 20.0  # opening of made lips in FAP units: 0.6 mm on a face
-_CLOSED_SHARE = 0.1  # share of a real mouth's range
+_CLOSED_SHARE = 0.1  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Clips with tracked lips, their phones, and when somebody speaks in them."""
+"""Clips with tracked lips, their phones, and when someone speaks in them."""
 
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -40,7 +40,7 @@ class Reference:
     mouth: Mouth
     phones: Sequence[Phone]  # aligned with the text, or recognized
     voice: Sequence[SpeechChange]  # the recognizer's voice activity
-    visemes: Mapping[str, Sequence[tuple[str, float]]]  # phone: visemes with shares of its duration
+    visemes: Mapping[str, Sequence[tuple[str, float]]]  # by phone, with fractions of it
 
     @cached_property
     def loud_s(self) -> Array:
@@ -57,7 +57,7 @@ class Reference:
         return float(np.sqrt(np.mean(np.square(self.clip.samples, dtype=float))))
 
     def is_speech(self, time_s: Array) -> Mask:
-        """Whether somebody speaks at the given times.
+        """Whether someone speaks at the given times.
 
         Voice activity is on, and a loud sound is within 0.1 s. Voice activity alone spans pauses of
         half a second, and the level mistakes noise for speech.

@@ -34,12 +34,12 @@ class Take:
 
     @cached_property
     def in_speech(self) -> Mask:
-        """Whether somebody speaks, at the times of the real frames."""
+        """Whether someone speaks, at the times of the real frames."""
         return self.reference.is_speech(self.real.time_s)
 
     @cached_property
     def opening_in_speech(self) -> Array:
-        """The opening while somebody speaks, at the times of the real frames."""
+        """The opening during speech, at the times of the real frames."""
         return self.made.at("opening", self.real.time_s)[self.in_speech]
 
     @cached_property

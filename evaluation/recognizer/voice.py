@@ -1,4 +1,4 @@
-"""Measures voice activity, laughter and breath: the share of time with each, by kind of audio.
+"""Measures voice activity, laughter and breath: the fraction of time with each, by kind of audio.
 
 The audio passes through a live recognizer in slices of 20 ms. The state of a slice is the newest
 state that the recognizer has reported (``SpeechChange``, ``Progress``) after processing the slice.
@@ -101,7 +101,7 @@ def evaluate_voice(
 ) -> dict[str, dict[str, Any]]:
     """Measure voice activity; return figures for a JSON file, by model and kind of audio.
 
-    The figures contain the seconds with and without a voice, and the share of each with voice
+    The figures contain the seconds with and without a voice, and the fraction of each with voice
     activity. Without such audio, the share is missing: None. The shares with laughter and with
     breath are those of the whole time.
     """

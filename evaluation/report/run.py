@@ -49,7 +49,7 @@ def run_steps(
         shown = [f"kouxing {_without_braces(command)}" for command in commands]
         code = code_hash(step.code)
         if not commands or missing:
-            reason = f"give --{missing[0]}" if missing else "it is not part of a quick report"
+            reason = f"add --{missing[0]}" if missing else "it is not part of a quick report"
             print_message(f"{name}: skipped ({reason})")
         elif not is_fresh and _is_up_to_date(path, shown, code):
             print_message(f"{name}: up to date")

@@ -134,7 +134,7 @@ class LipsPage:
     loaded_ms: float  # from a local server
     first_movement_ms: float  # from loading to the first motion of the mouth; the microphone speaks
     delay_ms: dict[str, float] | None  # from the sound to its weights: p50, p95; only kouxing-lips
-    processor_share: float  # share of one core
+    processor_share: float  # fraction of one core
     num_clips: int = 0
     lag_ms: float | None = None  # lag of the opening behind the real lips, with the page's delay
     opening_correlation: float | None = None

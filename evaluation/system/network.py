@@ -31,7 +31,7 @@ class Link:
     """Properties of the connection between two hosts; packets keep their order."""
 
     delay_ms: float = 0.0
-    loss: float = 0.0  # share of lost packets
+    loss: float = 0.0  # fraction of lost packets
 
     @property
     def jitter_ms(self) -> float:

@@ -1,4 +1,4 @@
-"""``kouxing config``: prints every key with its meaning, its present value and its origin."""
+"""``kouxing config``: prints every key with its meaning, its current value and its origin."""
 
 import json
 import sys

@@ -98,7 +98,7 @@ def _read_lines(path: Path) -> Iterator[str]:
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
-        raise UserError(f"{path}: this is not a text file; give a table of curves in UTF-8")
+        raise UserError(f"{path}: this is not a text file; use a table of curves in UTF-8")
     return (line for line in split_lines(path, text) if line.strip(" ,;\t\n"))
 
 

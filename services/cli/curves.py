@@ -71,7 +71,7 @@ class CurveExporter(ABC):
                 f" {' or '.join(suffixes)}"
             )
         if len(options.lips) > 1:
-            raise UserError("a curve file holds one face; give --lips only once")
+            raise UserError("a curve file holds one face; use --lips only once")
         if not output.parent.is_dir():
             raise write_error(output, FileNotFoundError())
         self._output = output

@@ -110,7 +110,7 @@ def open_exporter(output: Path, options: ExportOptions) -> Exporter:
     exporter = VideoExporter if is_sequence(output) else EXPORTERS.get(output.suffix.lower())
     if exporter is None:
         raise UserError(
-            f"{output}: unknown format; give a name that ends in {', '.join(EXPORTERS)}, a folder,"
+            f"{output}: unknown format; use a name that ends in {', '.join(EXPORTERS)}, a folder,"
             " or a name with a number such as face%05d.png"
         )
     _check_options(output, options, exporter)

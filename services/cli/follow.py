@@ -80,7 +80,7 @@ def _open_exporter(output: Path, form: CurveForm | None) -> CurveExporter:
     exporter = CURVE_EXPORTERS.get(output.suffix.lower())
     if exporter is None:
         raise UserError(
-            f"{output}: unknown format; give a name that ends in {', '.join(CURVE_EXPORTERS)}"
+            f"{output}: unknown format; use a name that ends in {', '.join(CURVE_EXPORTERS)}"
         )
     return exporter(output, ExportOptions(form=form))
 

@@ -125,15 +125,15 @@ def draw_mouth(
     suffix = output.suffix.lower()
     write = _WRITERS.get(suffix)
     if write is None:
-        raise UserError(f"{output}: give a name that ends in {', '.join(_WRITERS)}")
+        raise UserError(f"{output}: use a name that ends in {', '.join(_WRITERS)}")
     if num_points is not None and suffix != ".csv":
         raise UserError(f"{output}: --points applies to .csv; leave it out")
     if smooth and suffix not in (".mp4", ".csv"):
         raise UserError(f"{output}: --smooth applies to .mp4 and .csv; a picture has key frames")
     if text is not None and speech_to_text is not None:
-        raise UserError("give either a text or --speech-to-text, not both")
+        raise UserError("use either a text or --speech-to-text, not both")
     if text is None and speech_to_text is None and timing is not None:
-        raise UserError("--timing needs a text; give the spoken text before the output file")
+        raise UserError("--timing needs a text; write the spoken text before the output file")
     inventory = load_inventory(language)
     with open_progress() as progress:
         samples = read_mono_16k(source, track, progress)

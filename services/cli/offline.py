@@ -348,7 +348,7 @@ def lips(
 
     *text, output = text_and_output
     if len(text) > 1:
-        raise UserError("give one text and one output file; put a text with spaces in quotes")
+        raise UserError("expected one text and one output file; put a text with spaces in quotes")
     check_output(Path(output), inputs=[audio, *map(Path, text)], force=force)
     draw_mouth(
         audio,
@@ -370,7 +370,7 @@ def _format(form: PhoneFormat | None, output: Path | None) -> PhoneFormat:
     of_suffix = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
     if of_suffix is None:
         raise UserError(
-            f"{output}: unknown format; give a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
+            f"{output}: unknown format; use a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
         )
     if form not in (None, of_suffix):
         raise UserError(f"{output}: --format {form} does not fit this name; leave out the option")

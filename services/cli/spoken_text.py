@@ -56,7 +56,7 @@ def read_text(text: str, inventory: PhoneInventory) -> Transcript:
     if not transcript.syllables:
         if words:
             raise UserError(f"no word of the text can be read: {named}; {advice}")
-        raise UserError("the text is empty; give the spoken words")
+        raise UserError("the text is empty; write the spoken words")
     if words:
         print_message(f"words that cannot be read were ignored: {named}; {advice}")
     return transcript

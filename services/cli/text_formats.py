@@ -45,7 +45,7 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_MIN_COMMON = 0.8  # share of common characters in a text that was decoded correctly
+_MIN_COMMON = 0.8  # fraction of common characters in a text that was decoded correctly
 
 _TIME = r"(?:\d{1,3}[:：])?\d{1,2}[:：]\d{2}(?:[.,:]\d{1,3})?"
 _LRC_TIME = r"\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
@@ -148,19 +148,19 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
     text = text.lstrip("\ufeff \t\r\n").replace("\r\n", "\n").replace("\r", "\n")
     for beginning, name in _TEXTUAL.items():
         if text.startswith(beginning):
-            raise UserError(f"this is {name}; give only the spoken text")
+            raise UserError(f"this is {name}; keep only the spoken text")
     for form, pattern, extract in _FORMATS:
         if (is_markdown and form == "Markdown") or pattern.search(text):
             try:
                 spoken = extract(text)
             except ValueError:
-                raise UserError(f"this is not valid {form}; give only the spoken text") from None
+                raise UserError(f"this is not valid {form}; keep only the spoken text") from None
             break
     else:
         spoken = remove_columns(text)
         form = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
-        raise UserError("the text has times of an unknown format; give only the spoken text")
+        raise UserError("the text has times of an unknown format; keep only the spoken text")
     return SpokenText(spoken, form)
 
 
@@ -285,7 +285,7 @@ def _read_text_grid(text: str) -> str:
     if len(chosen) > 1 and chosen is tiers:
         names = ", ".join(repr(tier[0]) for tier in tiers if tier)
         raise UserError(
-            f"this TextGrid has the tiers {names}, none with Chinese characters; give only"
+            f"this TextGrid has the tiers {names}, none with Chinese characters; keep only"
             " the spoken text"
         )
     labels = chosen[0][1:] if chosen else []
@@ -310,7 +310,7 @@ def _json_text(value: object) -> str:
         for name in ("text", "content", "segments", "body", "syllables"):
             if name in value:
                 return _json_text(value[name])
-    raise UserError("this is JSON without the text of a transcript; give only the spoken text")
+    raise UserError("this is JSON without the text of a transcript; keep only the spoken text")
 
 
 def _read_markdown(text: str) -> str:
@@ -364,7 +364,7 @@ def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> N
 def _reject_xml(text: str) -> str:
     root = re.search(r"<([A-Za-z][\w:.-]*)", text)
     name = f" with the root element {root[1]!r}" if root else ""
-    raise UserError(f"this is XML{name}; give only the spoken text")
+    raise UserError(f"this is XML{name}; keep only the spoken text")
 
 
 _FORMATS: tuple[tuple[str, re.Pattern[str], Callable[[str], str]], ...] = (

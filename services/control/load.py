@@ -1,6 +1,6 @@
 """The load of each worker, and whether it has room for another session.
 
-A heartbeat states the share of the last two seconds in which a worker's loop was busy. Sessions
+A heartbeat states the fraction of the last two seconds in which a worker's loop was busy. Sessions
 that were placed or ended since then count with the cost of one session: the highest cost measured
 recently. Every session is expected to take that much, since a silent client may start to speak at
 any moment. A worker processes the audio of all sessions together, so each of many sessions costs

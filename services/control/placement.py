@@ -17,7 +17,7 @@ class Placement:
 
     def __init__(self, registry: Registry, max_load: float) -> None:
         self._registry = registry
-        self._max_load = max_load  # share of a worker's time for sessions
+        self._max_load = max_load  # fraction of a worker's time for sessions
 
     def place(
         self,

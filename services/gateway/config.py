@@ -9,7 +9,7 @@ from kouxing.shared.config import BoundHost, BoundPort, HostNames, Switch, Texts
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
-ADDRESS_SHARE = 0.75  # share of each quota for one address; many people may share a proxy's address
+ADDRESS_SHARE = 0.75  # fraction of each quota for one address, which may be that of a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
 
 

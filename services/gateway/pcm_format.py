@@ -38,7 +38,7 @@ class PcmFormat:
         rate_hz = self.sample_rate_hz
         if type(rate_hz) is not int or not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
             raise UserError(
-                f"sample_rate_hz must be a whole number from {RATES_HZ[0]} to {RATES_HZ[1]}, "
+                f"sample_rate_hz must be an integer from {RATES_HZ[0]} to {RATES_HZ[1]}, "
                 f"not {rate_hz!r}"
             )
         if type(self.num_channels) is not int or self.num_channels not in (1, 2):

@@ -57,7 +57,7 @@ CONTROL_MISSING_S = 8.0  # delay of reporting that control is missing; a restart
 
 @dataclass(slots=True)
 class _FollowedSession:
-    """A session. The gateway subscribes to it when somebody first needs it, until it ends."""
+    """A session. The gateway subscribes to it when someone first needs it, until it ends."""
 
     follower: ServiceFollower
     syllables: SyllableTrack
@@ -195,7 +195,7 @@ class GatewayService(Service):
     # --- from control ----------------------------------------------------------------------------
 
     def start_session(self, start: StartSession) -> bool:
-        """Subscribe to a session that somebody needs; confirm when this is in effect."""
+        """Subscribe to a session that someone needs; confirm when this is in effect."""
         session = self._sessions.get(start.session)
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)

@@ -118,7 +118,7 @@ def parse_command(message: str) -> MicrophoneCommand:
     fields = parse_object(message)
     num_skipped = fields.get("skip", 0)
     if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:
-        raise UserError(f"skip must be a whole number from 0 to {MAX_SKIPPED}")
+        raise UserError(f"skip must be an integer from 0 to {MAX_SKIPPED}")
     return MicrophoneCommand(
         flush=bool(fields.get("flush")),
         eof=bool(fields.get("eof")),

@@ -52,7 +52,7 @@ def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], ND
     header = parse_json(content[4:body])
     keys = ("times", "points", "sample_rate_hz")
     if not isinstance(header, dict) or any(type(header.get(key)) is not int for key in keys):
-        raise ValueError(f"its header needs whole numbers for {', '.join(keys)}")
+        raise ValueError(f"its header needs integers for {', '.join(keys)}")
     num_frames, num_points, rate_hz = (header[key] for key in keys)
     if num_points != len(LANDMARKS):
         raise ValueError(f"it has {num_points} landmarks a frame instead of {len(LANDMARKS)}")

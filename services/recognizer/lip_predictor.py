@@ -17,7 +17,7 @@ y        for each delay the FAPs, and log odds of closure and of      (delays, 1
     y = A f + B [h, u] + c
 
 A contains the ear's own lips, the last of its features. They come from many voices, so they follow
-unseen speakers better, and have the largest share of the FAPs. A also contains linear regressions
+unseen speakers better, and contribute most to the FAPs. A also contains linear regressions
 to the lips of filmed speakers. B [h, u] follows these speakers more closely.
 
 There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen

@@ -48,7 +48,7 @@ class LiveDecoder:
     The paper never corrects an emitted phone. Here, whenever a phone is emitted, the best string
     corrects the earlier ones. Such a phone is emitted again under its ``index``, with the measured
     onset and duration, or with another symbol. Phones that the rule passed over are emitted
-    together with the next one. A surplus phone is withdrawn (``Phone.is_withdrawn``). Silence
+    together with the next one. An extra phone is withdrawn (``Phone.is_withdrawn``). Silence
     within speech is a phone like any other.
 
     A phone is final when all paths of the search over settled scores share it, or speech has ended.
@@ -169,7 +169,7 @@ class LiveDecoder:
         if is_first and segments[0].phone == self._silence:
             segments = segments[1:]  # silence before the first phone is not emitted
         emitted: list[Phone] = []
-        while len(segments) < num_before:  # a surplus phone was emitted and is withdrawn
+        while len(segments) < num_before:  # an extra phone was emitted and is withdrawn
             silence = self._inventory.silence
             emitted.append(replace(self._open.pop(0), symbol=silence, duration_s=0.0, final=True))
             self._num_final, num_before = self._num_final + 1, num_before - 1

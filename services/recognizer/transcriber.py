@@ -50,7 +50,7 @@ def _recognizer_in(folder: Path) -> Any:
     tokens = folder / "tokens.txt"
     parts = {name: _model_in(folder, name) for name in ("encoder", "decoder", "joiner", "model")}
     if not tokens.is_file():
-        raise UserError(f"{folder} contains no tokens.txt; give the folder of a sherpa-onnx model")
+        raise UserError(f"{folder} contains no tokens.txt; use the folder of a sherpa-onnx model")
     given = {"tokens": str(tokens), "num_threads": 1}
     if parts["encoder"] and parts["decoder"] and parts["joiner"]:
         names = ("encoder", "decoder", "joiner")
@@ -60,7 +60,7 @@ def _recognizer_in(folder: Path) -> Any:
     if parts["model"] and "sense-voice" in folder.name:
         return OfflineRecognizer.from_sense_voice(**given, model=parts["model"], language="zh")
     raise UserError(
-        f"{folder} contains no model of a known kind; give the folder of a sherpa-onnx transducer, "
+        f"{folder} contains no model of a known kind; use the folder of a sherpa-onnx transducer, "
         "or one whose name contains 'paraformer' or 'sense-voice'"
     )
 

@@ -88,9 +88,9 @@ class FaceAnimator:
         feeling: float = 0.0,
     ) -> None:
         if not 0.0 <= delay_s <= MAX_DELAY_S:
-            raise UserError(f"delay_s is {delay_s:g}; give 0 to {MAX_DELAY_S:g} seconds")
+            raise UserError(f"delay_s is {delay_s:g}; it must be from 0 to {MAX_DELAY_S:g} seconds")
         if not 10.0 <= frame_rate_hz <= 240.0:
-            raise UserError(f"frame_rate_hz is {frame_rate_hz:g}; give 10 to 240")
+            raise UserError(f"frame_rate_hz is {frame_rate_hz:g}; it must be from 10 to 240")
         self._lip_model = lip_model
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s

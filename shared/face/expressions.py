@@ -36,13 +36,13 @@ def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
         if not _is_number(strength, 1.0):
             raise UserError(f"expression {name}: strength {strength} is not between 0 and 1")
     if not _is_number(hold_s, MAX_HOLD_S):
-        raise UserError(f"hold_s is {hold_s}; give 0 to {MAX_HOLD_S:g} seconds")
+        raise UserError(f"hold_s is {hold_s}; it must be from 0 to {MAX_HOLD_S:g} seconds")
 
 
 def check_amount(name: str, amount: object, lowest: float, highest: float) -> float:
     """Return the amount of a face setting; ``UserError`` if it is out of range."""
     if not _is_number(amount, highest, lowest):
-        raise UserError(f"{name} is {amount}; give {lowest:g} to {highest:g}")
+        raise UserError(f"{name} is {amount}; it must be from {lowest:g} to {highest:g}")
     return float(amount)  # type: ignore[arg-type]
 
 

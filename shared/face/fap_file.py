@@ -72,7 +72,7 @@ def read_fap(path: Path) -> FapAnimation:
     try:
         return _parse(path, text)
     except _BadFileError as error:
-        raise UserError(f"{path}, {error}; give a .fap file of version {_VERSION}") from error
+        raise UserError(f"{path}, {error}; use a .fap file of version {_VERSION}") from error
 
 
 def write_fap(path: Path, animation: FapAnimation) -> None:
@@ -218,6 +218,6 @@ def _parse_high(
     for value, limit in zip(given, limits, strict=True):
         if not (0 <= value <= limit and value == int(value)):
             raise _BadFileError(
-                line_number, f"FAP {fap} is {value:g}; give a whole number from 0 to {limit}"
+                line_number, f"FAP {fap} is {value:g}; it must be an integer from 0 to {limit}"
             )
     return [int(value) for value in given]

@@ -76,7 +76,7 @@ class State(Enum):
 
 _PAUSES = (State.ENDING, State.THINKING)
 _LIVELINESS_IN_PAUSES = 0.3  # factor for the head in pauses
-# share of the fixations on the listener
+# fraction of the fixations on the listener
 _ON_LISTENER = {
     State.LISTENING: 0.8,
     State.ATTENDING: 0.95,

@@ -10,7 +10,7 @@ Value = TypeVar("Value", float, NDArray[np.float32])
 
 
 def smoothing_share(elapsed_s: float, time_constant_s: float) -> float:
-    """Return the share of a change that a one-pole low-pass filter makes in a time, 0 to 1."""
+    """Return the fraction of a change that a one-pole low-pass filter makes in a time, 0 to 1."""
     return -math.expm1(-elapsed_s / time_constant_s)
 
 

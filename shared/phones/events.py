@@ -14,7 +14,7 @@ class Phone(Record, frozen=True, kw_only=True):
     """One recognized phone.
 
     A live recognizer emits the same ``index`` at least twice: first with an estimated duration
-    (``final`` false), then with the measured onset and duration (``final`` true). A surplus phone
+    (``final`` false), then with the measured onset and duration (``final`` true). An extra phone
     is withdrawn: its last emission is silence without duration.
     """
 

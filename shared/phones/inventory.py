@@ -25,8 +25,8 @@ column          meaning
 phone           symbol, 1 to 4 lower-case letters
 kind            ``initial`` (a consonant that begins a syllable), ``vowel`` (the rest of a syllable)
                 or ``silence`` (exactly one row, ``sil``)
-visemes         the phone's mouth shapes in order, ``name:share`` separated by spaces; the shares of
-                its duration add up to 1
+visemes         the phone's mouth shapes in order, ``name:share`` separated by spaces; the shares
+                of its duration add up to 1
 before_rounded  the phone's viseme before a rounded one, if different; may be empty
 =============== ===================================================================================
 """
@@ -65,7 +65,7 @@ _SYMBOL = re.compile(r"[a-z]{1,4}")
 _WORDS = re.compile(r"[^\W\d_]+(?: +[^\W\d_]+)*")
 
 Syllable = tuple[str, ...]
-VisemeShares = tuple[tuple[str, float], ...]  # (viseme, share of the phone's duration), in order
+VisemeShares = tuple[tuple[str, float], ...]  # (viseme, fraction of the phone's duration), in order
 
 
 @dataclass(frozen=True, kw_only=True)

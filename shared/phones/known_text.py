@@ -52,6 +52,6 @@ def characters_of(text: str, inventory: PhoneInventory) -> Characters:
     if len(syllables) != len(characters):
         raise UserError(
             f"{text!r}: {len(characters)} characters have another number of syllables,"
-            f" {len(syllables)}; give one character for each syllable"
+            f" {len(syllables)}; write one character for each syllable"
         )
     return list(zip(characters, syllables, strict=True))

@@ -76,7 +76,7 @@ class Heartbeat(Message, frozen=True, kw_only=True):
         default_factory=list
     )  # further languages that its sessions may choose
     build: Text = ""  # version of kouxing
-    load: Probability = 0.0  # share of the last seconds in which its loop was busy
+    load: Probability = 0.0  # fraction of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
     sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
         default_factory=dict

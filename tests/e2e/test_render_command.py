@@ -89,7 +89,7 @@ def test_renders_a_transparent_picture_of_any_head(face: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("output", "options", "message"),
     [
-        ("a.png", {"at": 9.0, "size": "64x48"}, "give 0 to 0.45 seconds"),
+        ("a.png", {"at": 9.0, "size": "64x48"}, "use 0 to 0.45 seconds"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
         ("a.mp4", {"lips": ["learnt"]}, "--lips applies to sound"),
         ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to sound"),

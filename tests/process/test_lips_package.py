@@ -189,8 +189,8 @@ def test_voice_state_follows_the_speech(models: Path) -> None:
     [
         ({"sampleRateHz": 4000}, "the sample rate 4000 Hz is out of range; use 8000 to 192000 Hz"),
         ({"shapes": ["arkit52"]}, "unknown shapes arkit52; use arkit, oculus, vrm"),
-        ({"expressiveness": 3}, "expressiveness is 3; give 0.5 to 2"),
-        ({"delayMs": -1}, "delayMs is -1; give 0 to 300"),
+        ({"expressiveness": 3}, "expressiveness is 3; it must be from 0.5 to 2"),
+        ({"delayMs": -1}, "delayMs is -1; it must be from 0 to 300"),
     ],
 )
 def test_bad_options_give_a_sentence(models: Path, options: dict[str, Any], text: str) -> None:
@@ -199,7 +199,7 @@ def test_bad_options_give_a_sentence(models: Path, options: dict[str, Any], text
 
 def test_samples_that_are_not_finite_give_a_sentence(models: Path) -> None:
     output = package_output(models, np.full(320, np.nan, np.float32))
-    assert output == {"error": "some samples are not finite; give values in [-1, 1]"}
+    assert output == {"error": "some samples are not finite; they must be in [-1, 1]"}
 
 
 def test_missing_models_give_a_sentence(tmp_path: Path) -> None:

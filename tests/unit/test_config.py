@@ -81,8 +81,8 @@ def test_a_default_may_depend_on_another_key() -> None:
 @pytest.mark.parametrize(
     ("config_type", "key", "text", "allowed"),
     [
-        (RecognizerConfig, "num_stable_frames", "many", "a whole number from 1 to 20"),
-        (RecognizerConfig, "num_stable_frames", "2.9", "a whole number from 1 to 20"),
+        (RecognizerConfig, "num_stable_frames", "many", "an integer from 1 to 20"),
+        (RecognizerConfig, "num_stable_frames", "2.9", "an integer from 1 to 20"),
         (RecognizerConfig, "advertise", "tcp://here", "a host name or address"),
         (RecognizerConfig, "audio", "tcp://127.0.0.1:99999", "an endpoint, tcp://HOST:PORT"),
         (RecognizerConfig, "control", "here", "an endpoint, tcp://HOST:PORT"),

@@ -68,5 +68,5 @@ def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
     with pytest.raises(UserError, match="lacks the columns licence, seconds, note"):
         read_emotions(folder)
     manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\tlong\temotion fear\t\n", encoding="utf-8")
-    with pytest.raises(UserError, match="give the seconds as a number"):
+    with pytest.raises(UserError, match="write the seconds as a number"):
         read_emotions(folder)

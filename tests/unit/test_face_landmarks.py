@@ -129,7 +129,7 @@ def replaced(at: int, part: bytes) -> bytes:
         (landmark_file(times=49), "only 49 frames"),
         (landmark_file(points=468), "468 landmarks"),
         (landmark_file(sample_rate_hz=4000), "4000 Hz"),
-        (b"\x04\x00\x00\x00null" + CONTENT[4 + HEADER_BYTES :], "whole numbers"),
+        (b"\x04\x00\x00\x00null" + CONTENT[4 + HEADER_BYTES :], "integers"),
         (replaced(8, np.float64(np.nan).tobytes()), "times"),
         (replaced(8 * NUM_FRAMES, np.float32(np.nan).tobytes()), "pixels"),
         (CONTENT[: 4 + HEADER_BYTES + NUM_FRAMES * (8 + 12 * 43) + 20], "second of audio"),

@@ -67,7 +67,7 @@ def test_parses_microphone_commands() -> None:
     ("fields", "error"),
     [
         *(({"lips": lips}, "lips must be the name") for lips in ("no name", 1)),
-        *(({"skip": n}, "skip must be a whole") for n in (-1, 1.5, True, wire.MAX_SKIPPED + 1)),
+        *(({"skip": n}, "skip must be an integer") for n in (-1, 1.5, True, wire.MAX_SKIPPED + 1)),
     ],
 )
 def test_rejects_bad_microphone_commands(fields: object, error: str) -> None:
@@ -94,7 +94,7 @@ def test_parses_face_settings() -> None:
         ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
         ({"express": "joy"}, "names to strengths"),
         ({"expressiveness": 3}, "expressiveness is 3"),
-        ({"feeling": -1}, "feeling is -1; give 0 to 1"),
+        ({"feeling": -1}, "feeling is -1; it must be from 0 to 1"),
         ({"still": "yes"}, "still must be true or false"),
         ({"listen_to": "a b"}, "listen_to must be the name of a session"),
         ({"acoustic": "heavy"}, "acoustic must be full or light"),

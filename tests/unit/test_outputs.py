@@ -76,7 +76,7 @@ def test_standard_output_is_not_a_file() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["me.avi"], r"me\.avi: unknown format; give a name that ends in \.mp4"),
+        (["me.avi"], r"me\.avi: unknown format; use a name that ends in \.mp4"),
         (["me.csv", "--lips", "lerned"], "unknown lip model 'lerned'; use one of"),
     ],
 )
@@ -99,7 +99,7 @@ def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) ->
         pair_outputs([tmp_path / "a.wav", tmp_path / "a.mp3"], None, ".mp4")
     with pytest.raises(UserError, match=r"would both be written to"):
         pair_outputs([tmp_path / "a.wav", tmp_path / "out/../a.wav"], None, ".mp4")
-    with pytest.raises(UserError, match=r"one\.csv is a file for 2 inputs; give a folder"):
+    with pytest.raises(UserError, match=r"one\.csv is a file for 2 inputs; use a folder"):
         pair_outputs(sources, tmp_path / "one.csv", ".csv")
 
 

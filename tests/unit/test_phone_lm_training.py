@@ -142,7 +142,7 @@ def test_draws_words_with_their_probabilities(model: tuple[Path, Path]) -> None:
     ngrams, dictionary = model
     for files, message in (
         ((dictionary, dictionary), "is not output of `tslminfo -v`"),
-        ((ngrams, ngrams), "give files of the same version"),
+        ((ngrams, ngrams), "use files of the same version"),
     ):
         with pytest.raises(UserError, match=message):
             draw_phones(*files, MANDARIN, num_words=10)
@@ -226,4 +226,4 @@ def test_n_grams_need_a_dictionary(option: str, tmp_path: Path) -> None:
     arguments = ["phone-lm", "-o", str(tmp_path / "l.npz"), option, str(tmp_path / "file")]
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, UserError)
-    assert "needs --dictionary" in str(result.exception)
+    assert "use --ngrams and --dictionary together" in str(result.exception)

@@ -60,7 +60,7 @@ def test_rejects_files_of_other_kinds_and_sizes(tmp_path: Path) -> None:
         assert str(tmp_path / "model.bin") in str(error.value)
 
     write_whisper(tmp_path, encoder_arrays(width=64))
-    refused("64 x 80 x 3 instead of 32 x 80 x 3; give the folder of a Whisper model of width 32")
+    refused("64 x 80 x 3 instead of 32 x 80 x 3; use the folder of a Whisper model of width 32")
     write_whisper(tmp_path, encoder_arrays(num_layers=1))
     refused("lacks encoder/layer_1")
     write_whisper(tmp_path, encoder_arrays(), version=3)

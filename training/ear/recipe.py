@@ -88,7 +88,7 @@ def train_ear(
     all_sounds = read_sounds(sounds, shipping=shipping)
     backgrounds = training_backgrounds(all_sounds)
     if not backgrounds:
-        raise UserError("no music or noise to mix with the speech; give a folder with --sounds")
+        raise UserError("no music or noise to mix with the speech; add a folder with --sounds")
     others = [
         Recording(
             sound.name,

@@ -202,7 +202,7 @@ def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneIn
 
 
 def _viseme_shares(inventory: PhoneInventory) -> Array:
-    """Return the share of each viseme in each phone, (num_phones, num_visemes)."""
+    """Return the fraction of each viseme in each phone, (num_phones, num_visemes)."""
     names = sorted({name for shares in inventory.visemes.values() for name, _ in shares})
     shares = np.zeros((len(inventory), len(names)))
     for row, phone in enumerate(inventory.phones):

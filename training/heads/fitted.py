@@ -84,7 +84,7 @@ def find(folder: Path, name: str) -> Path:
     """Return the path of a file; UserError if it is missing."""
     path = folder / name
     if not path.is_file():
-        raise UserError(f"{path} is missing; give --parts the folder `base` of {REPOSITORY}")
+        raise UserError(f"{path} is missing; set --parts to the folder `base` of {REPOSITORY}")
     return path
 
 

@@ -68,7 +68,7 @@ class MakeHuman:
             self._archive.getinfo(_DATA + "3dobjs/base.obj")
         except (OSError, KeyError, zipfile.BadZipFile) as error:
             raise UserError(
-                f"{wheel} does not contain the MakeHuman data; give the wheel of {REQUIREMENT}"
+                f"{wheel} does not contain the MakeHuman data; use the wheel of {REQUIREMENT}"
             ) from error
 
     def base_mesh(self) -> BaseMesh:

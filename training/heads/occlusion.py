@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 
 _SKULL = np.array([0.0, 5.93, 0.42])  # its middle, dm
 _HIDDEN = 0.002  # fraction of the sphere that is visible from a hidden vertex, at most
-_TOOTH_SHOWN = 0.4  # a tooth with a smaller share of visible triangles is removed
+_TOOTH_SHOWN = 0.4  # a tooth with a smaller fraction of visible triangles is removed
 _SIZE = 512  # px
 _NUM_DIRECTIONS = 160
 _VERTEX = """

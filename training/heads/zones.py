@@ -283,7 +283,7 @@ class FaceFields:
 
 
 def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
-    """Compute the fields (V, 3) of the tongue, including its share of the jaw's motion."""
+    """Compute the fields (V, 3) of the tongue, including its fraction of the jaw's motion."""
     geodesics = surface.Geodesics(tongue.vertices, tongue.quads)
     tip, body = tongue.points("6.1"), tongue.points("6.2")
     edges = tongue.points("6.3", "6.4")

@@ -55,7 +55,7 @@ COMPONENTS = ((160, 32, 0.5, 0.5), (128, 96, 1.0, 0.2), (128, 96, 1.0, 0.2), (51
 # Shares of the FAPs: the ear's lips, linear regression, recurrent network. Chosen on four speakers
 # without clips in training.
 _EAR_SHARE, _LINEAR_SHARE, _NETWORK_SHARE = 0.5, 0.3, 0.2
-_LINEAR_CLOSURE = 0.85  # share of a closure's log odds; the rest is the network's
+_LINEAR_CLOSURE = 0.85  # fraction of a closure's log odds; the rest is the network's
 _MAX_REPEATS = 6  # limit for the clips of a small source
 _NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
@@ -102,7 +102,7 @@ def train_lips(
     plain = track(speech_of(used), description="clips", total=len(used))
     trained_on = [stretch for stretches in plain for stretch in stretches]
     if not trained_on:
-        raise UserError(f"the clips in {folder} contain no speech; give clips with speech")
+        raise UserError(f"the clips in {folder} contain no speech; use clips with speech")
     augmented = speech_of(used, copy=1)
     copies = [
         stretch

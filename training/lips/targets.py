@@ -26,7 +26,7 @@ from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 
-_CLOSED_SHARE = 0.1  # share of the range of a speaker's opening
+_CLOSED_SHARE = 0.1  # fraction of the range of a speaker's opening
 _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
 

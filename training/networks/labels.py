@@ -47,8 +47,8 @@ _FULL_FOLDER_MINUTES = 45  # longer folders get the weight of this much speech
 class Mix:
     """Composition of a training set."""
 
-    kinds: Mapping[str, float]  # share of each kind of speech with text
-    untranscribed: float  # share of recordings without text
+    kinds: Mapping[str, float]  # fraction of each kind of speech with text
+    untranscribed: float  # fraction of recordings without text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -70,12 +70,12 @@ def load_whisper(network: Encoder, folder: Path) -> None:
         }
     except OSError as error:
         raise UserError(
-            f"cannot read {path}: {error.strerror or error}; give the folder of a Whisper model "
+            f"cannot read {path}: {error.strerror or error}; use the folder of a Whisper model "
             "for faster-whisper"
         ) from error
     except (ValueError, struct.error) as error:
         raise UserError(
-            f"{path} is not a Whisper model in CTranslate2's format: {error}; give the folder of a "
+            f"{path} is not a Whisper model in CTranslate2's format: {error}; use the folder of a "
             "model for faster-whisper"
         ) from error
     wanted = network.state_dict()
@@ -84,7 +84,7 @@ def load_whisper(network: Encoder, folder: Path) -> None:
             sizes = (" x ".join(map(str, shape)) for shape in (array.shape, wanted[name].shape))
             raise UserError(
                 f"{path}: {_names(network.shape.layers)[name]} is {' instead of '.join(sizes)}; "
-                f"give the folder of a Whisper model of width {network.shape.width}, such as base"
+                f"use the folder of a Whisper model of width {network.shape.width}, such as base"
             )
     network.load_state_dict(wanted | weights)
 

@@ -73,7 +73,7 @@ def draw_phones(
     levels = _levels(ngrams)
     if max(int((level.code % _BASE).max()) for level in levels) >= len(words):
         raise UserError(
-            f"{ngrams} has words that {dictionary} lacks; give files of the same version"
+            f"{ngrams} has words that {dictionary} lacks; use files of the same version"
         )
     rng = np.random.default_rng(seed)
     num_chains = min(_NUM_CHAINS, num_words)

@@ -74,7 +74,7 @@ def estimate_phone_lm(
     """
     num_phones = len(inventory)
     if num_phones**order > _MAX_CODE:
-        raise UserError(f"order {order} is too high for {num_phones} phones; give a lower one")
+        raise UserError(f"order {order} is too high for {num_phones} phones; use a lower one")
     silence = inventory.index[inventory.silence]
     grams, counts = _count(np.concatenate(streams), order, silence, num_phones)
     unigram_counts = np.full(num_phones, _UNSEEN_COUNT)
@@ -227,7 +227,7 @@ def train_phone_lm(
     if len(corpus_stream):
         streams += [corpus_stream] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus_stream)))
     if not num_text + len(corpus_stream):
-        raise UserError("no text to count; give --text, --ngrams or a corpus with sentences")
+        raise UserError("no text to count; add --text, --ngrams or a corpus with sentences")
     print_message(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
     phone_lm = estimate_phone_lm(streams, inventory)
     write_archive(output, phone_lm_arrays(phone_lm))
@@ -256,7 +256,7 @@ def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
         ) from error
     if phone_lm.inventory.language != inventory.language:
         raise UserError(
-            f"{path} is for {phone_lm.inventory.language}, not for {inventory.language}; give a "
+            f"{path} is for {phone_lm.inventory.language}, not for {inventory.language}; use a "
             "phone language model for this language"
         )
     return phone_lm

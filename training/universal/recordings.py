@@ -32,7 +32,7 @@ _HELD_OUT_SPEAKERS = frozenset(
     "grid_s31 grid_s33 grid_s5 grid_m_lbax grid_f_lbbc".split()
 )
 _HELD_OUT_SHARE = 10  # one in 10 speakers of English by native speakers of Mandarin
-# share of each group in training; synthetic speech other than Mandarin has _SYNTHETIC_SHARE
+# fraction of each group in training; synthetic speech other than Mandarin has _SYNTHETIC_SHARE
 _SHARES = {"learners": 0.27, "mandarin": 0.15, "en": 0.10, "emodb": 0.10, "grid": 0.08, "fr": 0.07,
            "es": 0.06, "ru": 0.06, "de": 0.04, "yue": 0.04, "pt": 0.03}  # fmt: skip
 _SYNTHETIC_SHARE = 0.16

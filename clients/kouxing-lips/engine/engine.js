@@ -135,7 +135,7 @@ function recognizerFor(model) {
 
 function inRange(name, value, lowest, highest) {
   if (value >= lowest && value <= highest) return value;
-  throw new RangeError(`${name} is ${value}; give ${lowest} to ${highest}`);
+  throw new RangeError(`${name} is ${value}; it must be from ${lowest} to ${highest}`);
 }
 
 /** Return samples in [-1, 1]; throws a RangeError if some are not finite. */
@@ -143,7 +143,7 @@ function clip(samples) {
   const clipped = new Float32Array(samples.length);
   for (let i = 0; i < samples.length; i++) {
     const sample = samples[i];
-    if (!(Math.abs(sample) < Infinity)) throw new RangeError("some samples are not finite; give values in [-1, 1]");
+    if (!(Math.abs(sample) < Infinity)) throw new RangeError("some samples are not finite; they must be in [-1, 1]");
     clipped[i] = sample > 1 ? 1 : sample < -1 ? -1 : sample;
   }
   return clipped;

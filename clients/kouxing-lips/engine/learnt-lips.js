@@ -14,7 +14,7 @@ export class LearntLips {
   #labiodentals;
   #queue = []; // lip frames that are not due yet
   #stable; // the last lip frame, stabilized
-  #shares = [0, 0]; // closure shares of the last two lip frames
+  #shares = [0, 0]; // closure fractions of the last two lip frames
   #hasLipFrames = false;
   #isSpeaking = false;
   #track;

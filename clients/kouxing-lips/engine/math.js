@@ -14,7 +14,7 @@ export function smoothStep(share) {
   return share * share * (3 - 2 * share);
 }
 
-/** Return the share of a change that a one-pole low-pass filter makes in a time, 0 to 1. */
+/** Return the fraction of a change that a one-pole low-pass filter makes in a time, 0 to 1. */
 export function smoothingShare(elapsedS, timeConstantS) {
   return -Math.expm1(-elapsedS / timeConstantS);
 }

@@ -27,7 +27,7 @@ const ARRAYS = {
  *   { values, shape } by name, constants, ... }; it is rejected if a file is missing or of another version
  */
 export async function loadModel(base, { phones = false } = {}) {
-  if (![true, false, FINAL].includes(phones)) throw new RangeError(`phones is ${phones}; give true, false or "${FINAL}"`);
+  if (![true, false, FINAL].includes(phones)) throw new RangeError(`phones is ${phones}; it must be true, false or "${FINAL}"`);
   const files = [...FILES, ...(phones ? [PHONES_FILE] : []), ...(phones === FINAL ? [BLOCKS_FILE] : [])];
   const [ear, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
   const model = JSON.parse(new TextDecoder().decode(header));

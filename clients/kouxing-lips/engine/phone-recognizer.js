@@ -144,7 +144,7 @@ export class PhoneRecognizer {
     if (this.#done === 0 && segments.length > Math.max(0, numBefore) && segments[0].phone === this.#silence) segments = segments.slice(1);
     const emitted = [];
     for (; segments.length < numBefore; numBefore--) {
-      // a surplus phone was emitted and is withdrawn
+      // an extra phone was emitted and is withdrawn
       emitted.push({ ...this.#open.shift(), symbol: this.#symbols[this.#silence], durationS: 0, isFinal: true });
       this.#numFinal++;
     }

@@ -2,7 +2,7 @@
 
 import { Transition } from "./trajectory.js";
 
-/** The share of the ajar mouth in one session. */
+/** The fraction of the ajar mouth in one session. */
 export class RestingLips {
   #c; // constants
   #levels = []; // levels of future frames: [time s, dB]

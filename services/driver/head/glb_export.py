@@ -80,7 +80,7 @@ def export_glb(
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".glb", ".vrm"):
-        raise UserError(f"{path}: give a name that ends in .glb or .vrm")
+        raise UserError(f"{path}: use a name that ends in .glb or .vrm")
     is_avatar = suffix == ".vrm"
     morphs = AVATAR_MORPHS if is_avatar else FAP_MORPHS + ARKIT_MORPHS
     document = GlbDocument()

@@ -87,7 +87,7 @@ def _check_textures(pieces: list[Primitive]) -> None:
 
 
 def _turn_shares(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
-    """Return each node's share of the head rotation: 1 below a node "head", less on the neck."""
+    """Return each node's fraction of the head rotation: 1 below a node "head", less on the neck."""
     share: dict[int, float] = {}
     bones = find_bones(glb)
     for number in nodes:  # parents come first
@@ -274,7 +274,7 @@ def _skinned(
     places: dict[int, Float64],
     turn_shares: dict[int, float],
 ) -> tuple[Float64, Float64 | None]:
-    """Return each vertex's rest matrix (V, 4, 4) and its share of the head rotation (V,)."""
+    """Return each vertex's rest matrix (V, 4, 4) and its fraction of the head rotation (V,)."""
     entry = glb.item("skins", skin)
     joints = [int(joint) for joint in entry["joints"]]
     bones = np.array([places[joint] for joint in joints])

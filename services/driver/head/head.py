@@ -72,7 +72,7 @@ class Head:
     coarse_triangles: tuple[NDArray[np.uint32], ...]  # per part of the coarse head, (C, 3)
     uv: Float32  # (V, 2), v downwards
     colors: Float32  # (V, 3), linear factors on the texture: ambient occlusion and tint
-    head_weight: Float32  # (V,), share of the head rotation, 0 on the shoulders
+    head_weight: Float32  # (V,), fraction of the head rotation, 0 on the shoulders
     basis: sparse.csr_array  # (3 V, 68), displacement by one FAP unit, m
     fapu: dict[str, float]  # MNS MW ENS ES IRISD in m, AU in rad
     feature_points: dict[str, int]  # vertex by point name, such as "2.1"
@@ -99,7 +99,7 @@ class Head:
             file = ASSETS / f"{path}.npz"
         if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
             raise UserError(
-                f"unknown head {str(path)!r}; give the path of a .glb, .gltf, .vrm or .npz, or one"
+                f"unknown head {str(path)!r}; use the path of a .glb, .gltf, .vrm or .npz, or one"
                 f" of {', '.join(HEAD_NAMES)}"
             )
         expected = "a head; make one with kouxing head import"

@@ -31,7 +31,7 @@ def read_mesh(path: Path) -> list[Primitive]:
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise UserError(f"{path}: give a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
+        raise UserError(f"{path}: use a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
     if suffix == ".glb":
         with check_glb(path):
             pieces = read_pieces(Glb(path))

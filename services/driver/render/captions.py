@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 from kouxing.services.driver.render.renderer import UInt8
 from kouxing.shared.fonts import font_for
 
-_TEXT_HEIGHT, _TEXT_WIDTH = 1 / 14, 1 / 20  # largest letters, as shares of the picture
+_TEXT_HEIGHT, _TEXT_WIDTH = 1 / 14, 1 / 20  # largest letters, as fractions of the picture
 _MIN_TEXT_PX = 12.0
 _BAND_HEIGHT, _MARGIN, _SPACE, _JOINT = 1.9, 0.8, 0.5, 0.15  # letter heights
 PAUSE_S = 0.6  # ends a line

@@ -97,7 +97,7 @@ class Renderer:
         on_screen: bool = False,
     ) -> None:
         if width_px < 1 or height_px < 1:
-            raise UserError(f"cannot draw {width_px} x {height_px} pixels; give a positive size")
+            raise UserError(f"cannot draw {width_px} x {height_px} pixels; use a positive size")
         self.head = head
         self.transparent = background is None
         self._background = background
@@ -299,7 +299,7 @@ def _remove_background(pixels: UInt8) -> UInt8:
 
 
 def mouth_light(faps: Float32) -> float:
-    """Return the share of the light on teeth and tongue, 0 to 1, for FAPs (68,).
+    """Return the fraction of the light on teeth and tongue, 0 to 1, for FAPs (68,).
 
     Little light passes a small mouth or protruding lips. The light passes the gap between the lips,
     of height ``h``, onto teeth at a depth ``d``. It increases with ``h`` and decreases with ``d``;

@@ -21,7 +21,7 @@ COLORS = {
 _FRAMINGS = {
     Framing.FACE: (-0.267, 20.0), Framing.HEAD: (-0.25, 26.0), Framing.MOUTH: (-1.20, 6.6),
 }  # fmt: skip
-_RISE = 0.0114  # height of the camera above the center, as a share of its distance
+_RISE = 0.0114  # height of the camera above the center, as a fraction of its distance
 
 
 def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:

@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kouxing.services.driver.render.renderer import Float32, Renderer, UInt8
 
-_CAPTION_SHARE = 1 / 20  # height of the letters, as a share of the picture
+_CAPTION_SHARE = 1 / 20  # height of the letters, as a fraction of the picture
 
 
 class SideBySide:

@@ -101,7 +101,7 @@ def render_picture(
     """
     last_s = frames[-1][0]
     if not 0 <= at_s <= last_s:
-        raise UserError(f"--at {at_s:g} is outside the animation; give 0 to {last_s:g} seconds")
+        raise UserError(f"--at {at_s:g} is outside the animation; use 0 to {last_s:g} seconds")
     times_s = [time_s for time_s, _ in frames]
     after = min(int(np.searchsorted(times_s, at_s, side="right")), len(frames) - 1)
     pair = frames[max(after - 1, 0)], frames[after]

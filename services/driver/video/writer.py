@@ -110,7 +110,7 @@ def check_name(path: Path) -> None:
     """Raise ``UserError`` if a path is not a valid output in an existing folder."""
     if path.suffix not in _FORMATS and not is_sequence(path):
         raise UserError(
-            f"{path}: give a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder,"
+            f"{path}: use a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder,"
             " or a name with a number such as face%05d.png"
         )
     if not path.parent.is_dir():
@@ -156,7 +156,7 @@ class VideoWriter:
             )
         if width_px < 2 or height_px < 2 or width_px % 2 or height_px % 2:
             raise UserError(
-                f"cannot make a video of {width_px} x {height_px} pixels; give even, positive sizes"
+                f"cannot make a video of {width_px} x {height_px} pixels; use even, positive sizes"
             )
         if not 1 <= frame_rate_hz <= 1000:
             raise UserError(

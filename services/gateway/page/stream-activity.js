@@ -8,7 +8,7 @@ export class StreamActivity {
   #lastFrameMs = -Infinity;
   #lastSoundMs = -Infinity;
   #updatedMs = null;
-  #share = 0; // share of the stream's face, 0 to 1; the rest is the face at rest
+  #share = 0; // fraction of the stream's face, 0 to 1; the rest is the face at rest
 
   frameArrived(nowMs) {
     this.#lastFrameMs = nowMs;
@@ -22,7 +22,7 @@ export class StreamActivity {
     return nowMs - this.#lastSoundMs < SILENT_MS && nowMs - this.#lastFrameMs < SILENT_MS;
   }
 
-  /** Return the stream's share of the face to be drawn now, 0 to 1. */
+  /** Return the stream's fraction of the face to be drawn now, 0 to 1. */
   update(nowMs, hasFace) {
     const elapsedMs = nowMs - (this.#updatedMs ?? nowMs);
     this.#updatedMs = nowMs;

@@ -77,7 +77,7 @@ class LastPhone(NamedTuple):
 
     phone: int
     start: int  # frame
-    confidence: float  # share of the contexts' best paths where it is last or last but one
+    confidence: float  # fraction of the contexts' best paths where it is last or last but one
 
 
 class _Hmms(NamedTuple):

@@ -34,7 +34,7 @@ ROUNDED_VISEMES = frozenset({"u", "v", "w", "oe"})
 
 
 def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) -> VisemeShares:
-    """Return the visemes of a phone in order, each with its share of the phone's duration.
+    """Return the visemes of a phone in order, each with its fraction of the phone's duration.
 
     ``next_phone`` is the phone that follows without a pause, if known. Some phones have another
     viseme before a rounded phone.

@@ -29,7 +29,7 @@ _TONGUE_BELOW_TEETH, _TONGUE_HALF_WIDTH = 0.045, 0.27
 _LINE_PX_PER_WIDTH = 0.006
 # bounding box of a mouth at any opening, mouth widths
 WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
-_ANCHORS = {"start": 0.0, "middle": 0.5, "end": 1.0}  # share of a label left of its x
+_ANCHORS = {"start": 0.0, "middle": 0.5, "end": 1.0}  # fraction of a label left of its x
 _SUPERSAMPLING = 3
 
 

@@ -53,7 +53,7 @@ def time_text(
     Raises ``UserError`` if there is no speech, no text, or too much text.
     """
     if not syllables:
-        raise UserError("the text is empty; give the spoken words")
+        raise UserError("the text is empty; write the spoken words")
     if len(syllables) > MAX_SYLLABLES:
         raise UserError(
             f"the text has {len(syllables)} syllables, of at most {MAX_SYLLABLES}; use forced"
@@ -91,7 +91,7 @@ def phone_onsets(
     """Return the onsets of the phones of a syllable, seconds (eq. 5).
 
     The final follows its initial by its influence factor. A third phone (r-coloring) gets its
-    typical share of the remaining time.
+    typical fraction of the remaining time.
     """
     onsets_s = [start_s]
     rest = list(syllable)

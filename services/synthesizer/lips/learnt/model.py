@@ -57,7 +57,7 @@ _REST_S = 0.15  # duration of the way to rest without sound
 _FLUSHED_S = 0.3  # audio whose lip frames may arrive after an interruption
 _MEMORY_S = 0.5
 _TEETH_LOG_ODDS = 1.0  # threshold for a phone f
-_CLOSED_SHARE = 0.5  # lips count as closed from this share of the way to a closure
+_CLOSED_SHARE = 0.5  # lips count as closed from this fraction of the way to a closure
 _JITTER = 10.0  # FAP units: changes of this size are halved, smaller changes are reduced further
 _MAX_FAP = 4000.0  # FAP units; larger values are invalid
 _EPSILON = 1e-6  # FAP units, and FAP units per second
@@ -107,7 +107,7 @@ class LearntStream:
         self._queue: deque[LipPositions] = deque()  # not due yet
         self._newest_s = -np.inf  # time of the newest lip frame
         self._stable = self._neutral  # the last lip frame, stabilized
-        self._shares = (0.0, 0.0)  # closure shares of the last two lip frames
+        self._shares = (0.0, 0.0)  # closure fractions of the last two lip frames
         self._has_lip_frames = False
         self._is_speaking = False
         self._flushed_until_s = -np.inf  # ignore lip frames of the audio up to here
@@ -117,7 +117,7 @@ class LearntStream:
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._rest: RestTransition | None = None  # set while media time stands still
         self._resting = RestingLips()
-        self._ajar = 0.0  # share of the ajar mouth at the last frame
+        self._ajar = 0.0  # fraction of the ajar mouth at the last frame
         self._late_s = 0.0  # lateness of the newest lip frame
         self._time_s = start_s  # time of the last frame
         self._mouth = still(self._neutral)

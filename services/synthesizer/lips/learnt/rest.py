@@ -7,7 +7,7 @@ its training data rests closed.
 ======  =========================================================  ====
 symbol  meaning                                                    unit
 ======  =========================================================  ====
-s       share of the way from the predicted mouth to an ajar one   1
+s       fraction of the way from the predicted mouth to an ajar one   1
 ======  =========================================================  ====
 
     goal of s = 1  from the start of a pause for at most HOLD_S,
@@ -60,7 +60,7 @@ AJAR = np.array([_AJAR_FAPS.get(fap, 0.0) for fap in MOUTH_FAPS])  # (num_mouth_
 
 
 class RestingLips:
-    """The share of the ajar mouth in one session."""
+    """The fraction of the ajar mouth in one session."""
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
