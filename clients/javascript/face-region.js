@@ -4,6 +4,9 @@ import * as THREE from "three";
 
 const MIN_SHARE = 0.1; // fraction of the largest displacement; vertices that move less are not in the region
 const MAX_HEAD = 3; // height of a head, relative to the region from chin to brows
+const MAX_TALL = 2; // height of a head whose mesh also has a body, relative to the same region
+const MAX_TALL_OF_MOUTH = 5; // the same, relative to the region of shapes that move only the mouth
+const MAX_TILT = 0.17; // angle between the eyes and the x axis that is not corrected
 const MAX_APART = 2; // distance of the parts of one face, in sizes of a part
 const STEEPER = 1.5; // how much farther the mouth is below the eyes along an axis that replaces y
 
@@ -26,40 +29,51 @@ export class FaceRegion {
     }
   }
 
-  /** The rotation after which y is up and the face looks along z. */
+  /** The rotation after which y is up and the face looks along z; it also undoes a mirroring. */
   get upright() {
     const [left, right, mouth] = [/^eyeBlinkLeft|^blinkLeft/, /^eyeBlinkRight|^blinkRight/, /^jawOpen|^aa/].map((name) =>
       centerOf(this.#union(({ shape }) => name.test(shape))),
     );
     const side = left.clone().sub(right);
     const up = left.add(right).divideScalar(2).sub(mouth);
-    if (![...side, ...up].every(Number.isFinite) || side.length() === 0) return new THREE.Quaternion();
+    const turn = new THREE.Matrix4();
+    if (![...side, ...up].every(Number.isFinite) || side.length() === 0) return turn;
     const largest = (vector) => [0, 1, 2].reduce((a, b) => (Math.abs(vector.getComponent(b)) > Math.abs(vector.getComponent(a)) ? b : a));
     const x = largest(side);
-    const y = x === 1 ? 2 : 1;
+    let y = x === 1 ? 2 : 1;
     const other = 3 - x - y;
-    const isOther = Math.abs(up.getComponent(other)) > STEEPER * Math.abs(up.getComponent(y));
+    if (Math.abs(up.getComponent(other)) > STEEPER * Math.abs(up.getComponent(y))) y = other;
     const xAxis = new THREE.Vector3().setComponent(x, Math.sign(side.getComponent(x)));
-    const yAxis = new THREE.Vector3().setComponent(isOther ? other : y, isOther ? Math.sign(up.getComponent(other)) : 1);
-    const basis = new THREE.Matrix4().makeBasis(xAxis, yAxis, xAxis.clone().cross(yAxis));
-    return new THREE.Quaternion().setFromRotationMatrix(basis).invert();
+    const yAxis = new THREE.Vector3().setComponent(y, up.getComponent(y) < 0 ? -1 : 1);
+    const zAxis = xAxis.clone().cross(yAxis);
+    if (this.#parts.some(({ shape, mesh }) => isMouth(shape) && mesh.matrixWorld.determinant() < 0)) zAxis.negate();
+    turn.makeBasis(xAxis, yAxis, zAxis).invert();
+    const [found, wanted] = [side.applyMatrix4(turn).normalize(), new THREE.Vector3(1, 0, 0)];
+    if (found.angleTo(wanted) < MAX_TILT) return turn;
+    return turn.premultiply(new THREE.Matrix4().makeRotationFromQuaternion(new THREE.Quaternion().setFromUnitVectors(found, wanted)));
   }
 
-  /** The head: { center, height }. A mesh that also has a body counts only where the face moves. */
+  /** The head: { center, height }. A mesh that also has a body counts only above the chin. */
   get bounds() {
     const moved = this.#union(() => true);
     const whole = new THREE.Box3();
     for (const mesh of new Set(this.#parts.map((part) => part.mesh))) whole.expandByObject(mesh);
     const height = sizeOf(moved).y;
-    const isHead = height === 0 || sizeOf(whole).y <= MAX_HEAD * height;
-    return isHead
-      ? { center: centerOf(whole), height: sizeOf(whole).y }
-      : { center: centerOf(moved), height: (MAX_HEAD / 2) * height };
+    if (height === 0 || sizeOf(whole).y <= MAX_HEAD * height) return { center: centerOf(whole), height: sizeOf(whole).y };
+    const limit = this.#parts.every(({ shape }) => isMouth(shape)) ? MAX_TALL_OF_MOUTH : MAX_TALL;
+    const center = centerOf(moved);
+    moved.max.y = Math.min(whole.max.y, moved.min.y + limit * height);
+    center.y = centerOf(moved).y;
+    return { center, height: sizeOf(moved).y };
   }
 
   #union(isWanted) {
     return this.#parts.filter(isWanted).reduce((union, { box }) => union.union(box), new THREE.Box3());
   }
+}
+
+function isMouth(shape) {
+  return !/eye|brow|cheek|nose|blink|look/.test(shape);
 }
 
 function centerOf(box) {

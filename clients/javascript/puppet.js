@@ -11,6 +11,7 @@ import { MorphedMesh } from "./page/morph.js";
 import { chooseSet, findShapes } from "./shape-names.js";
 
 const UNREADABLE = { DRACOLoader: "KHR_draco_mesh_compression", KTX2: "KHR_texture_basisu" }; // by words of three.js
+const DAMAGED = "it is not a GLB or VRM file, or it is damaged; export it again, or choose another file";
 const VIEW_HEIGHT = 1.6; // height of the camera's view, relative to the face
 const VRM_FACE_M = 0.24;
 const JAW_BONE = /(^|[.:|_ ])(jaw|jawroot|lowerjaw)$/i;
@@ -39,7 +40,7 @@ export async function loadPuppet(url) {
     const word = Object.keys(UNREADABLE).find((key) => error.message.includes(key));
     let text = error.message;
     if (word) text = `it needs ${UNREADABLE[word]}, which kouxing cannot read; export it without`;
-    if (error instanceof SyntaxError) text = "it is not a GLB or VRM file; choose another file";
+    if ([SyntaxError, RangeError, TypeError].includes(error.constructor)) text = DAMAGED;
     throw new Error(url.startsWith("blob:") ? `cannot show this file: ${text}` : `${url}: ${text}`, { cause: error });
   }
 }
@@ -47,25 +48,50 @@ export async function loadPuppet(url) {
 async function readAvatar(url) {
   const loader = new GLTFLoader().register((parser) => new VRMLoaderPlugin(parser));
   loader.setMeshoptDecoder(MeshoptDecoder).setDRACOLoader(globalThis.Worker ? new DRACOLoader() : null);
-  const { scene, parser, userData } = await loader.loadAsync(url);
+  loader.register(({ json }) => ({ name: "kouxing", beforeRoot: () => checkTextures(json) }));
+  const data = await fetchFile(url);
+  const { scene, parser, userData } = await loader.parseAsync(data, THREE.LoaderUtils.extractUrlBase(url));
   const kouxing = scene.getObjectByName("kouxing")?.userData.kouxing;
   scene.updateMatrixWorld(true);
   const meshes = [];
   scene.traverse((node) => {
     node.frustumCulled = false; // its bounds do not follow the face
-    if (node.morphTargetInfluences) meshes.push({ mesh: node, names: targetNames(node, parser) });
+    if (node.isMesh && node.morphTargetInfluences) meshes.push({ mesh: node, names: targetNames(node, parser) });
   });
-  if (userData.vrm) return vrmAvatar(userData.vrm, meshes);
   const isHead = kouxing?.faps.some(({ name }) => meshes[0]?.names.includes(name));
-  return isHead ? kouxingHead(scene, meshes, kouxing) : morphAvatar(scene, meshes);
+  let avatar;
+  if (userData.vrm) avatar = vrmAvatar(userData.vrm, meshes);
+  else avatar = isHead ? kouxingHead(scene, meshes, kouxing) : morphAvatar(scene, meshes);
+  if (!(avatar.view.height > 0 && avatar.view.height < Infinity)) throw new Error("its face has no size; export it again");
+  return avatar;
 }
 
-/** Return the names of a mesh's morph targets. Programs write them in different places. */
+async function fetchFile(url) {
+  const answer = await fetch(url).catch(({ message }) => {
+    throw new Error(`cannot be loaded (${message}); check the address`);
+  });
+  if (!answer.ok) throw new Error(`cannot be loaded (${answer.status} ${answer.statusText}); check the address`);
+  return answer.arrayBuffer();
+}
+
+/** Throw an error if a texture has only an image that needs an extension that cannot be read. */
+function checkTextures({ textures = [] }) {
+  if (textures.some(({ source, extensions = {} }) => source === undefined && "KHR_texture_basisu" in extensions)) {
+    throw new Error(Object.keys(UNREADABLE)[1]);
+  }
+}
+
+/** Return the names of a mesh's morph targets, "" without effect. Programs write them in different places. */
 function targetNames(mesh, { json, associations }) {
   const { meshes, primitives = 0 } = associations.get(mesh);
   const { targets, extras } = json.meshes[meshes].primitives[primitives];
-  const names = extras?.targetNames ?? json.meshes[meshes].extras?.targetNames;
-  return targets.map(({ POSITION }, i) => names?.[i] ?? json.accessors[POSITION]?.name ?? String(i));
+  const names = [extras, json.meshes[meshes].extras].map((found) => found?.targetNames).find(Array.isArray);
+  return targets.map(({ POSITION }, i) => (moves(mesh, i) ? String(names?.[i] ?? json.accessors[POSITION].name ?? i) : ""));
+}
+
+/** Return whether a morph target moves vertices. */
+function moves({ geometry }, index) {
+  return geometry.morphAttributes.position?.[index]?.array.some((value) => value !== 0) ?? false;
 }
 
 function kouxingHead(scene, meshes, { faps, camera }) {
@@ -94,7 +120,7 @@ function morphAvatar(scene, meshes) {
   const turnJaw = findJaw(scene, targets);
   const region = new FaceRegion(targets);
   const upright = new THREE.Group().add(scene);
-  upright.quaternion.copy(region.upright);
+  upright.applyMatrix4(region.upright);
   upright.updateMatrixWorld(true);
   const { center, height } = new FaceRegion(targets).bounds;
   return {
@@ -143,7 +169,9 @@ function isMovedBy(mesh, bone) {
 
 function vrmAvatar(vrm, meshes) {
   VRMUtils.rotateVRM0(vrm); // version 0 faces the other way
-  const names = vrm.expressionManager?.expressions.map(({ expressionName }) => expressionName) ?? [];
+  vrm.scene.updateMatrixWorld(true);
+  const expressions = (vrm.expressionManager?.expressions ?? []).filter(({ binds }) => binds.some(hasEffect));
+  const names = expressions.map(({ expressionName }) => expressionName);
   let speaking = null; // by morph targets, if the expressions do not suffice
   let set;
   try {
@@ -160,13 +188,13 @@ function vrmAvatar(vrm, meshes) {
   const turnsEyes = speaking?.turnsEyes || [...shapes.values()].some((shape) => shape.startsWith("eyeLook"));
   const lookAt = !turnsEyes && vrm.lookAt?.applier instanceof VRMLookAtBoneApplier ? vrm.lookAt : null;
   const head = vrm.humanoid.getRawBoneNode("head");
-  vrm.scene.updateMatrixWorld(true);
   const target = head.getWorldPosition(new THREE.Vector3());
-  target.y += VRM_FACE_M / 4; // the bone is at the end of the neck
+  const faceHeight = VRM_FACE_M * head.getWorldScale(new THREE.Vector3()).y;
+  target.y += faceHeight / 4; // the bone is at the end of the neck
   return {
     scene: vrm.scene,
     set,
-    view: { target, height: VIEW_HEIGHT * VRM_FACE_M },
+    view: { target, height: VIEW_HEIGHT * faceHeight },
     pose(weights, shapeNames) {
       speaking?.pose(weights, shapeNames);
       const weightOf = new Map(shapeNames.map((name, i) => [name, weights[i]]));
@@ -177,6 +205,11 @@ function vrmAvatar(vrm, meshes) {
       vrm.update(seconds);
     },
   };
+}
+
+/** Return whether a bind of an expression moves vertices or changes a material. */
+function hasEffect({ primitives, index }) {
+  return primitives === undefined || primitives.some((mesh) => moves(mesh, index));
 }
 
 /** Rotate the eyes of a VRM that has eye bones instead of expressions. */

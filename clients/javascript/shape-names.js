@@ -1,7 +1,7 @@
 // Names that avatars give to their shapes. The table is shared/face/shape_names.txt, and
 // shared/face/shape_names.py explains it.
 
-const TABLE = `arkit *jawOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
+const TABLE = `arkit *jawOpen=mouthOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
  *mouthPucker=Mouth_Pucker_Up_L+Mouth_Pucker_Up_R+Mouth_Pucker_Down_L+Mouth_Pucker_Down_R
  mouthFunnel=Mouth_Funnel_Up_L+Mouth_Funnel_Up_R+Mouth_Funnel_Down_L+Mouth_Funnel_Down_R
  mouthRollLower=Mouth_Roll_In_Lower_L+Mouth_Roll_In_Lower_R mouthShrugLower mouthShrugUpper
@@ -28,7 +28,7 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
  blinkLeft=EYE_Close_L blinkRight=EYE_Close_R lookUp lookDown lookLeft lookRight
 `;
 const TITLES = { arkit: "ARKit", oculus: "Oculus", vrm: "VRM" };
-const SEPARATOR = /[._:|/\- ]|eCTRL/g;
+const SEPARATOR = /[._:|/\- ]|eCTRL|(?<=[a-z])(?=[A-Z])/g;
 
 /** Return the shape of each recognized name of a mesh, by name. */
 export function findShapes(set, names) {
@@ -69,10 +69,10 @@ export function chooseSet(names) {
   );
 }
 
-/** Write the side at the end of a name as a word. */
+/** Remove a number at the end of a name, and write the side before it as a word. */
 function sided(name) {
   return name
-    .replace(/_div\d$/, "") // suffix that Daz appends
+    .replace(/[._ ](div)?\d+$/, "") // Blender appends .001, Daz _div2
     .replace(/(?:[._\- ][Ll]|(?<=[a-z])L)$/, "Left")
     .replace(/(?:[._\- ][Rr]|(?<=[a-z])R)$/, "Right");
 }
@@ -87,7 +87,7 @@ function candidates(name) {
   const keys = [toKey(text)];
   for (const { 0: separator, index } of text.matchAll(SEPARATOR)) {
     const key = toKey(text.slice(index + separator.length));
-    if (key.length > 1 || ".:|/".includes(separator)) keys.push(key);
+    if (key.length > (separator ? 1 : 6) || [...".:|/"].includes(separator)) keys.push(key);
   }
   return keys;
 }

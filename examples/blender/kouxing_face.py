@@ -50,7 +50,7 @@ LIVE_LINK_ORDER = (
 
 # shared/face/shape_names.txt, explained in shared/face/shape_names.py
 SHAPE_NAMES = """
-arkit *jawOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
+arkit *jawOpen=mouthOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
  *mouthPucker=Mouth_Pucker_Up_L+Mouth_Pucker_Up_R+Mouth_Pucker_Down_L+Mouth_Pucker_Down_R
  mouthFunnel=Mouth_Funnel_Up_L+Mouth_Funnel_Up_R+Mouth_Funnel_Down_L+Mouth_Funnel_Down_R
  mouthRollLower=Mouth_Roll_In_Lower_L+Mouth_Roll_In_Lower_R mouthShrugLower mouthShrugUpper
@@ -77,12 +77,12 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
  blinkLeft=EYE_Close_L blinkRight=EYE_Close_R lookUp lookDown lookLeft lookRight
 """
 TITLES = {"arkit": "ARKit", "oculus": "Oculus", "vrm": "VRM"}
-SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL")
+SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL|(?<=[a-z])(?=[A-Z])")
 
 
 def sided(name):
-    """Write the side at the end of a name as a word."""
-    name = re.sub(r"_div\d$", "", name)  # suffix that Daz appends
+    """Remove a number at the end of a name, and write the side before it as a word."""
+    name = re.sub(r"[._ ](div)?\d+$", "", name)  # Blender appends .001, Daz _div2
     name = re.sub(r"([._\- ][Ll]|(?<=[a-z])L)$", "Left", name)
     return re.sub(r"([._\- ][Rr]|(?<=[a-z])R)$", "Right", name)
 
@@ -96,7 +96,8 @@ def candidates(name):
     """Return the keys of a name without none, one, two, ... words at its beginning."""
     name = sided(name)
     rests = [(found[0], to_key(name[found.end() :])) for found in SEPARATOR.finditer(name)]
-    return [to_key(name), *(key for mark, key in rests if len(key) > 1 or mark in ".:|/")]
+    least = {"": 7, **dict.fromkeys(".:|/", 0)}  # letters of a name after this separator
+    return [to_key(name), *(key for mark, key in rests if len(key) >= least.get(mark, 2))]
 
 
 def read_table():

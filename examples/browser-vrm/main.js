@@ -24,7 +24,8 @@ const { vrm, renderer } = await start().catch((error) => {
   throw error;
 });
 const expressions = vrm.expressionManager;
-const nameOf = new Map((expressions?.expressions ?? []).map(({ expressionName }) => [plain(expressionName), expressionName]));
+const moving = (expressions?.expressions ?? []).filter(({ binds }) => binds.length > 0); // some exporters write empty ones
+const nameOf = new Map(moving.map(({ expressionName }) => [plain(expressionName), expressionName]));
 const head = vrm.humanoid.getNormalizedBoneNode("head");
 const forward = vrm.meta.metaVersion === "0" ? -1 : 1; // the bones of version 0 look along -z
 const scene = new THREE.Scene();

@@ -3,7 +3,7 @@
 class_name KouxingShapeNames
 
 const TABLE := """
-arkit *jawOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
+arkit *jawOpen=mouthOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
  *mouthPucker=Mouth_Pucker_Up_L+Mouth_Pucker_Up_R+Mouth_Pucker_Down_L+Mouth_Pucker_Down_R
  mouthFunnel=Mouth_Funnel_Up_L+Mouth_Funnel_Up_R+Mouth_Funnel_Down_L+Mouth_Funnel_Down_R
  mouthRollLower=Mouth_Roll_In_Lower_L+Mouth_Roll_In_Lower_R mouthShrugLower mouthShrugUpper
@@ -31,8 +31,8 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
 """
 const TITLES := {"arkit": "ARKit", "oculus": "Oculus", "vrm": "VRM"}
 
-static var _separator := RegEx.create_from_string("[._:|/\\- ]|eCTRL")
-static var _div := RegEx.create_from_string("_div\\d$")
+static var _separator := RegEx.create_from_string("[._:|/\\- ]|eCTRL|(?<=[a-z])(?=[A-Z])")
+static var _number := RegEx.create_from_string("[._ ](div)?\\d+$")  # .001 of Blender, _div2 of Daz
 static var _left := RegEx.create_from_string("([._\\- ][Ll]|(?<=[a-z])L)$")
 static var _right := RegEx.create_from_string("([._\\- ][Rr]|(?<=[a-z])R)$")
 static var _sets := _read_table()
@@ -102,9 +102,9 @@ static func _nearest(share: Dictionary, set_names: Array) -> String:
 	return best
 
 
-## Write the side at the end of a name as a word.
+## Remove a number at the end of a name, and write the side before it as a word.
 static func _sided(name: String) -> String:
-	return _right.sub(_left.sub(_div.sub(name, ""), "Left"), "Right")
+	return _right.sub(_left.sub(_number.sub(name, ""), "Left"), "Right")
 
 
 static func _to_key(name: String) -> String:
@@ -117,7 +117,8 @@ static func _candidates(name: String) -> Array:
 	var keys := [_to_key(text)]
 	for separator in _separator.search_all(text):
 		var key := _to_key(text.substr(separator.get_end()))
-		if key.length() > 1 or separator.get_string() in ".:|/":
+		var mark := separator.get_string()
+		if key.length() > (1 if mark else 6) or (mark and mark in ".:|/"):
 			keys.append(key)
 	return keys
 

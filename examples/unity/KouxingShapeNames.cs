@@ -9,7 +9,7 @@ using System.Text.RegularExpressions;
 public static class KouxingShapeNames
 {
     const string Table = @"
-arkit *jawOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
+arkit *jawOpen=mouthOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthRight tongueOut
  *mouthPucker=Mouth_Pucker_Up_L+Mouth_Pucker_Up_R+Mouth_Pucker_Down_L+Mouth_Pucker_Down_R
  mouthFunnel=Mouth_Funnel_Up_L+Mouth_Funnel_Up_R+Mouth_Funnel_Down_L+Mouth_Funnel_Down_R
  mouthRollLower=Mouth_Roll_In_Lower_L+Mouth_Roll_In_Lower_R mouthShrugLower mouthShrugUpper
@@ -45,7 +45,7 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
 
     static readonly Dictionary<string, string> Titles = new Dictionary<string, string>
         { ["arkit"] = "ARKit", ["oculus"] = "Oculus", ["vrm"] = "VRM" };
-    static readonly Regex Separator = new Regex(@"[._:|/\- ]|eCTRL");
+    static readonly Regex Separator = new Regex(@"[._:|/\- ]|eCTRL|(?<=[a-z])(?=[A-Z])");
     static readonly Dictionary<string, List<Entry>> Sets = ReadTable();
 
     /// Return the shape of each recognized name of a mesh, by name.
@@ -87,10 +87,10 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
             + "use an avatar with the shapes of ARKit, Oculus or VRM");
     }
 
-    /// Write the side at the end of a name as a word.
+    /// Remove a number at the end of a name, and write the side before it as a word.
     static string Sided(string name)
     {
-        name = Regex.Replace(name, @"_div\d$", ""); // of Daz
+        name = Regex.Replace(name, @"[._ ](div)?\d+$", ""); // Blender appends .001, Daz _div2
         name = Regex.Replace(name, @"([._\- ][Ll]|(?<=[a-z])L)$", "Left");
         return Regex.Replace(name, @"([._\- ][Rr]|(?<=[a-z])R)$", "Right");
     }
@@ -105,7 +105,8 @@ vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
         foreach (Match separator in Separator.Matches(name))
         {
             string key = ToKey(name.Substring(separator.Index + separator.Length));
-            if (key.Length > 1 || ".:|/".Contains(separator.Value)) yield return key;
+            int least = separator.Length == 0 ? 7 : ".:|/".Contains(separator.Value) ? 0 : 2;
+            if (key.Length >= least) yield return key;
         }
     }
 

@@ -5,8 +5,9 @@ contain the same table. Each line or continuation belongs to a set. An entry is 
 other names, ``shape=OTHER=PART+PART``; a sum of parts also forms the shape. An avatar can speak if
 it has the first shape of a set, and speaks well if it has all shapes with ``*``.
 
-Names match in any case, after any prefix, and with ``_L``, ``.L`` or ``Left`` at the end. A name of
-one letter matches only without a prefix or after ``.``, ``:``, ``|`` or ``/``.
+Names match in any case, after any prefix, before a number (``.001``), and with ``_L``, ``.L`` or
+``Left`` at the end. A name of one letter matches only without a prefix or after ``.``, ``:``, ``|``
+or ``/``. After a prefix without a separator (``bsJawOpen``), only names of 7 or more letters match.
 """
 
 import re
@@ -29,7 +30,7 @@ class ShapeSetName(StrEnum):
 
 TABLE = Path(__file__).with_name("shape_names.txt").read_text(encoding="utf-8")
 _TITLES = {"arkit": "ARKit", "oculus": "Oculus", "vrm": "VRM"}
-_SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL")
+_SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL|(?<=[a-z])(?=[A-Z])")
 _SIDES = {"L": "Left", "R": "Right"}
 
 
@@ -79,8 +80,8 @@ def _key(name: str) -> str:
 
 
 def _sided(name: str) -> str:
-    """Write the side at the end as a word."""
-    name = re.sub(r"_div\d$", "", name)  # suffix that Daz appends
+    """Remove a number at the end, and write the side before it as a word."""
+    name = re.sub(r"[._ ](div)?\d+$", "", name)  # Blender appends .001, Daz _div2
     return re.sub(
         r"(?:[._\- ]([LRlr])|(?<=[a-z])([LR]))$",
         lambda match: _SIDES[(match[1] or match[2]).upper()],
@@ -94,7 +95,8 @@ def _candidates(name: str) -> Iterator[str]:
     yield _key(name)
     for separator in _SEPARATOR.finditer(name):
         key = _key(name[separator.end() :])
-        if len(key) > 1 or separator[0] in ".:|/":
+        mark = separator[0]
+        if len(key) > (1 if mark else 6) or mark in tuple(".:|/"):
             yield key
 
 

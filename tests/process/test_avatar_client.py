@@ -16,20 +16,36 @@ CLIENT = ROOT / "clients" / "javascript"
 ARKIT = ["jawOpen", "mouthPucker", "eyeBlinkLeft", "eyeBlinkRight"]
 VRCHAT = [f"vrc.v_{viseme}" for viseme in ("sil", "pp", "aa", "ih", "oh", "ou")]
 VOWELS = ["A", "I", "U", "E", "O"]
+TURNS: dict[str, dict[str, list[float]]] = {
+    "z up": {"rotation": [2**-0.5, 0, 0, 2**-0.5]},
+    "upside down": {"rotation": [0, 0, 1, 0]},
+    "oblique": {"rotation": [0, np.sin(0.3), 0, np.cos(0.3)]},
+    "mirrored": {"scale": [1, 1, -1]},
+}
+DAMAGED = "it is not a GLB or VRM file, or it is damaged; export it again"
 CANNOT = "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit; use an avatar"
 LOOK = """
 import { readFileSync } from "node:fs";
 globalThis.self = globalThis;
 globalThis.ProgressEvent = Event;
 console.warn = console.error = () => {};
+const THREE = await import("three");
 const { loadPuppet } = await import("./puppet.js");
 for (const file of process.argv.slice(2)) {
   try {
     const url = "data:;base64," + readFileSync(file).toString("base64");
     const { scene, set, view, pose } = await loadPuppet(url);
-    pose([1], ["jawOpen"]);
+    pose([1], [set === "arkit" ? "jawOpen" : "aa"]);
     const jaw = 2 * Math.acos(scene.getObjectByName("CC_Base_JawRoot")?.quaternion.w ?? 1);
-    console.log(JSON.stringify({ set, target: view.target.toArray(), height: view.height, jaw }));
+    const eyes = new THREE.Box3();
+    for (const side of ["EyeL", "EyeR"]) eyes.expandByObject(scene.getObjectByName(side) ?? scene);
+    const center = eyes.getCenter(new THREE.Vector3()).sub(view.target).toArray();
+    let opening = 0;
+    scene.traverse((node) => {
+      opening = Math.max(opening, ...(node.morphTargetInfluences ?? []));
+    });
+    const target = view.target.toArray();
+    console.log(JSON.stringify({ set, target, height: view.height, jaw, eyes: center, opening }));
   } catch (error) {
     console.log(JSON.stringify({ error: error.message.replace(/^data:[^:]*: /, "") }));
   }
@@ -61,6 +77,14 @@ def face(shapes: list[str]) -> list[Mesh]:
     return [*eyes, box("Head", (0, 1.65, 0), 0.2, shapes)]
 
 
+def column(shapes: list[str]) -> Mesh:
+    """Make a body from the floor to the top of its head, whose chin and mouth each shape lowers."""
+    heights = np.repeat([0, 1.55, 1.6, 1.75], 3)
+    points = np.stack([np.tile([-0.1, 0.1, 0], 4), heights, np.tile([0, 0, 0.1], 4)], axis=1)
+    moved = np.outer((heights > 0) & (heights < 1.7), [0, -0.02, 0])
+    return Mesh("Body", points, np.arange(12).reshape(4, 3), dict.fromkeys(shapes, moved))
+
+
 def change(path: Path, kind: str) -> None:
     if kind == "jaw bone":
         bones = [{"name": "CC_Base_Head"}, {"name": "CC_Base_JawRoot"}]
@@ -68,10 +92,21 @@ def change(path: Path, kind: str) -> None:
         return
     document, binary = read_chunks(path)
     nodes = document["scenes"][0]["nodes"]
-    if kind == "z up":
-        turn = {"rotation": [2**-0.5, 0, 0, 2**-0.5], "scale": [100, 100, 100]}
+    if kind in TURNS:
+        turn = TURNS[kind] | {"scale": [100 * x for x in TURNS[kind].get("scale", (1, 1, 1))]}
         document["nodes"].append(turn | {"children": nodes})
         document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+    elif kind == "no effect":
+        binary[:] = bytes(len(binary))
+    elif kind == "empty expressions":
+        add_humanoid(document)
+    elif kind == "cut off":
+        path.write_bytes(path.read_bytes()[:-100])
+        return
+    elif kind == "texture":
+        texture = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+        document |= {"textures": [texture], "images": [{"bufferView": 0, "mimeType": "image/ktx2"}]}
+        document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     elif kind == "twice":
         document["nodes"].append(document["nodes"][2] | {"translation": [1, 0, 0]})
         nodes.append(len(document["nodes"]) - 1)
@@ -87,13 +122,42 @@ def change(path: Path, kind: str) -> None:
     write_chunks(path, document, binary)
 
 
+def add_humanoid(document: dict[str, Any]) -> None:
+    """Make a VRM in centimeters whose expressions move nothing, as some exporters write."""
+    bones = {"head": len(document["nodes"])}
+    limbs = {"Arm": ("UpperArm", "LowerArm", "Hand"), "Leg": ("UpperLeg", "LowerLeg", "Foot")}
+    names = [
+        side + part for side in ("left", "right") for parts in limbs.values() for part in parts
+    ]
+    for name in ("hips", "spine", *names):
+        bones[name] = len(document["nodes"]) + len(bones)
+    document["nodes"] += [{"translation": [0, 1.6, 0]}, *({} for _ in list(bones)[1:])]
+    root = {"children": list(range(len(document["nodes"]))), "scale": [100, 100, 100]}
+    document["nodes"].append(root)
+    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+    document["extensionsUsed"] = ["VRMC_vrm"]
+    document["extensions"] = {
+        "VRMC_vrm": {
+            "specVersion": "1.0",
+            "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
+            "humanoid": {"humanBones": {bone: {"node": node} for bone, node in bones.items()}},
+            "expressions": {"preset": {"aa": {"morphTargetBinds": []}}},
+        }
+    }
+
+
 FILES: dict[str, tuple[list[Mesh], str]] = {
     "rpm": (face(ARKIT), ""),
     "head first": (face(ARKIT)[::-1], ""),
     "primitives": (face(ARKIT), "primitives"),
     "vrchat": (face(VRCHAT), ""),
     "vowels": (face(VOWELS), ""),
-    "z up": (face(ARKIT), "z up"),
+    **{kind: (face(ARKIT), kind) for kind in TURNS},
+    "vrm": (face(VOWELS), "empty expressions"),
+    "body": ([column(VOWELS)], ""),
+    "no effect": (face(ARKIT), "no effect"),
+    "cut off": (face(ARKIT), "cut off"),
+    "texture": (face(ARKIT), "texture"),
     "twice": (face(ARKIT), "twice"),
     "teeth": ([*face(ARKIT), box("Teeth", (0, 1.6, 0.05), 0.04, [])], "jaw bone"),
     "chin": ([*face(ARKIT), box("Chin", (0, 1.6, 0.05), 0.04, ["jawOpen"])], "jaw bone"),
@@ -149,8 +213,24 @@ def test_the_jaw_bone_turns_only_for_parts_without_shapes(
     assert found["chin"]["jaw"] == 0
 
 
-def test_turns_a_face_upright(found: dict[str, dict[str, Any]]) -> None:
-    assert found["z up"]["target"] == pytest.approx([0, 165, 0], abs=1)
+def test_frames_the_head_if_only_the_mouth_of_a_body_moves(
+    found: dict[str, dict[str, Any]],
+) -> None:
+    assert found["body"]["target"][:2] == pytest.approx([0, 1.65], abs=0.01)
+    assert found["body"]["height"] == pytest.approx(0.35, abs=0.01)  # above 1.55 m
+
+
+@pytest.mark.parametrize("kind", TURNS)
+def test_turns_a_face_upright(found: dict[str, dict[str, Any]], kind: str) -> None:
+    assert found[kind]["eyes"] == pytest.approx([0, 5, 9], abs=1)
+
+
+def test_a_vrm_speaks_by_morph_targets_if_its_expressions_move_nothing(
+    found: dict[str, dict[str, Any]],
+) -> None:
+    assert found["vrm"]["set"] == "vrm"
+    assert found["vrm"]["opening"] == 1
+    assert found["vrm"]["height"] == pytest.approx(38.4)  # in centimeters
 
 
 @pytest.mark.parametrize(
@@ -159,6 +239,9 @@ def test_turns_a_face_upright(found: dict[str, dict[str, Any]]) -> None:
         ("unnamed", CANNOT),
         ("no face", CANNOT),
         ("blink", CANNOT),
+        ("no effect", CANNOT),
+        ("cut off", DAMAGED),
+        ("texture", "it needs KHR_texture_basisu, which kouxing cannot read"),
         ("twice", "it has several faces; export only one avatar"),
         ("draco", "it needs KHR_draco_mesh_compression, which kouxing cannot read"),
     ],

@@ -18,6 +18,8 @@ MESHES = [
     "I U E O",
     "happy Blink",
     "jawOpen",
+    "jawOpen.001 bsMouthPucker mouthSmile_L_2 headAa",
+    "mouthOpen mouthSmile A_1 eyeBlinkLeft",
     "0 1 2",
 ]
 SETS = ("arkit", "oculus", "vrm")

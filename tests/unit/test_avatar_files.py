@@ -30,6 +30,15 @@ def edit(path: Path, change: Callable[[dict[str, Any], bytearray], None]) -> Pat
     return path
 
 
+def content(
+    document: dict[str, Any], binary: bytearray, accessor: int, kind: str
+) -> tuple[slice, NDArray[Any]]:
+    """Return the place of an accessor in the binary chunk, and its rows of three numbers."""
+    view = document["bufferViews"][document["accessors"][accessor]["bufferView"]]
+    place = slice(view["byteOffset"], view["byteOffset"] + view["byteLength"])
+    return place, np.frombuffer(bytes(binary[place]), kind).reshape(-1, 3)
+
+
 def names_in_primitives(document: dict[str, Any], _binary: bytearray) -> None:
     for mesh in document["meshes"]:
         mesh["primitives"][0]["extras"] = mesh.pop("extras", {})
@@ -55,6 +64,45 @@ def sideways(document: dict[str, Any], binary: bytearray) -> None:
     document["nodes"][-1]["rotation"] = [0, 2**-0.5, 0, 2**-0.5]
 
 
+def oblique(document: dict[str, Any], binary: bytearray) -> None:
+    z_up_in_centimeters(document, binary)
+    document["nodes"][-1]["rotation"] = [0, np.sin(0.3), 0, np.cos(0.3)]
+
+
+def upside_down(document: dict[str, Any], binary: bytearray) -> None:
+    z_up_in_centimeters(document, binary)
+    document["nodes"][-1]["rotation"] = [0, 0, 1, 0]
+
+
+def mirrored(document: dict[str, Any], binary: bytearray) -> None:
+    z_up_in_centimeters(document, binary)
+    document["nodes"][-1] |= {"scale": [1, 1, -1], "rotation": [0, 0, 0, 1]}
+
+
+def one_eye_mirrored(document: dict[str, Any], binary: bytearray) -> None:
+    node = next(node for node in document["nodes"] if node["name"] == "eye_right")
+    primitive = document["meshes"][node["mesh"]]["primitives"][0]
+    place, points = content(document, binary, primitive["attributes"]["POSITION"], "<f4")
+    binary[place] = (points * np.array([-1, 1, 1], "<f4")).tobytes()
+    place, corners = content(document, binary, primitive["indices"], "<u4")
+    binary[place] = corners[:, ::-1].tobytes()
+    node["scale"] = [-1, 1, 1]
+
+
+def lights(document: dict[str, Any], _binary: bytearray) -> None:
+    document["extensionsRequired"] = ["KHR_lights_punctual"]
+
+
+def texture_of_an_extension(document: dict[str, Any], _binary: bytearray) -> None:
+    for texture in document["textures"]:
+        del texture["source"]
+
+
+def null_binds(document: dict[str, Any], _binary: bytearray) -> None:
+    groups = [{"name": "happy", "presetName": "joy", "binds": None}]
+    document["extensions"] = {"VRM": {"blendShapeMaster": {"blendShapeGroups": groups}}}
+
+
 def data_uri(document: dict[str, Any], binary: bytearray) -> None:
     document["buffers"].append(
         {
@@ -74,10 +122,8 @@ def draco(document: dict[str, Any], binary: bytearray) -> None:
         ("points", primitive["attributes"]["POSITION"], "<f4"),
         ("faces", primitive["indices"], "<u4"),
     ):
-        accessor = document["accessors"][number]
-        view = document["bufferViews"][accessor.pop("bufferView")]
-        data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-        arrays[name] = np.frombuffer(data, kind).reshape(-1, 3)
+        _, arrays[name] = content(document, binary, number, kind)
+        del document["accessors"][number]["bufferView"]
     encoded = DracoPy.encode(**arrays, preserve_order=True, quantization_bits=16)
     view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(encoded)}
     document["bufferViews"].append(view)
@@ -93,7 +139,11 @@ def draco(document: dict[str, Any], binary: bytearray) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [names_in_primitives, names_in_accessors, z_up_in_centimeters, sideways, data_uri, draco],
+    [
+        *(names_in_primitives, names_in_accessors, z_up_in_centimeters, sideways, oblique),
+        *(upside_down, mirrored, one_eye_mirrored, lights, texture_of_an_extension, null_binds),
+        *(data_uri, draco),
+    ],
 )
 def test_reads_files_of_other_programs(
     tmp_path: Path, change: Callable[[dict[str, Any], bytearray], None]
@@ -101,6 +151,35 @@ def test_reads_files_of_other_programs(
     head = read_glb(edit(write_glb(tmp_path / "my.glb", meshes(SHAPES)), change))
     assert shape_error(head, JAW) < 0.25
     assert np.abs(head.eye_centers - ORIGINAL.eye_centers).max() < 0.01
+    for part in ("skin", "eye_right"):  # the triangles face outwards
+        normals, wanted = (model.normals[model.part(part).vertices] for model in (head, ORIGINAL))
+        assert (normals * wanted).sum(axis=1).mean() > 0.9
+
+
+def test_applies_default_weights_of_other_shapes_only(tmp_path: Path) -> None:
+    """The shapes of speech start at rest; the others, such as the shape of the nose, stay."""
+
+    def change(document: dict[str, Any], _binary: bytearray) -> None:
+        for mesh in document["meshes"]:
+            names = mesh.get("extras", {}).get("targetNames", [])
+            mesh["weights"] = [float(name in ("jawOpen", "Nose")) for name in names]
+
+    nose = neutral_faps(stretch_l_nose=400, stretch_r_nose=400)
+    path = write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"], "Nose": nose}))
+    plain, head = read_glb(path), read_glb(edit(path, change))
+    rows = plain.part("skin").vertices
+    moved = head.vertices[rows] - plain.vertices[rows]
+    wanted = ORIGINAL.deform(nose) - ORIGINAL.vertices
+    scale = np.ptp(plain.vertices[:, 0]) / np.ptp(ORIGINAL.vertices[:, 0])
+    assert moved == pytest.approx(scale * wanted[ORIGINAL.part("skin").vertices], abs=1e-4)
+
+
+def test_the_content_decides_between_text_and_binary(tmp_path: Path) -> None:
+    document, binary = read_chunks(write_glb(tmp_path / "my.gltf", meshes(SHAPES)))
+    assert shape_error(load_head(str(tmp_path / "my.gltf")), JAW) < 0.25
+    data_uri(document, binary)
+    (tmp_path / "my.glb").write_text(json.dumps(document), encoding="utf-8-sig")
+    assert shape_error(load_head(str(tmp_path / "my.glb")), JAW) < 0.25
 
 
 def test_reads_a_gltf_with_its_buffer_in_its_folder_only(tmp_path: Path) -> None:
@@ -116,6 +195,10 @@ def test_reads_a_gltf_with_its_buffer_in_its_folder_only(tmp_path: Path) -> None
         gltf.write_text(json.dumps(document), encoding="utf-8")
         with pytest.raises(UserError, match="not in its folder"):
             load_head(str(gltf))
+    document["buffers"][0]["uri"] = "other.bin"
+    gltf.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(UserError, match=r"my\.gltf: it lacks its file 'other.bin'; copy it"):
+        load_head(str(gltf))
 
 
 def vowels(version: int) -> Callable[[dict[str, Any], bytearray], None]:

@@ -85,8 +85,12 @@ def test_shapes_move_the_mesh_as_named() -> None:
             "arkit",
             "mouthSmileLeft",
             "mouthSmileLeft mouthSmile_L mouthSmile.L mouthSmileL MOUTHSMILE_LEFT Mouth_Smile_L"
-            " blendShape1.mouthSmile_L Head|mouthSmileLeft G8__facs_bs_MouthSmileLeft_div2",
+            " blendShape1.mouthSmile_L Head|mouthSmileLeft G8__facs_bs_MouthSmileLeft_div2"
+            " mouthSmile_L.001 mouthSmileLeft_2",
         ),
+        ("arkit", "jawOpen", "jawOpen.001 bsJawOpen face.bsJawOpen_2 CTRL_expressions_jawOpen"),
+        ("arkit", "jawOpen", "mouthOpen Wolf3D_Head.mouthOpen"),
+        ("vrm", "blinkLeft", "eyeBlinkLeft"),
         ("arkit", "mouthPucker", "mouthPucker CC_Base_Body.Mouth_Pucker_Up_L"),
         ("arkit", "eyeLookOutLeft", "Eye_L_Look_L eyeLookOut_L"),
         ("arkit", "eyeBlinkRight", "eCTRLEyesClosedR eyeBlink_R"),
@@ -96,7 +100,7 @@ def test_shapes_move_the_mesh_as_named() -> None:
         ("oculus", "PP", "viseme_PP vrc.v_pp V_Explosive"),
         ("vrm", "aa", "A aa Fcl_MTH_A Face.M_F00_000_00_Fcl_MTH_A あ"),
         ("vrm", "blinkLeft", "Blink_L blinkLeft Fcl_EYE_Close_L vrc.blink_left"),
-        ("vrm", "", "Hair_A Key_E happy"),
+        ("vrm", "", "Hair_A Key_E happy HairA faceAa Key_1"),
     ],
 )
 def test_finds_the_shape_of_a_name(set_name: str, shape: str, names: str) -> None:

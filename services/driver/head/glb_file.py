@@ -30,7 +30,7 @@ _MESHOPT, _DRACO = "EXT_meshopt_compression", "KHR_draco_mesh_compression"
 _SUPPORTED = {
     _MESHOPT, _DRACO, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp",
 }  # fmt: skip
-_LOOKS = ("KHR_materials_", "VRM")  # extensions whose data is plain glTF
+_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "VRM")  # extensions whose data is plain glTF
 
 Float64 = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class Glb:
         self._num_bytes = 0
         text = data = self._read(path)
         self._binary = b""
-        if path.suffix.lower() != ".gltf":
+        if not data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):  # not the text of a .gltf
             chunks = _chunks(data)
             text, self._binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
         self.json: dict[str, Any] = parse_json(text)
@@ -116,6 +116,8 @@ class Glb:
             raise BadGlbError(
                 f"it refers to {uri!r}, which is not in its folder; export it as .glb"
             )
+        if not (self._folder / path).exists():
+            raise BadGlbError(f"it lacks its file {uri!r}; copy it there too, or export as .glb")
         return self._read(self._folder / path)
 
     def _load_buffer(self, index: int) -> bytes:
@@ -206,6 +208,8 @@ class Glb:
         source = entry.get("source")
         for extension in entry.get("extensions", {}).values():
             source = extension.get("source", source)
+        if source is None:
+            return b""
         image = self.item("images", source)
         if "bufferView" in image:
             return self.view(image["bufferView"])

@@ -20,9 +20,11 @@ r       ridge: keeps weights of similar shapes small  m     1
 """
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb, check_glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
@@ -52,6 +54,7 @@ _TRAVEL_M = 0.01  # typical displacement of a feature point by a strong FAP
 _FADE = (-2.1, -3.2)  # heights relative to the eyes where the neck stops following the head
 _MIN_FAPS = 12
 _MAX_FACES_APART = 2.0  # distance of the parts of one face, in sizes of a part
+_MAX_TILT_RAD = 0.17  # angle between the eyes and the x axis that is not corrected
 _STEEPER = 1.5  # how much farther the mouth is below the eyes along an axis that replaces y
 
 _JAW = FAP_NUMBER["open_jaw"] - 1
@@ -103,10 +106,7 @@ def _recognize(pieces: list[Primitive]) -> Names:
             for kind in {set_name: 0, **_SETS}
             for name, shape in find_shapes(kind, piece.shapes).items()
         }
-        shapes, piece.shapes = piece.shapes, {}
-        for name, shift in shapes.items():
-            if (shape := shape_of.get(name)) in table:
-                piece.shapes[shape] = piece.shapes.get(shape, 0.0) + shift
+        _keep_known(piece, {name: shape for name, shape in shape_of.items() if shape in table})
     known = {name for piece in pieces for name in piece.shapes}
     opening = {
         name: share for name in known & table.keys() if (share := table[name][_JAW] / _OPEN_JAW) > 0
@@ -117,6 +117,17 @@ def _recognize(pieces: list[Primitive]) -> Names:
     return {name: row for name, row in table.items() if name in known}
 
 
+def _keep_known(piece: Primitive, shape_of: Mapping[str, str]) -> None:
+    """Rename the shapes of a piece, and apply the weights at rest of the others (of the body)."""
+    shapes, piece.shapes = piece.shapes, {}
+    for name, shift in shapes.items():
+        if name in shape_of:
+            shape = shape_of[name]
+            piece.shapes[shape] = piece.shapes.get(shape, 0.0) + shift
+        elif name in piece.rest:
+            piece.vertices = piece.vertices + piece.rest[name] * shift
+
+
 # --- the head -------------------------------------------------------------------------------------
 
 
@@ -124,20 +135,20 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
     names = part_names(pieces)
     _check_single_face(pieces, known)
     eyes = _eyes(glb, pieces, names)
-    turn = _upright(
-        eyes, _moved_center(pieces, [name for name in known if not _NOT_MOUTH.search(name)])
-    )
-    for piece in pieces:
-        piece.vertices = piece.vertices @ turn.T
-        piece.shapes = {name: shift @ turn.T for name, shift in piece.shapes.items()}
-    eyes = eyes @ turn.T
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
         raise BadGlbError(
             "both eyes, found by shapes or names, are at the same place; correct them"
         )
-    if eyes[0, 0] - eyes[1, 0] < 0.5 * unit:
-        raise BadGlbError("its eyes are not side by side; y must be up and the face look along z")
+    mouth = [name for name in known if not _NOT_MOUTH.search(name)]
+    is_mirrored = any(piece.is_mirrored for piece in pieces if piece.shapes.keys() & mouth)
+    turn = _upright(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
+    for piece in pieces:
+        if piece.is_mirrored != is_mirrored:
+            piece.triangles = piece.triangles[:, ::-1]
+        piece.vertices = piece.vertices @ turn.T
+        piece.shapes = {name: shift @ turn.T for name, shift in piece.shapes.items()}
+    eyes = eyes @ turn.T
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
     pivot = _pivot(glb, turn, middle, unit)
     world = np.concatenate([piece.vertices for piece in pieces])
@@ -186,8 +197,12 @@ def _check_single_face(pieces: list[Primitive], known: Names) -> None:
         raise BadGlbError("it has several faces; export only one avatar")
 
 
-def _upright(eyes: Float64, mouth: Float64 | None) -> Float64:
-    """Return the rotation by right angles (3, 3) after which y is up and the face looks along z."""
+def _upright(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Float64:
+    """Return the rotation (3, 3) after which y is up and the face looks along z.
+
+    It is by right angles, and then by the remaining angle of the eyes if that is large. For a
+    mirrored face, the result is also a reflection, which undoes the mirroring.
+    """
     side = eyes[0] - eyes[1]
     x = int(np.abs(side).argmax())
     y = 1 if x != 1 else 2
@@ -196,10 +211,14 @@ def _upright(eyes: Float64, mouth: Float64 | None) -> Float64:
         up = eyes.mean(axis=0) - mouth
         other = 3 - x - y
         if abs(up[other]) > _STEEPER * abs(up[y]):
-            y, sign = other, float(np.sign(up[other]))
+            y = other
+        sign = -1.0 if up[y] < 0 else 1.0
     turn = np.zeros((3, 3))
     turn[0, x], turn[1, y] = np.sign(side[x]), sign
-    turn[2] = np.cross(turn[0], turn[1])
+    turn[2] = np.cross(turn[0], turn[1]) * (-1 if is_mirrored else 1)
+    remaining, _ = Rotation.align_vectors([1, 0, 0], turn @ side)
+    if remaining.magnitude() > _MAX_TILT_RAD:
+        turn = remaining.as_matrix() @ turn
     return turn
 
 

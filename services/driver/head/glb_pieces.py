@@ -135,12 +135,12 @@ def _expressions(glb: Glb) -> defaultdict[str, Binds]:
     for group in groups:
         preset = group.get("presetName", "unknown")
         name = group["name"] if preset == "unknown" else preset
-        for bind in group.get("binds", []):
+        for bind in group.get("binds") or []:
             weight = float(bind.get("weight", 100)) / 100
             found[f"mesh {bind['mesh']}"].append((str(name), int(bind["index"]), weight))
     kinds = extensions.get("VRMC_vrm", {}).get("expressions", {})
     for name, expression in (kinds.get("custom", {}) | kinds.get("preset", {})).items():
-        for bind in expression.get("morphTargetBinds", []):
+        for bind in expression.get("morphTargetBinds") or []:
             key = f"node {bind['node']}"
             found[key].append((name, int(bind["index"]), float(bind.get("weight", 1))))
     return found
@@ -181,7 +181,7 @@ def _piece(
         placed, weight = _skinned(glb, node["skin"], attributes, places, turn_shares)
     if not len(uv) == len(colors) == len(placed) == count:
         raise ValueError("the attributes of a mesh have different lengths")
-    shapes = _shapes(glb, mesh, primitive, placed[:, :3, :3], binds)
+    shapes, rest = _shapes(glb, node, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
     jaw = None if weight is None else _jaw_shift(glb, node["skin"], attributes, places, vertices)
     if weight is not None and _uses_eye_bones(glb):
@@ -199,6 +199,8 @@ def _piece(
         material=material,
         head_weight=weight,
         shapes=shapes,
+        rest=rest,
+        is_mirrored=count > 0 and bool(np.linalg.det(placed[0, :3, :3]) < 0),
         jaw=jaw,
     )
 
@@ -222,9 +224,14 @@ def _moved_uv(uv: Float64, base: dict[str, Any]) -> Float64:
 
 
 def _shapes(
-    glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any], placed: Float64, binds: Binds
-) -> dict[str, Float64]:
-    """Return the displacements (V, 3) of the expressions and morph targets by name."""
+    glb: Glb,
+    node: dict[str, Any],
+    mesh: dict[str, Any],
+    primitive: dict[str, Any],
+    placed: Float64,
+    binds: Binds,
+) -> tuple[dict[str, Float64], dict[str, float]]:
+    """Return the displacements (V, 3) of the expressions and morph targets, and weights at rest."""
     shifts = {}
     for number, target in enumerate(primitive.get("targets", [])):
         if "POSITION" in target:
@@ -236,10 +243,14 @@ def _shapes(
     for name, number, weight in binds:
         if number in shifts:
             shapes[name] = shapes.get(name, 0.0) + weight * shifts[number]
+    weights = node.get("weights") or mesh.get("weights") or []
+    rest = {}
     for number, name in enumerate(_target_names(glb, mesh, primitive)):
-        if number in shifts:
-            shapes.setdefault(name, shifts[number])
-    return shapes
+        if number in shifts and name not in shapes:
+            shapes[name] = shifts[number]
+            if number < len(weights) and weights[number]:
+                rest[name] = float(weights[number])
+    return shapes, rest
 
 
 def _corners(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
@@ -258,7 +269,7 @@ def _target_names(glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any]) -> 
     targets = primitive.get("targets", [])
     for place in (primitive, mesh):
         names = (place.get("extras") or {}).get("targetNames", [])
-        if names:
+        if isinstance(names, list) and names:
             return [str(name) for name in names]
     entries = [
         glb.item("accessors", target["POSITION"]) if "POSITION" in target else {}

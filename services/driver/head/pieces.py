@@ -32,6 +32,8 @@ class Primitive:
     material: dict[str, Any]
     head_weight: Float64 | None  # None without a skeleton
     shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by name
+    rest: dict[str, float] = field(default_factory=dict)  # weights of shapes in the mesh at rest
+    is_mirrored: bool = False  # by a negative scale: its triangles face inwards
     jaw: Float64 | None = None  # displacements by a jaw bone
 
 
