@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -20,6 +21,7 @@ def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator
     """Yield the function's result for each item, in order.
 
     Processes are forked when the iteration starts, so the function may use large data in memory.
+    They are killed if the iteration ends early, for example by Ctrl-C.
     """
     num_cores = len(os.sched_getaffinity(0))
     if num_cores < _MIN_CORES:
@@ -35,12 +37,17 @@ def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator
                 yield results.popleft().result()
         while results:
             yield results.popleft().result()
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _start_worker(function: Callable[[Any], Any]) -> None:
     global _function  # noqa: PLW0603
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C prints no traceback
     _function = function
 
 

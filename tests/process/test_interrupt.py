@@ -1,5 +1,6 @@
 """Ctrl-C ends a command, even if a library drops the exception."""
 
+import json
 import os
 from pathlib import Path
 
@@ -72,6 +73,49 @@ try:
 except KeyboardInterrupt:
     raise ImportError("initialization failed")
 """
+# Each command runs in a process of its own, with Ctrl-C when it opens a file in the folder `data`
+# or starts a program.
+IN_INPUT = """
+import importlib, json, os, signal, sys
+for name in ("ear", "universal", "blocks", "lips", "gmm", "ferguson", "visemes", "heads"):
+    importlib.import_module(f"kouxing.training.{name}.recipe")
+import kouxing.evaluation.commands, kouxing.evaluation.recognizer.error_rates
+import kouxing.services.cli.main
+from kouxing.shared.interrupt import install_interrupt
+
+def interrupt(event, arguments):
+    is_input = event == "open" and "/data/" in str(arguments[0])
+    if not is_pressed and (is_input or event == "subprocess.Popen"):
+        is_pressed.append(True)
+        signal.raise_signal(signal.SIGINT)
+
+is_pressed = []
+sys.addaudithook(interrupt)
+results = {}
+for line in sys.argv[1:]:
+    sys.argv[1:] = line.split()
+    if not (child := os.fork()):
+        install_interrupt()
+        try:
+            kouxing.services.cli.main.main()
+        finally:
+            os._exit(1)
+    results[line] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+print(json.dumps(results))
+"""
+RECIPES = (
+    *("train phone-lm --corpus {data} -o {out}/a.npz", "train gmm --corpus {data} -o {out}/a.npz"),
+    "train blocks --corpus {data} --whisper {data} -o {out}/a.npz",
+    "train universal --corpus {data} --languages {data} -o {out}/a.npz",
+    "train ear --corpus {data} --whisper {data} --sounds {data} --clips {data} -o {out}/a.npz",
+    *("train visemes --clips {data} -o {out}/a.json", "train lips --clips {data} -o {out}/a.npz"),
+    "train ferguson --clips {data} --corpus {data} -o {out}/a.tsv",
+    "train traits --recordings {data} --sounds {data} -o {out}/a.npz",
+    "train heads man --parts {data} -o {out}",
+    "evaluate recognizer --manifest {data} --json {out}/a.json",
+    "evaluate lips --clips {data} --json {out}/a.json",
+    "evaluate schemes --clips {data} --json {out}/a.json",
+)
 COMMAND = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -109,6 +153,21 @@ def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) 
     printed, log = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, printed) == (130, "")
     assert "Traceback" not in log
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_every_recipe_and_leaves_no_output(tmp_path: Path) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    data.mkdir()
+    out.mkdir()
+    for name in ("manifest.tsv", "model.bin", "a.flac", "a.csv", "a.json"):
+        (data / name).touch()
+    lines = [line.format(data=data, out=out) for line in RECIPES]
+    process = start_python("-c", IN_INPUT, *lines, PYTHONPATH=str(ROOT))
+    printed, log = process.communicate(timeout=4 * LIMIT_S)
+    assert json.loads(printed) == dict.fromkeys(lines, 130), log
+    assert log == ""
+    assert not [*out.iterdir()]
 
 
 def test_onnxruntime_stores_no_usage_data(tmp_path: Path) -> None:

@@ -7,6 +7,28 @@ import pytest
 
 from kouxing.corpora import parallel
 from kouxing.corpora.parallel import process_in_order
+from tests.system import LIMIT_S, ROOT, start_python
+
+# Ctrl-C reaches all processes, or only the first, while one of them works on an endless item.
+INTERRUPTED = """
+import os, signal, sys
+from kouxing.corpora import parallel
+from kouxing.services.cli import main
+from kouxing.shared.interrupt import install_interrupt
+os.setsid()
+parallel._MIN_CORES = 1
+send, to = (os.killpg, os.getpgrp()) if sys.argv[1] == "all" else (os.kill, os.getpid())
+
+def work(item):
+    if item == 5:
+        send(to, signal.SIGINT)
+    while item > 5:
+        signal.pause()
+
+install_interrupt()
+main._run_command = lambda: list(parallel.process_in_order(work, range(100)))
+main.main()
+"""
 
 
 @pytest.mark.parametrize("num_cores", [1, 4])
@@ -27,3 +49,10 @@ def test_an_error_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [next(results) for _ in range(3)] == [0, 0, 1]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+@pytest.mark.parametrize("receivers", ["all", "first"])
+def test_ctrl_c_ends_all_processes_without_a_traceback(receivers: str) -> None:
+    process = start_python("-c", INTERRUPTED, receivers, PYTHONPATH=str(ROOT))
+    assert process.communicate(timeout=LIMIT_S) == ("", "")  # no process holds the pipes open
+    assert process.returncode == 130

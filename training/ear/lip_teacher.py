@@ -40,6 +40,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
+from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.events import Phone
 from kouxing.training.ear.teachers import Teachers
 from kouxing.training.lips.recipe import repeats_by_source, standardize, units_of
@@ -115,7 +116,8 @@ class LipTeacher:
         """Write the teacher."""
         projection = {name: torch.from_numpy(getattr(self.projection, name)) for name in _PARTS}
         networks = [network.state_dict() for network in self.networks]
-        torch.save({"projection": projection, "networks": networks}, path)
+        with open_output(path) as file:
+            torch.save({"projection": projection, "networks": networks}, file)
 
     @classmethod
     def load(cls, path: Path) -> LipTeacher:

@@ -34,6 +34,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.ear import Voice
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import write_text
 from kouxing.training.ear.lip_teacher import LipTeacher, TeacherFeatures
 from kouxing.training.ear.singing import sing
 from kouxing.training.ear.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
@@ -146,7 +147,7 @@ class TargetStore:
             key.update(f"{recording.name} {recording.voice}\n".encode())
         path = self._folder / "key"
         if not path.exists():
-            path.write_text(key.hexdigest())
+            write_text(path, key.hexdigest())
         elif path.read_text() != key.hexdigest():
             raise UserError(
                 f"{self._folder} contains targets of other recordings or models; delete it"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import FORMAT
+from kouxing.shared.output_file import open_output
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.fitted import Fitted
 from kouxing.training.heads.makehuman import FEATURE_POINTS, METERS_PER_UNIT, PIVOT, BaseMesh
@@ -204,7 +205,8 @@ def write(
     }
     for name, data in textures.items():
         arrays[f"texture_{name}"] = np.frombuffer(data, np.uint8)
-    np.savez_compressed(output, allow_pickle=False, **arrays)
+    with open_output(output) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[HeadPiece]:

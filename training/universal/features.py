@@ -25,6 +25,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import load_or_compute, read_audio
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.terminal import write_text
 from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, MAX_FRAMES, FeatureEncoder
 
@@ -106,7 +107,7 @@ class FeatureStore:
                     file.write(integers.tobytes())
                     entries.append((one.utterance_id, len(some), first, len(rows)))
                     first += len(rows)
-        index.write_text(json.dumps(entries))
+        write_text(index, json.dumps(entries))
 
 
 def _read_shard(index: Path) -> Iterator[Features]:

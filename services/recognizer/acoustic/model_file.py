@@ -1,6 +1,5 @@
 """Model files: npz archives of plain arrays, without pickle. Every size is checked."""
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -14,6 +13,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, T
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
+from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
 # For model files without a phone language model.
@@ -82,9 +82,8 @@ def load_part(path: Path, form: str, name: str, build: Callable[[Archive], Part]
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write a model file."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    path.write_bytes(buffer.getvalue())
+    with open_output(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def write_model(path: Path, form: str, topology: Topology, **arrays: Any) -> None:
