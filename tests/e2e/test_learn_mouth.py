@@ -166,6 +166,15 @@ def test_a_slow_computer_is_reported_before_reading(browser: Browser) -> None:
     browser.click("learn-mouth [data-step=problem] .close")
 
 
+def test_a_slow_start_is_reported(browser: Browser) -> None:
+    browser.evaluate("void (document.body.append = () => {})")  # the tracker never loads
+    browser.click("learn")
+    browser.click("lesson-start")
+    browser.wait_for("document.getElementById('lesson-advice').textContent.includes('is slow')")
+    browser.click("learn-mouth [data-step=reading] .close")
+    browser.evaluate("delete document.body.append")
+
+
 def test_the_page_records_the_same_landmarks(browser: Browser) -> None:
     kept = browser.evaluate("(async () => (await import('/face-recording.js')).LANDMARKS)()")
     assert tuple(kept) == LANDMARKS

@@ -488,7 +488,12 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
 @pytest.mark.parametrize(
     ("name", "content", "english", "chinese"),
     [
-        ("broken.wav", b"RIFF" + bytes(40), "the file is damaged or cut off", "文件损坏或不完整"),
+        (
+            f"{'broken' * 20}.wav",
+            b"RIFF" + bytes(40),
+            "the file is damaged or cut off",
+            "文件损坏或不完整",
+        ),
         ("silent.wav", None, "silent.wav: no speech was found; it is silent", "文件是静音的"),
     ],
 )
@@ -503,6 +508,8 @@ def test_a_file_without_sound_is_explained_in_both_languages(
         choose(page, "language", language)
         choose_file(page, tmp_path / name)
         page.wait_for(f"{NOTICE}.includes('{text}')")
+        notice = "document.getElementById('notice')"
+        assert page.evaluate(f"{notice}.scrollWidth <= {notice}.clientWidth")  # long names wrap
 
 
 def test_a_dropped_file_is_streamed(

@@ -13,7 +13,8 @@ import { READING_TEXTS } from "./texts.js";
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
 const GOOD_RATE_HZ = 10; // rate of the images; below it, the reading is longer
 const SLOW_SHARE = 1.5; // multiple of the usual time
-const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the first image
+const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the tracker is loaded
+const SLOW_START_MS = 2500; // a longer start is reported
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
 const CURVES = ["tracked", "before", "after"];
 const BOX = { width: 600, height: 150 };
@@ -114,14 +115,19 @@ export class MouthLesson {
     const tracker = new FaceTracker();
     let stream = null;
     let context = null;
+    let slowStart = null; // timer
     try {
       stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
         video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 } },
       });
+      slowStart = setTimeout(() => {
+        element("lesson-advice").textContent = say("lessonSlowStart");
+      }, SLOW_START_MS);
       const video = element("lesson-video");
       video.srcObject = stream;
       [context] = await Promise.all([openCaptureContext(), tracker.load(), video.play()]);
+      clearTimeout(slowStart);
       signal.throwIfAborted();
       const recording = new FaceRecording(context.sampleRate);
       await this.#read(recording, { video, tracker, context, stream, signal });
@@ -130,6 +136,7 @@ export class MouthLesson {
       if (!signal.aborted) this.#fail(errorText(error));
       return null;
     } finally {
+      clearTimeout(slowStart);
       for (const track of stream?.getTracks() ?? []) track.stop();
       context?.close();
       tracker.close();

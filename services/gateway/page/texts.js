@@ -211,6 +211,10 @@ export const TEXTS = {
   recordAgain: { en: "Record again", zh: "重录" },
   sendAgain: { en: "Send again", zh: "重发" },
   lessonStarting: { en: "Starting camera and microphone …", zh: "正在启动摄像头和麦克风…" },
+  lessonSlowStart: {
+    en: "Starting takes longer: this computer or its connection is slow. Please close other programs.",
+    zh: "启动较慢：这台电脑或网络较慢，请关闭其他程序。",
+  },
   lessonShowFace: { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" },
   lessonLipsClosed: { en: "Keep your lips closed …", zh: "请先闭上嘴…" },
   lessonRead: { en: "Read aloud. Repeat the text if there is time left.", zh: "请朗读，读完可重复。" },
