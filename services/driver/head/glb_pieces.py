@@ -1,4 +1,4 @@
-"""Reads the meshes of a GLB as pieces in common axes, with shapes and skeleton.
+"""Reads the meshes of a GLB in one coordinate system, with their shapes and skeleton.
 
 The shapes of a mesh are its morph targets. In a VRM, an expression is also a shape: a weighted sum
 of morph targets of several meshes (``VRM`` of version 0, ``VRMC_vrm`` of version 1).
@@ -6,6 +6,7 @@ of morph targets of several meshes (``VRM`` of version 0, ``VRMC_vrm`` of versio
 
 import re
 from collections import defaultdict
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -175,17 +176,19 @@ def _piece(
     if "COLOR_0" in attributes:
         colors *= attributes["COLOR_0"][:, :3]
     texture = glb.image(base["index"]) if base else b""
-    placed = np.broadcast_to(place, (count, 4, 4))
-    weight = None
+    skin = None
     if "skin" in node and "JOINTS_0" in attributes:
-        placed, weight = _skinned(glb, node["skin"], attributes, places, turn_shares)
+        skin = _Skin(glb, node["skin"], attributes, places)
+    placed = skin.matrices() if skin else np.broadcast_to(place, (count, 4, 4))
     if not len(uv) == len(colors) == len(placed) == count:
         raise ValueError("the attributes of a mesh have different lengths")
     shapes, rest = _shapes(glb, node, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
-    jaw = None if weight is None else _jaw_shift(glb, node["skin"], attributes, places, vertices)
-    if weight is not None and _uses_eye_bones(glb):
-        shapes = _eye_look_shapes(glb, node["skin"], attributes, places, vertices) | shapes
+    weight = jaw = None
+    if skin and turn_shares:
+        weight, jaw = skin.mean(turn_shares), skin.jaw_shift(vertices)
+        if _uses_eye_bones(glb):
+            shapes = skin.eye_look_shapes(vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
             raise ValueError("a coordinate or color is not finite or very large")
@@ -278,83 +281,69 @@ def _target_names(glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any]) -> 
     return [str(entry.get("name", number)) for number, entry in enumerate(entries)]
 
 
-def _skinned(
-    glb: Glb,
-    skin: object,
-    attributes: dict[str, Float64],
-    places: dict[int, Float64],
-    turn_shares: dict[int, float],
-) -> tuple[Float64, Float64 | None]:
-    """Return each vertex's rest matrix (V, 4, 4) and its fraction of the head rotation (V,)."""
-    entry = glb.item("skins", skin)
-    joints = [int(joint) for joint in entry["joints"]]
-    bones = np.array([places[joint] for joint in joints])
-    if "inverseBindMatrices" in entry:
-        bind = glb.accessor(entry["inverseBindMatrices"])[: len(joints)]
-        bones = bones @ bind.reshape(-1, 4, 4).transpose(0, 2, 1)
-    which, weights = attributes["JOINTS_0"].astype(np.int64), attributes["WEIGHTS_0"]
-    if which.shape != weights.shape or (which.size and which.max() >= len(joints)):
-        raise ValueError("a mesh refers to a missing joint")
-    weights = _normalized(weights)
-    share = np.array([turn_shares.get(joint, 0.0) for joint in joints])
-    placed = np.einsum("vk,vkij->vij", weights, bones[which])
-    return placed, (weights * share[which]).sum(axis=1) if turn_shares else None
+class _Skin:
+    """The joints that move the vertices of a mesh, and their weights."""
 
+    def __init__(
+        self, glb: Glb, skin: object, attributes: dict[str, Float64], nodes: dict[int, Float64]
+    ) -> None:
+        entry = glb.item("skins", skin)
+        self._glb = glb
+        self._nodes = nodes
+        self._joints = [int(joint) for joint in entry["joints"]]
+        self._bones = np.array([nodes[joint] for joint in self._joints])
+        if "inverseBindMatrices" in entry:
+            bind = glb.accessor(entry["inverseBindMatrices"])[: len(self._joints)]
+            self._bones = self._bones @ bind.reshape(-1, 4, 4).transpose(0, 2, 1)
+        index, weights = attributes["JOINTS_0"].astype(np.int64), attributes["WEIGHTS_0"]
+        if index.shape != weights.shape or (index.size and index.max() >= len(self._joints)):
+            raise ValueError("a mesh refers to a missing joint")
+        self._index = index
+        self._weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
 
-def _jaw_shift(
-    glb: Glb,
-    skin: object,
-    attributes: dict[str, Float64],
-    places: dict[int, Float64],
-    vertices: Float64,
-) -> Float64 | None:
-    """Return the displacements (V, 3) by a jaw bone, if it moves vertices.
+    def matrices(self) -> Float64:
+        """Return each vertex's rest matrix (V, 4, 4)."""
+        matrices: Float64 = np.einsum("vk,vkij->vij", self._weights, self._bones[self._index])
+        return matrices
 
-    A VRM's jaw bone is ignored, because programs often choose a wrong one.
-    """
-    jaw = next((number for number, bone in find_bones(glb).items() if bone == "jaw"), None)
-    if jaw not in places or glb.json.get("extensions", {}).keys() & {"VRM", "VRMC_vrm"}:
-        return None
-    below = {jaw}
-    for number in places:  # parents come first
-        if number in below:
-            below |= set(glb.item("nodes", number).get("children", []))
-    is_jaw = np.array([joint in below for joint in glb.item("skins", skin)["joints"]])
-    share = (
-        _normalized(attributes["WEIGHTS_0"]) * is_jaw[attributes["JOINTS_0"].astype(np.int64)]
-    ).sum(axis=1, keepdims=True)
-    if not share.any():
-        return None
-    shift: Float64 = share * _JAW_RAD * np.cross([1, 0, 0], vertices - places[jaw][:3, 3])
-    return shift
+    def mean(self, values: Mapping[int, float]) -> Float64:
+        """Return the weighted mean (V,) of the values of each vertex's joints; others have 0."""
+        of_joint = np.array([values.get(joint, 0.0) for joint in self._joints])
+        mean: Float64 = (self._weights * of_joint[self._index]).sum(axis=1)
+        return mean
 
+    def jaw_shift(self, vertices: Float64) -> Float64 | None:
+        """Return the displacements (V, 3) by a jaw bone, if it moves vertices.
 
-def _normalized(weights: Float64) -> Float64:
-    """Scale the joint weights (V, n) of each vertex to a sum of 1."""
-    normalized: Float64 = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
-    return normalized
-
-
-def _eye_look_shapes(
-    glb: Glb,
-    skin: object,
-    attributes: dict[str, Float64],
-    places: dict[int, Float64],
-    vertices: Float64,
-) -> dict[str, Float64]:
-    """Return ARKit's eye shapes by name: the displacements (V, 3) by rotations of the eye bones."""
-    joints, bones = glb.item("skins", skin)["joints"], find_bones(glb)
-    is_old = "VRM" in glb.json["extensions"]  # version 0 looks along -z
-    weights = _normalized(attributes["WEIGHTS_0"])
-    shapes = {}
-    for side, outward in (("Left", 1.0), ("Right", -1.0)):
-        is_eye = np.array([bones.get(joint) == f"{side.lower()}Eye" for joint in joints])
-        share = (weights * is_eye[attributes["JOINTS_0"].astype(np.int64)]).sum(axis=1)
+        A VRM's jaw bone is ignored, because programs often choose a wrong one.
+        """
+        jaw = next((joint for joint, bone in find_bones(self._glb).items() if bone == "jaw"), None)
+        is_vrm = self._glb.json.get("extensions", {}).keys() & {"VRM", "VRMC_vrm"}
+        if jaw not in self._nodes or is_vrm:
+            return None
+        below = {jaw}
+        for node in self._nodes:  # parents come first
+            if node in below:
+                below |= set(self._glb.item("nodes", node).get("children", []))
+        share = self.mean(dict.fromkeys(below, 1.0))[:, None]
         if not share.any():
-            continue
-        center = places[joints[int(is_eye.argmax())]][:3, 3]
-        arm = share[:, None] * (vertices - center)
-        out, down = (_LOOK_RAD[name] for name in ("Out", "Down"))
-        shapes[f"eyeLookOut{side}"] = outward * out * np.cross([0, 1, 0], arm)
-        shapes[f"eyeLookDown{side}"] = (-down if is_old else down) * np.cross([1, 0, 0], arm)
-    return shapes
+            return None
+        arm = vertices - self._nodes[jaw][:3, 3]
+        shift: Float64 = share * _JAW_RAD * np.cross([1, 0, 0], arm)
+        return shift
+
+    def eye_look_shapes(self, vertices: Float64) -> dict[str, Float64]:
+        """Return ARKit's eye shapes: the displacements (V, 3) by rotations of the eye bones."""
+        bones = find_bones(self._glb)
+        is_old = "VRM" in self._glb.json["extensions"]  # version 0 looks along -z
+        out, down = _LOOK_RAD["Out"], _LOOK_RAD["Down"]
+        shapes = {}
+        for side, outward in (("Left", 1.0), ("Right", -1.0)):
+            eyes = [joint for joint in self._joints if bones.get(joint) == f"{side.lower()}Eye"]
+            share = self.mean(dict.fromkeys(eyes, 1.0))[:, None]
+            if not share.any():
+                continue
+            arm = share * (vertices - self._nodes[eyes[0]][:3, 3])
+            shapes[f"eyeLookOut{side}"] = outward * out * np.cross([0, 1, 0], arm)
+            shapes[f"eyeLookDown{side}"] = (-down if is_old else down) * np.cross([1, 0, 0], arm)
+        return shapes
