@@ -54,7 +54,7 @@ class AudioSource:
     num_channels: int
     duration_s: float | None  # None: not known
     blocks: Iterator[Samples]
-    remarks: list[str] = field(default_factory=list)  # problems; complete after the last block
+    warnings: list[str] = field(default_factory=list)  # problems; complete after the last block
     is_live: bool = False  # it arrives in real time
     notices: list[str] = field(default_factory=list)  # messages to print before reading
 
@@ -263,8 +263,8 @@ def num_clipped(samples: Samples) -> int:
     return int(np.count_nonzero(np.abs(samples) >= CLIPPED_LEVEL))
 
 
-def clipping_remarks(name: str, share: float) -> list[str]:
-    """Return a remark for the user if too large a fraction of the samples is clipped."""
+def clipping_warnings(name: str, share: float) -> list[str]:
+    """Return a warning for the user if too large a fraction of the samples is clipped."""
     if share <= CLIPPED_SHARE:
         return []
     return [f"{name}: {share:.0%} of the samples are clipped; record at a lower level"]
@@ -280,12 +280,12 @@ def raw_audio(
     rate_hz, num_channels = min(raw.sample_rate_hz, MAX_RATE_HZ), raw.num_channels
     num_mixed = min(2, num_channels)
     _check_rate(name, raw.sample_rate_hz)
-    remarks: list[str] = []
+    warnings: list[str] = []
     frame_bytes = raw.dtype.itemsize * num_channels
     block_bytes = frame_bytes * raw.sample_rate_hz // 50
 
     def pieces() -> Iterator[tuple[int, Samples]]:
-        guard = CancellationGuard(name, num_mixed, remarks)
+        guard = CancellationGuard(name, num_mixed, warnings)
         rest, num_read = b"", 0
         while more := stream.read(block_bytes):
             num_read += len(more)
@@ -296,10 +296,10 @@ def raw_audio(
             yield raw.sample_rate_hz, guard.mix(channels, channels)
         sizes = (num_read, num_read + num_missing())
         seconds = (size / frame_bytes / raw.sample_rate_hz for size in sizes)
-        remarks.extend(_cut_off(name, *seconds))
+        warnings.extend(_cut_off(name, *seconds))
 
     blocks = _blocks(pieces(), name, rate_hz, num_mixed, BLOCK_S)
-    return AudioSource(name, rate_hz, num_mixed, None, blocks, remarks)
+    return AudioSource(name, rate_hz, num_mixed, None, blocks, warnings)
 
 
 def _source(
@@ -318,8 +318,8 @@ def _source(
         for block in _blocks(sound.blocks, path, rate_hz, sound.num_channels, block_s):
             num_read += len(block)
             yield block
-        if not sound.remarks:
-            sound.remarks.extend(_missing(path, num_read / rate_hz, begin, num_bytes()))
+        if not sound.warnings:
+            sound.warnings.extend(_missing(path, num_read / rate_hz, begin, num_bytes()))
 
     return AudioSource(
         name=name,
@@ -327,7 +327,7 @@ def _source(
         num_channels=sound.num_channels,
         duration_s=sound.duration_s,
         blocks=blocks(),
-        remarks=sound.remarks,
+        warnings=sound.warnings,
         notices=sound.notices,
     )
 
@@ -395,7 +395,7 @@ def _resample(
 
 
 def _missing(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
-    """Return a remark if a file is shorter than its header states."""
+    """Return a warning if a file is shorter than its header states."""
     return _cut_off(path, read_s, read_s * (stated_bytes(begin) or 0) / num_bytes)
 
 

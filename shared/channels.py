@@ -15,16 +15,16 @@ class CancellationGuard:
 
     There are three causes. A microphone cable inverts one of two channels. The mix of a film leaves
     out a channel. Only one of nine channels contains a voice. Other mixes are returned unchanged.
-    ``name`` is the name of the sound in the remark that is added to ``remarks``.
+    ``name`` is the name of the sound in the warning that is added to ``warnings``.
     """
 
-    def __init__(self, name: str, num_channels: int, remarks: list[str]) -> None:
+    def __init__(self, name: str, num_channels: int, warnings: list[str]) -> None:
         self._name = name
         self._num_channels = num_channels
-        self._remarks = remarks
+        self._warnings = warnings
         self._energy: NDArray[np.float64] = np.zeros(1)  # energy of every channel so far
         self._mixed_energy = 0.0
-        self._has_remarked = False
+        self._has_warned = False
 
     def mix(self, channels: Samples, mixed: Samples) -> Samples:
         """Return ``mixed`` or the loudest of ``channels``, with ``num_channels`` columns."""
@@ -48,9 +48,9 @@ class CancellationGuard:
         )
         if not is_lost:
             return mixed
-        if not self._has_remarked:
-            self._has_remarked = True
-            self._remarks.append(
+        if not self._has_warned:
+            self._has_warned = True
+            self._warnings.append(
                 f"{self._name}: mixing all channels would lose the sound of one;"
                 f" only channel {loudest + 1} is used"
             )

@@ -66,7 +66,7 @@ class MediaSound:
 
     ``track`` counts from 1. If it is None, the default track is read, or else the first, of those
     that can be decoded. ``name`` is the file's, for messages. ``blocks`` yields the sample rate and
-    samples, (n, channels); the rate may change. ``remarks`` is complete after the last block.
+    samples, (n, channels); the rate may change. ``warnings`` is complete after the last block.
 
     Raises ``UserError`` if FFmpeg cannot read the file, or it has no such track; while reading, if
     nothing can be decoded.
@@ -75,7 +75,7 @@ class MediaSound:
     def __init__(
         self, file: BinaryIO, name: str, begin: bytes, track: int | None, *, is_pipe: bool
     ) -> None:
-        self.remarks: list[str] = []
+        self.warnings: list[str] = []
         self.notices: list[str] = []
         self._name = name
         self._mixers: dict[tuple[str, str, int], list[Any]] = {}
@@ -209,7 +209,7 @@ class MediaSound:
         start_s = start_of(self._container)
         origin_s = (first.time or 0.0) if start_s is None else start_s
         position_s = 0.0
-        guard = CancellationGuard(self._name, self.num_channels, self.remarks)
+        guard = CancellationGuard(self._name, self.num_channels, self.warnings)
         frame: Any = first
         with self._container:
             while frame is not None:
@@ -269,7 +269,7 @@ class MediaSound:
         return float(self._container.duration / av.time_base)
 
     def _check_end(self, read_s: float) -> None:
-        """Remark on damage, and on a file that ends before its header states."""
+        """Warn about damage, and about a file that ends before its header states."""
         stream, stated_s, end_s = self._stream, self._stated_s(), self._read_end_s
         min_missing_s = _MIN_MISSING_OF_FILE_S
         if stream.duration is not None and stream.time_base is not None:
@@ -277,18 +277,18 @@ class MediaSound:
             end_s, min_missing_s = self._track_end_s, _MIN_MISSING_S
         missing_s = 0.0 if stated_s is None else stated_s - end_s
         if missing_s > min_missing_s and self._states_length():
-            self.remarks.append(
+            self.warnings.append(
                 f"{self._name}: the file is cut off after {read_s:.1f} s of"
                 f" {read_s + missing_s:.1f} s"
             )
         elif self._container.format.name == "ogg" and is_cut_ogg(self._file.end):
-            self.remarks.append(f"{self._name}: the file is cut off after {read_s:.1f} s")
+            self.warnings.append(f"{self._name}: the file is cut off after {read_s:.1f} s")
         elif self._is_stopped:
-            self.remarks.append(
+            self.warnings.append(
                 f"{self._name}: the file cannot be read after {read_s:.1f} s; export it again"
             )
         elif self._num_damaged and self._damaged_s < end_s:
-            self.remarks.append(
+            self.warnings.append(
                 f"{self._name}: damaged near {self._damaged_s:.1f} s; the damaged part is silent"
             )
 

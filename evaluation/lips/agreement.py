@@ -11,7 +11,7 @@ from kouxing.evaluation.lips.curves import LAGS_S, Moments, best_lag, pooled_mom
 from kouxing.evaluation.lips.mouths import CURVES, Mouth
 
 Array = NDArray[np.float64]
-Pair = tuple[Mouth, Mouth]  # the mouth to judge, and the real one
+Pair = tuple[Mouth, Mouth]  # the predicted and the real mouth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ def agreement_of(pairs: Sequence[Pair]) -> Agreement:
 def moments(pairs: Sequence[Pair], curve: str, lag_s: float = 0.0) -> Moments:
     """Compare a curve over all frames, after removal of each clip's means."""
     return pooled_moments(
-        (made.at(curve, real.time_s + lag_s), real.curves[curve]) for made, real in pairs
+        (predicted.at(curve, real.time_s + lag_s), real.curves[curve]) for predicted, real in pairs
     )
 
 

@@ -46,7 +46,7 @@ def closure_class(reference: Reference, time_s: float) -> str:
 def labials_shut(takes: Takes) -> float | None:
     """Return the fraction of b p m whose lips are closed within 40 ms of the quietest moment."""
     shut = [
-        is_closed_at(take.reference.quietest_moments(take.reference.labials()), take.made)
+        is_closed_at(take.reference.quietest_moments(take.reference.labials()), take.predicted)
         for take in takes
     ]
     flags = np.concatenate([np.zeros(0, bool), *shut])
@@ -55,6 +55,8 @@ def labials_shut(takes: Takes) -> float | None:
 
 def share_shut(takes: Takes) -> float | None:
     """Return the fraction of the frames in speech in which the lips are closed."""
-    flags = [take.made.is_closed[take.reference.is_speech(take.made.time_s)] for take in takes]
+    flags = [
+        take.predicted.is_closed[take.reference.is_speech(take.predicted.time_s)] for take in takes
+    ]
     together = np.concatenate([np.zeros(0, bool), *flags])
     return float(together.mean()) if len(together) else None

@@ -17,24 +17,24 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.04
-_OPEN = 100.0  # opening of made lips in FAP units: 3 mm on a face
+_OPEN = 100.0  # opening of predicted lips in FAP units: 3 mm on a face
 _OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """Counts of real events, of those reproduced, of made events, and of those that are true."""
+    """Numbers of real, reproduced and predicted events, and of predictions that are true."""
 
     real: int = 0
     met: int = 0
-    made: int = 0
+    predicted: int = 0
     true: int = 0
 
     def __add__(self, other: Detections) -> Detections:
         return Detections(
             self.real + other.real,
             self.met + other.met,
-            self.made + other.made,
+            self.predicted + other.predicted,
             self.true + other.true,
         )
 
@@ -45,8 +45,8 @@ class Detections:
 
     @property
     def precision(self) -> float | None:
-        """Share of the made events that are true."""
-        return self.true / self.made if self.made else None
+        """Fraction of the predicted events that are true."""
+        return self.true / self.predicted if self.predicted else None
 
     @property
     def f1(self) -> float | None:
@@ -59,7 +59,7 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A closure of made lips, from an opening to the next one."""
+    """A closure of predicted lips, from an opening to the next one."""
 
     time_s: float  # middle of the frames in which the lips touch
     is_true: bool  # real lips are closed within 40 ms of one of these frames
@@ -83,19 +83,19 @@ def is_closed_at(moments_s: Array, mouth: Mouth) -> Mask:
     return near & is_near(moments_s, mouth.time_s[mouth.opening > _OPEN], _OPEN_WINDOW_S)
 
 
-def contacts(made: Mouth, real: Mouth) -> list[Contact]:
-    """Return the closures of made lips. A contact starts when open lips close.
+def contacts(predicted: Mouth, real: Mouth) -> list[Contact]:
+    """Return the closures of predicted lips. A contact starts when open lips close.
 
     Closures where the real mouth is unknown, such as after the end of the clip, do not count.
     """
-    is_open = made.opening > _OPEN
-    opened_s = made.time_s[is_open]
-    touching = made.is_closed & ~is_open & is_near(made.time_s, opened_s, _OPEN_WINDOW_S)
-    touching &= is_near(made.time_s, real.time_s, WINDOW_S)
+    is_open = predicted.opening > _OPEN
+    opened_s = predicted.time_s[is_open]
+    touching = predicted.is_closed & ~is_open & is_near(predicted.time_s, opened_s, _OPEN_WINDOW_S)
+    touching &= is_near(predicted.time_s, real.time_s, WINDOW_S)
     # A contact's number is how often the lips have opened before it. Contact 0 is the initial rest.
     state = np.where(is_open, 1, -1)[is_open | touching]
     number = np.cumsum(np.diff(state, prepend=-1) > 0)[state < 0]
-    time_s = made.time_s[touching]
+    time_s = predicted.time_s[touching]
     is_true = is_near(time_s, real.time_s[real.is_closed], WINDOW_S)
     return [
         Contact(float(time_s[frames].mean()), bool(is_true[frames].any()))
@@ -104,23 +104,23 @@ def contacts(made: Mouth, real: Mouth) -> list[Contact]:
     ]
 
 
-def closures(made: Mouth, real: Mouth) -> Detections:
-    """Compare closures. A real closure is reproduced if the made lips also close within 40 ms.
+def closures(predicted: Mouth, real: Mouth) -> Detections:
+    """Compare closures. A real closure is reproduced if the predicted lips also close within 40 ms.
 
     Adapted from the closure accuracy of Electronic Arts, which measures only recall.
 
-    In the example, there is a frame every 40 ms. The real lips close in the second frame. The made
-    lips close in the third and in the sixth.
+    In the example, there is a frame every 40 ms. The real lips close in the second frame, and the
+    predicted lips in the third and the sixth.
 
     >>> def mouth(*opening: float) -> Mouth:
     ...     curve = np.array(opening)
     ...     return Mouth(np.arange(len(curve)) / 25.0, {"opening": curve}, curve < 20.0)
-    >>> made, real = mouth(200, 200, 0, 200, 200, 0, 200), mouth(200, 0, 200, 200, 200, 200, 200)
-    >>> found = closures(made, real)
-    >>> found.recall, found.precision, round(found.f1, 2)
+    >>> predicted = mouth(200, 200, 0, 200, 200, 0, 200)
+    >>> detections = closures(predicted, mouth(200, 0, 200, 200, 200, 200, 200))
+    >>> detections.recall, detections.precision, round(detections.f1, 2)
     (1.0, 0.5, 0.67)
     """
-    real_s, made_contacts = real_closures(real), contacts(made, real)
-    num_met = int(is_closed_at(real_s, made).sum())
-    num_true = sum(contact.is_true for contact in made_contacts)
-    return Detections(len(real_s), num_met, len(made_contacts), num_true)
+    real_s, predicted_contacts = real_closures(real), contacts(predicted, real)
+    num_met = int(is_closed_at(real_s, predicted).sum())
+    num_true = sum(contact.is_true for contact in predicted_contacts)
+    return Detections(len(real_s), num_met, len(predicted_contacts), num_true)

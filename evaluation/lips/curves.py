@@ -16,7 +16,7 @@ _ROUNDING_S = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Second moments of a made and a real curve, after removal of each clip's mean."""
+    """Second moments of a predicted and a real curve, after removal of each clip's mean."""
 
     num_frames: int = 0
     products: float = 0.0
@@ -40,17 +40,17 @@ class Moments:
 
 
 def pooled_moments(pairs: Iterable[tuple[Array, Array]]) -> Moments:
-    """Compare made and real curves, a pair per clip. NaN values are ignored.
+    """Compare predicted and real curves, a pair per clip. NaN values are ignored.
 
-    >>> made, real = np.array([1.0, 2.0, 3.0]), np.array([10.0, 12.0, 11.0])
-    >>> round(pooled_moments([(made, real)]).correlation, 6)
+    >>> predicted, real = np.array([1.0, 2.0, 3.0]), np.array([10.0, 12.0, 11.0])
+    >>> round(pooled_moments([(predicted, real)]).correlation, 6)
     0.5
     """
     sums = np.zeros(4)
-    for made, real in pairs:
-        is_known = ~np.isnan(made + real)
+    for predicted, real in pairs:
+        is_known = ~np.isnan(predicted + real)
         if is_known.any():
-            x, y = (curve[is_known] - curve[is_known].mean() for curve in (made, real))
+            x, y = (curve[is_known] - curve[is_known].mean() for curve in (predicted, real))
             sums += len(x), x @ y, x @ x, y @ y
     return Moments(int(sums[0]), *map(float, sums[1:]))
 

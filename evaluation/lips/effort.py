@@ -74,9 +74,9 @@ def effort_correlation(takes: Takes) -> float | None:
 
 def speech_lip_intensity(takes: Takes) -> float | None:
     """Return the speech-lip intensity correlation coefficient (SLCC) over clips."""
-    used = [take for take in takes if len(take.made.time_s) > 1]
+    used = [take for take in takes if len(take.predicted.time_s) > 1]
     return correlate_by_speaker(
         [take.reference.clip.speaker for take in used],
         [take.reference.rms for take in used],
-        [lip_intensity(take.made) for take in used],
+        [lip_intensity(take.predicted) for take in used],
     )

@@ -3,8 +3,8 @@
 Source: Lee et al., "Perceptually accurate 3D talking head generation", CVPR 2025. The openings have
 30 frames per second, as there, and are smoothed by a Gaussian of 2 frames. Derivative dynamic time
 warping (Keogh and Pazzani 2001, with first differences) pairs frames. A pair counts if both frames
-are maxima or both are minima, and the made one is between the real curve's neighboring extrema.
-The misalignment is the mean absolute offset of the pairs of a clip.
+are maxima or minima, and the predicted one is between the real curve's neighboring extrema. The
+misalignment is the mean absolute offset of the pairs of a clip.
 
 Long clips are cut into pieces of 8 s, because the paper's sequences are sentences.
 """
@@ -21,13 +21,14 @@ RATE_HZ = 30.0
 _SMOOTHING, _PIECE = 2.0, 240  # frames
 
 
-def misalignment_s(made: Mouth, real: Mouth) -> float | None:
+def misalignment_s(predicted: Mouth, real: Mouth) -> float | None:
     """Return the MTM of a clip, seconds; None if no extrema match."""
     if len(real.time_s) < 2:
         return None
     time_s = np.arange(real.time_s[0], real.time_s[-1], 1.0 / RATE_HZ)
     curves = [
-        gaussian_filter1d(mouth.at("opening", time_s), sigma=_SMOOTHING) for mouth in (made, real)
+        gaussian_filter1d(mouth.at("opening", time_s), sigma=_SMOOTHING)
+        for mouth in (predicted, real)
     ]
     offsets = [
         offset
@@ -37,16 +38,16 @@ def misalignment_s(made: Mouth, real: Mouth) -> float | None:
     return float(np.mean(np.abs(offsets))) / RATE_HZ if offsets else None
 
 
-def match_extrema(made: Array, real: Array) -> list[int]:
-    """Return the lag of made extrema behind the real ones that they match, frames.
+def match_extrema(predicted: Array, real: Array) -> list[int]:
+    """Return the lag of predicted extrema behind the real ones that they match, frames.
 
     >>> match_extrema(np.array([0.0, 0, 1, 4, 1, 0, 2, 2]), np.array([0.0, 1, 4, 1, 0, 2, 2, 1]))
     [1, 1]
     """
-    kinds = [_extrema(curve) for curve in (made, real)]
+    kinds = [_extrema(curve) for curve in (predicted, real)]
     real_extrema = np.flatnonzero(kinds[1])
     offsets = []
-    for j, i in warping_path(*(np.diff(curve, prepend=curve[:1]) for curve in (made, real))):
+    for j, i in warping_path(*(np.diff(curve, prepend=curve[:1]) for curve in (predicted, real))):
         if kinds[1][i] and kinds[0][j] == kinds[1][i]:
             place = int(np.searchsorted(real_extrema, i))
             first = real_extrema[place - 1] if place else 0

@@ -12,7 +12,7 @@ from kouxing.evaluation.lips.take import Takes
 def correlation_in_speech(takes: Takes, curve: str) -> float | None:
     """Return the Pearson correlation of a curve with the real one, after removing clips' means."""
     return pooled_moments(
-        (take.made.at(curve, take.real.time_s)[take.in_speech], real[take.in_speech])
+        (take.predicted.at(curve, take.real.time_s)[take.in_speech], real[take.in_speech])
         for take in takes
         for real in [take.real.curves[curve]]
     ).correlation

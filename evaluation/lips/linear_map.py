@@ -26,7 +26,7 @@ from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.closures import Detections, closures
 from kouxing.evaluation.lips.curve_tables import CurveTable
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import CURVES, made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import CURVES, predicted_mouth, real_faps, real_mouth
 from kouxing.shared.face.faps import NUM_FAPS
 
 Array = NDArray[np.float64]
@@ -85,10 +85,10 @@ def _fit(clips: Sequence[LipClip], tables: Mapping[str, CurveTable], delay_s: fl
         deviation = x.std(axis=0) + 1e-6
         x /= deviation
         solution = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ y)
-        made = x @ solution
-        if name == "opening" and made.any():
-            correlation = float(np.corrcoef(made, y)[0, 1])
-            solution *= y.std() / made.std()
+        predicted = x @ solution
+        if name == "opening" and predicted.any():
+            correlation = float(np.corrcoef(predicted, y)[0, 1])
+            solution *= y.std() / predicted.std()
         weights.append(solution / deviation)
     return LinearMap(delay_s, np.stack(weights, axis=1), 0.0, correlation)
 
@@ -98,7 +98,7 @@ def _best_constant(
 ) -> float:
     """Return the constant of the opening with the best F1 of closures on some clips."""
     reals = [real_mouth(clip.time_s, real_faps(clip)) for clip in clips]
-    made = [
+    predicted = [
         linear.faps(tables[clip.name], np.arange(0.0, clip.time_s[-1], 1.0 / FRAME_RATE_HZ))
         for clip in clips
     ]
@@ -106,9 +106,9 @@ def _best_constant(
     def f1(constant: float) -> float:
         shift = np.zeros(NUM_FAPS)
         shift[_LOWER_LIP] = -constant
-        pairs = zip(made, reals, strict=True)
-        found = (closures(made_mouth(faps + shift), real) for faps, real in pairs)
+        pairs = zip(predicted, reals, strict=True)
+        found = (closures(predicted_mouth(faps + shift), real) for faps, real in pairs)
         return sum(found, Detections()).f1 or 0.0
 
-    openings = np.concatenate([CURVES["opening"](faps) for faps in made])
+    openings = np.concatenate([CURVES["opening"](faps) for faps in predicted])
     return max((float(c) for c in -np.percentile(openings, _SHUT_SHARES)), key=f1)

@@ -21,8 +21,8 @@ from kouxing.evaluation.lips.take import Measure, Takes
 
 
 def pairs_of(takes: Takes) -> list[Pair]:
-    """Return the made and the real mouth of each take."""
-    return [(take.made, take.real) for take in takes]
+    """Return the predicted and the real mouth of each take."""
+    return [(take.predicted, take.real) for take in takes]
 
 
 def misalignment_ms(takes: Takes) -> float | None:

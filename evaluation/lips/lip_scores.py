@@ -14,7 +14,7 @@ from rich.progress import track
 from kouxing.corpora.lip_clips import LipClip, aligned_phones
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
 from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
-from kouxing.evaluation.lips.mouths import Mouth, made_mouth
+from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth
 from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
 from kouxing.evaluation.lips.references import read_parts, reference_of
 from kouxing.evaluation.lips.take import Take
@@ -58,7 +58,7 @@ class Face:
 
     def mouth(self, events: Sequence[SoundEvent]) -> Mouth:
         """Return the mouth that the face shows for a recognizer's output."""
-        return made_mouth(live_frames(self.lips, events, self.delay_ms / 1e3))
+        return predicted_mouth(live_frames(self.lips, events, self.delay_ms / 1e3))
 
 
 def load_faces(

@@ -18,7 +18,7 @@ CURVES: dict[str, Callable[[Array], Array]] = {  # functions of FAPs (num_frames
     "width": lambda faps: faps[:, 5] + faps[:, 6],
     "jaw": lambda faps: faps[:, 2],
 }
-_CLOSED = 20.0  # opening of made lips in FAP units: 0.6 mm on a face
+_CLOSED = 20.0  # opening of predicted lips in FAP units: 0.6 mm on a face
 _CLOSED_SHARE = 0.1  # fraction of a real mouth's range
 
 
@@ -40,7 +40,7 @@ class Mouth:
         return np.interp(time_s, self.time_s, self.curves[name])
 
 
-def made_mouth(faps: Array) -> Mouth:
+def predicted_mouth(faps: Array) -> Mouth:
     """Return the mouth of frames (num_frames, 68) at ``FRAME_RATE_HZ``."""
     curves = {name: curve(faps) for name, curve in CURVES.items()}
     return Mouth(np.arange(len(faps)) / FRAME_RATE_HZ, curves, curves["opening"] < _CLOSED)

@@ -17,7 +17,7 @@ from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.curve_tables import CurveTable, read_tables, shipped_mouth
 from kouxing.evaluation.lips.linear_map import fit_map
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
 
 Array = NDArray[np.float64]
 MouthOf = Callable[[LipClip], Mouth]
@@ -64,7 +64,7 @@ def _shipped(
 
     def agreement(delay_s: float) -> float:
         pairs = [
-            (made_mouth(faps(clip, _frames_s(clip), delay_s)), real)
+            (predicted_mouth(faps(clip, _frames_s(clip), delay_s)), real)
             for clip, real in zip(fitting, reals, strict=True)
         ]
         return moments(pairs, "opening").correlation or 0.0
@@ -78,11 +78,15 @@ def _mouths_of(
 ) -> dict[str, MouthOf]:
     faps_of, delay_s = _shipped(folder, tables, fitting)
     title = f"{folder.name}, {1e3 * delay_s:.0f} ms"
-    mouths: dict[str, MouthOf] = {title: lambda clip: made_mouth(faps_of(clip, _frames_s(clip)))}
+    mouths: dict[str, MouthOf] = {
+        title: lambda clip: predicted_mouth(faps_of(clip, _frames_s(clip)))
+    }
     if fitting:
         linear = fit_map(fitting, tables, _DELAYS_S[::2])
         title = f"{folder.name}, fitted, {1e3 * linear.delay_s:.0f} ms"
-        mouths[title] = lambda clip: made_mouth(linear.faps(tables[clip.name], _frames_s(clip)))
+        mouths[title] = lambda clip: predicted_mouth(
+            linear.faps(tables[clip.name], _frames_s(clip))
+        )
     return mouths
 
 

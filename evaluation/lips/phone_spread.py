@@ -13,9 +13,10 @@ Array = NDArray[np.float64]
 
 
 def phone_deviations(takes: Takes) -> Array:
-    """Return made and real openings in the middle of phones, (2, n), less their classes' means.
+    """Return predicted and real openings in the middle of phones, (2, n).
 
-    The class of a phone is its speaker and its viseme. Classes with one phone are left out.
+    The mean of each class is subtracted. The class of a phone is its speaker and its viseme.
+    Classes with one phone are left out.
     """
     openings: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for take in takes:
@@ -26,7 +27,8 @@ def phone_deviations(takes: Takes) -> Array:
             viseme = take.reference.viseme_at(middle_s)
             if viseme != PAUSE and take.real.time_s[0] <= middle_s <= take.real.time_s[-1]:
                 pair = [
-                    mouth.at("opening", np.array([middle_s]))[0] for mouth in (take.made, take.real)
+                    mouth.at("opening", np.array([middle_s]))[0]
+                    for mouth in (take.predicted, take.real)
                 ]
                 openings[take.reference.clip.speaker, viseme].append((pair[0], pair[1]))
     classes = [np.array(pairs).T for pairs in openings.values() if len(pairs) > 1]
@@ -41,6 +43,6 @@ def phone_spread(takes: Takes) -> float | None:
 
 
 def phone_correlation(takes: Takes) -> float | None:
-    """Correlate made and real openings within classes of phones."""
-    made, real = phone_deviations(takes)
-    return pooled_moments([(made, real)]).correlation
+    """Correlate predicted and real openings within classes of phones."""
+    predicted, real = phone_deviations(takes)
+    return pooled_moments([(predicted, real)]).correlation

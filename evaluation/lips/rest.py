@@ -13,7 +13,7 @@ from kouxing.evaluation.lips.take import Takes
 def rest_opening(takes: Takes) -> float | None:
     """Return the mean opening while nobody speaks, FAP units. Rigs do not count: they rest at 0."""
     openings = [
-        take.made.at("opening", take.real.time_s[~take.in_speech])
+        take.predicted.at("opening", take.real.time_s[~take.in_speech])
         for take in takes
         if not take.reference.clip.is_rig
     ]
@@ -31,7 +31,7 @@ def closing_time_ms(takes: Takes) -> float | None:
         for take in takes
         if not take.reference.clip.is_rig
         for start_s, end_s in take.reference.pauses()
-        for time_s in [take.made.time_s[take.made.is_closed]]
+        for time_s in [take.predicted.time_s[take.predicted.is_closed]]
         for closed_s in [time_s[(time_s >= start_s) & (time_s <= end_s)]]
     ]
     return median(times_ms) if times_ms else None

@@ -30,7 +30,7 @@ from kouxing.evaluation.lips.four_schemes import (
     make_frames,
 )
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -100,7 +100,7 @@ def _pairs_with_aligned(
     frames: Sequence[Array | None], aligned: Sequence[Array | None]
 ) -> list[Pair]:
     return [
-        (made_mouth(faps), real_mouth(np.arange(len(reference)) / FRAME_RATE_HZ, reference))
+        (predicted_mouth(faps), real_mouth(np.arange(len(reference)) / FRAME_RATE_HZ, reference))
         for faps, reference in zip(frames, aligned, strict=True)
         if faps is not None and reference is not None
     ]
@@ -111,7 +111,7 @@ def _pairs_with_tracked(
 ) -> list[Pair]:
     clips = [sentence.sentence.clip for sentence in sentences]
     return [
-        (made_mouth(faps), real_mouth(clip.time_s, real_faps(clip)))
+        (predicted_mouth(faps), real_mouth(clip.time_s, real_faps(clip)))
         for faps, clip in zip(frames, clips, strict=True)
         if faps is not None and len(clip.time_s)
     ]
@@ -142,7 +142,7 @@ def _condition_score(
         face_delay_ms=lip_model_info(condition.lips).delay_ms if is_live else None,
         phone_delay_p50_ms=p50,
         phone_delay_p95_ms=p95,
-        jerk=rms_jerk([made_mouth(faps).opening for faps in frames], FRAME_RATE_HZ),
+        jerk=rms_jerk([predicted_mouth(faps).opening for faps in frames], FRAME_RATE_HZ),
         like_scheme_1=agreement_of(like_aligned) if like_aligned else None,
         like_real_lips=agreement_of(like_real) if like_real else None,
     )

@@ -76,10 +76,10 @@ class RateScore:
     of_phones: dict[str, float]  # accuracy over the mean mouths of phones, by method
 
 
-def accuracy_of(made: Array, real: Array) -> float:
+def accuracy_of(predicted: Array, real: Array) -> float:
     """Compare mouth FAPs, (num_frames, num_mouth_faps) each; NaN where not measured."""
-    made, real = made[:, _LIP_COLUMNS], real[:, _LIP_COLUMNS]
-    difference, size = np.abs(made - real), np.abs(real)
+    predicted, real = predicted[:, _LIP_COLUMNS], real[:, _LIP_COLUMNS]
+    difference, size = np.abs(predicted - real), np.abs(real)
     return 1.0 - float(np.nansum(difference) / np.sum(size[np.isfinite(difference)]))
 
 
@@ -117,8 +117,8 @@ def _score_rate(
     frames_of = {name: np.concatenate(mouths) for name, mouths in frames.items()}
     means_of = {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()}
 
-    def accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
-        return {name: accuracy_of(mouths, real) for name, mouths in made.items()}
+    def accuracies(predicted: Mapping[str, Array], real: Array) -> dict[str, float]:
+        return {name: accuracy_of(mouths, real) for name, mouths in predicted.items()}
 
     return RateScore(
         rate=rate,

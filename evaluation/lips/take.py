@@ -1,6 +1,6 @@
-"""Takes: a *take* is a clip with a mouth to judge.
+"""Takes: a *take* is a clip with a mouth to evaluate.
 
-The mouth is made by a lip model, or it is the clip's real one, which shows what to aim for. A
+The mouth is predicted by a lip model, or it is the clip's real one, which shows what to aim for. A
 measure pools the takes of a group of clips.
 """
 
@@ -22,10 +22,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Take:
-    """A clip and the mouth to judge. Figures are cached, because groups of clips share takes."""
+    """A clip and the mouth to evaluate. Figures are cached, because groups of clips share takes."""
 
     reference: Reference
-    made: Mouth
+    predicted: Mouth
 
     @property
     def real(self) -> Mouth:
@@ -40,22 +40,22 @@ class Take:
     @cached_property
     def opening_in_speech(self) -> Array:
         """The opening during speech, at the times of the real frames."""
-        return self.made.at("opening", self.real.time_s)[self.in_speech]
+        return self.predicted.at("opening", self.real.time_s)[self.in_speech]
 
     @cached_property
     def closures(self) -> Detections:
-        """Real and made closures."""
-        return closures(self.made, self.real)
+        """Real and predicted closures."""
+        return closures(self.predicted, self.real)
 
     @cached_property
     def contacts(self) -> list[Contact]:
         """Made closures."""
-        return contacts(self.made, self.real)
+        return contacts(self.predicted, self.real)
 
     @cached_property
     def misalignment_s(self) -> float | None:
         """Mean temporal misalignment."""
-        return misalignment_s(self.made, self.real)
+        return misalignment_s(self.predicted, self.real)
 
 
 Takes = Sequence[Take]

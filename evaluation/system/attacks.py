@@ -82,7 +82,7 @@ class Memory:
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
+class AttackResult:
     """Effects of one attack. Memory is in MB of 2^20 bytes."""
 
     attack: str
@@ -94,7 +94,7 @@ class Damage:
     p95_ms: dict[str, float | None]  # the other client's p95, by phase; None: no frame in time
 
 
-def measure(path: Path, names: Collection[str], console: Console) -> list[Damage]:
+def measure(path: Path, names: Collection[str], console: Console) -> list[AttackResult]:
     """Start the services, attack them and return the figures.
 
     The other client streams the file. ``names`` are keys of ``ATTACKS``; if empty, all run. Raises
@@ -107,41 +107,41 @@ def measure(path: Path, names: Collection[str], console: Console) -> list[Damage
     runs = [(name, target) for name in names or ATTACKS for target in ATTACKS[name].targets]
     with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
         _delays_ms(system.control, speech)  # the first session of a process is slow
-        damages = []
+        results = []
         for place, (name, target) in enumerate(runs, start=2):
             console.print(f"attack: {name}" + (f" on {target}" if target else ""))
             # A new source address each time: a service may reject one that has misbehaved.
-            damages.append(_damage(system, name, target, f"127.0.0.{place}", speech))
-        return damages
+            results.append(_result(system, name, target, f"127.0.0.{place}", speech))
+        return results
 
 
-def show(damages: list[Damage], console: Console) -> None:
+def show(results: list[AttackResult], console: Console) -> None:
     """Print the figures as a table, with the memory of the service that grew most."""
     columns = ("attack", "target", "key", "service", "growth MB", "kept MB", "p95 ms by phase")
-    print_table(console, "", columns, map(_row, damages))
+    print_table(console, "", columns, map(_row, results))
 
 
-def _row(damage: Damage) -> list[str]:
-    worst = max(damage.growth_mb, key=lambda service: damage.growth_mb[service])
-    notes = [f"{service} restarted" for service in damage.restarted]
+def _row(result: AttackResult) -> list[str]:
+    worst = max(result.growth_mb, key=lambda service: result.growth_mb[service])
+    notes = [f"{service} restarted" for service in result.restarted]
     return [
-        "; ".join([damage.attack, *notes]),
-        damage.target,
-        "yes" if damage.has_key else "no",
+        "; ".join([result.attack, *notes]),
+        result.target,
+        "yes" if result.has_key else "no",
         worst,
-        f"{damage.growth_mb[worst]:.1f}",
-        f"{damage.kept_mb[worst]:.1f}",
-        " / ".join(format_number(damage.p95_ms[phase], ".0f") for phase in PHASES),
+        f"{result.growth_mb[worst]:.1f}",
+        f"{result.kept_mb[worst]:.1f}",
+        " / ".join(format_number(result.p95_ms[phase], ".0f") for phase in PHASES),
     ]
 
 
-def _damage(
+def _result(
     system: LocalSystem,
     name: str,
     target: str,
     source: str,
     speech: NDArray[np.float32],
-) -> Damage:
+) -> AttackResult:
     with connect(system.control) as client:
         services = client.status().services
     endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
@@ -163,7 +163,7 @@ def _damage(
         memory.wait_until_kept(RELEASED_MB, deadline_s - time.monotonic())
     kept_mb = {kind: memory.kept_mb for kind, memory in memories.items()}
     has_key = ATTACKS[name].has_key
-    return Damage(name, target, has_key, growth_mb, kept_mb, restarted, delays_ms)
+    return AttackResult(name, target, has_key, growth_mb, kept_mb, restarted, delays_ms)
 
 
 def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | None]:

@@ -164,9 +164,9 @@ def attacks(
     from kouxing.evaluation.system.attacks import measure, show
 
     check_output(json_file, force=force)
-    damages = measure(SENTENCE, attack or (), CONSOLE)
-    show(damages, Console())
-    write_json(json_file, [asdict(damage) for damage in damages])
+    results = measure(SENTENCE, attack or (), CONSOLE)
+    show(results, Console())
+    write_json(json_file, [asdict(result) for result in results])
 
 
 def faults(

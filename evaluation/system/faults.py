@@ -146,8 +146,8 @@ def _cut(which: str, *, is_mended: bool) -> Actions:
     def actions(system: HostsSystem, session: str, timing: Timing) -> list[Action]:
         host = which if which == CLIENT else system.instance_of(session, which)
         cut: Action = timing.fault_at_s, functools.partial(system.network.cut, host)
-        mend: Action = timing.fault_at_s + timing.cut_s, system.network.mend
-        return [cut, mend] if is_mended else [cut]
+        restore: Action = timing.fault_at_s + timing.cut_s, system.network.restore
+        return [cut, restore] if is_mended else [cut]
 
     return actions
 

@@ -30,7 +30,7 @@ from rich.progress import track
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
 from kouxing.evaluation.lips.references import read_parts
 from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
@@ -289,7 +289,7 @@ def _shown_mouth(rows: Array, column: int, lag_s: float) -> Mouth:
     time_s = np.arange(int(rows[-1, 0] * FRAME_RATE_HZ)) / FRAME_RATE_HZ
     faps = np.zeros((len(time_s), NUM_FAPS))
     faps[:, _LOWER_LIP] = -np.interp(time_s + lag_s, rows[:, 0], rows[:, column])
-    return made_mouth(faps)
+    return predicted_mouth(faps)
 
 
 def show(pages: Sequence[LipsPage], console: Console) -> None:

@@ -90,7 +90,7 @@ class Network:
         for side in ("saddr", "daddr"):
             self._rule(f"ip {side} {address} drop", chain="cuts")
 
-    def mend(self) -> None:
+    def restore(self) -> None:
         """Connect all hosts again."""
         self._on_router("nft", "flush", "chain", "inet", "network", "cuts")
 

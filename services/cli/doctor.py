@@ -27,7 +27,7 @@ PUBLISHERS = ("phones", "faps", "events")  # accept every allowed key
 ROUTERS = {"audio": "client", "unpaced_audio": "client", "phone_input": "service"}  # and its role
 
 
-class Finding(NamedTuple):
+class CheckResult(NamedTuple):
     """The result of one check."""
 
     subject: str
@@ -35,21 +35,21 @@ class Finding(NamedTuple):
     fix: str = ""  # empty: the check passed
 
 
-def examine(given: str) -> Iterator[Finding]:
+def examine(given: str) -> Iterator[CheckResult]:
     """Yield the result of each check; ``given`` is the address of control, empty by default."""
     control, config = find_system(given)
     control = control or config.control
     address = control.partition(" ")[0]
     if reason := reach_error(*split_endpoint(address, "control"), is_zeromq=True):
-        yield Finding(f"control at {address}", "cannot be reached", reason)
+        yield CheckResult(f"control at {address}", "cannot be reached", reason)
         return
-    yield Finding(f"control at {address}", "can be reached")
+    yield CheckResult(f"control at {address}", "can be reached")
     keys: Mapping[str, Key | None] = {"none": None}
     if not config.insecure:
         try:
             keys = local_keys() or {CLIENT: user_key(control=address)}
         except UserError as error:
-            yield Finding("keys", "cannot be used", str(error))
+            yield CheckResult("keys", "cannot be used", str(error))
             return
     accepted: dict[str, Key | None] = {}
     for name, key in keys.items():
@@ -66,7 +66,7 @@ def examine(given: str) -> Iterator[Finding]:
         ) as client:
             services = client.status().services
     except UserError as error:
-        yield Finding("status", "control does not answer", str(error))
+        yield CheckResult("status", "control does not answer", str(error))
         return
     with contextlib.ExitStack() as stack:
         buses = {name: stack.enter_context(Bus(key)) for name, key in accepted.items()}
@@ -74,26 +74,28 @@ def examine(given: str) -> Iterator[Finding]:
             yield from _check_service(service, buses)
     for name in MIN_SERVICES:
         if name not in {service.service for service in services}:
-            yield Finding(name, "is not running", f"start it: kouxing {name} --config kouxing.toml")
+            yield CheckResult(
+                name, "is not running", f"start it: kouxing {name} --config kouxing.toml"
+            )
 
 
-def _check_key(name: str, key: Key | None, address: str) -> Finding:
+def _check_key(name: str, key: Key | None, address: str) -> CheckResult:
     control = with_key(address, key.control if key else "")
     try:
         with Bus(key) as bus:
             result = bus.probe(control)
     except UserError as error:
-        return Finding(f"key {name}", "cannot be used", str(error))
+        return CheckResult(f"key {name}", "cannot be used", str(error))
     if result is ProbeResult.ACCEPTED:
-        return Finding(f"key {name}", "control accepts it")
+        return CheckResult(f"key {name}", "control accepts it")
     running, _, running_key = find_control().partition(" ")
     if key is not None and running == address and running_key not in ("", key.control):
-        return Finding(
+        return CheckResult(
             f"key {name}",
             "belongs to another system than this control",
             "set XDG_STATE_HOME to the same folder as for 'kouxing run'",
         )
-    return Finding(
+    return CheckResult(
         f"key {name}", "control does not accept it", rejection_hint(control, name, _roles(name))
     )
 
@@ -103,7 +105,7 @@ def _roles(name: str) -> Collection[str]:
     return KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
 
 
-def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[Finding]:
+def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[CheckResult]:
     problems = []
     if service.age_s > MAX_AGE_S:
         problems.append(f"silent for {service.age_s:.0f} s; look at its log")
@@ -123,7 +125,7 @@ def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[
             problems.append(f"{name} at {address}: {problem}")
     endpoints = plural(len(service.endpoints), "endpoint")
     about = f"{endpoints}, clock {service.clock_offset_ms:+z.0f} ms"
-    yield Finding(service.instance, about, "\n".join(problems))
+    yield CheckResult(service.instance, about, "\n".join(problems))
 
 
 def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str:

@@ -10,7 +10,7 @@ from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 
 from kouxing.services.cli.curves import CURVE_EXPORTERS, CurveExporter, Curves, Row, json_line
 from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
-from kouxing.services.cli.streaming import missed_remark
+from kouxing.services.cli.streaming import missed_warning
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
@@ -71,7 +71,7 @@ def follow(
         unit = "mouth shape"
     print_message(f"session {followed.name} ended: {plural(count, unit)}")
     if results.num_missed:
-        print_message(missed_remark(results.num_missed, "frame" if shows_faps else "phone"))
+        print_message(missed_warning(results.num_missed, "frame" if shows_faps else "phone"))
     if output is not None:
         print_message(f"wrote {output}")
 

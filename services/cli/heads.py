@@ -71,8 +71,8 @@ def import_mesh(
     from kouxing.services.driver.head.import_head import import_head
 
     check_output(output, inputs=[mesh, points], force=force)
-    for remark in import_head(mesh, points, output):
-        print_message(remark)
+    for warning in import_head(mesh, points, output):
+        print_message(warning)
     print_message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
 
 

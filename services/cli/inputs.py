@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.shared.audio_file import clipping_remarks, limited_blocks, num_clipped, open_audio
+from kouxing.shared.audio_file import clipping_warnings, limited_blocks, num_clipped, open_audio
 from kouxing.shared.channels import Samples
 from kouxing.shared.terminal import print_message
 
@@ -37,6 +37,6 @@ def read_mono_16k(
         num_samples += block.size
         clipped += num_clipped(block)
     content += resampler.finish().data
-    for remark in (*source.remarks, *clipping_remarks(str(path), clipped / max(1, num_samples))):
-        print_message(remark)
+    for warning in (*source.warnings, *clipping_warnings(str(path), clipped / max(1, num_samples))):
+        print_message(warning)
     return np.frombuffer(content, np.float32)

@@ -102,8 +102,8 @@ def run(
         more=extra_worker_environments(settings, workers),
     )
     _install_signal_handlers()
-    if remark := _port_remark(settings, addresses, control):
-        print_message(remark)
+    if warning := _port_warning(settings, addresses, control):
+        print_message(warning)
     try:
         with CONSOLE.status(f"starting {', '.join(KINDS)}"):
             ensure_page_heads()
@@ -181,7 +181,7 @@ def _control_address(bound: str) -> str:
     return with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
 
 
-def _port_remark(settings: Settings, moved: Mapping[str, str], control: str) -> str:
+def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) -> str:
     """Return a message about default ports that are in use, or an empty string."""
     taken = [
         setting.text
@@ -194,12 +194,12 @@ def _port_remark(settings: Settings, moved: Mapping[str, str], control: str) -> 
         owner = f"another kouxing is running, with control at {running.partition(' ')[0]}"
     else:
         owner = f"other programs use {', '.join(taken)}"
-    remarks = [f"{owner}; this kouxing uses free ports"] if taken else []
+    warnings = [f"{owner}; this kouxing uses free ports"] if taken else []
     if BOUND_CONTROL in moved:
-        remarks.append(
+        warnings.append(
             f"your commands use this kouxing; for other programs, set KOUXING_CONTROL={control}"
         )
-    return "; ".join(remarks)
+    return "; ".join(warnings)
 
 
 def _install_signal_handlers() -> None:

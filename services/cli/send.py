@@ -38,38 +38,38 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
         for target in targets:
             senders.start(target)
             print_message(f"sending {target.contents} to {target.url}; press Ctrl-C to stop")
-        with _Search(session, client, senders) as search:
+        with _SessionFinder(session, client, senders) as search:
             _send_frames(search, client, senders)
 
 
 @dataclass(frozen=True, slots=True)
-class _Opening:
+class _OpenedSession:
     """The name of a session, and when it was opened at the earliest and at the latest."""
 
     session: str
     earliest_s: float
     latest_s: float
 
-    def is_after(self, other: _Opening) -> bool:
+    def is_after(self, other: _OpenedSession) -> bool:
         """Return whether this is another session, also if it has the same name."""
         return self.session != other.session or self.earliest_s > other.latest_s + _TOLERANCE_S
 
 
-class _Search:
+class _SessionFinder:
     """Asks control for the session to follow, in a thread because answers may take long.
 
     The targets' face at rest shows the expressions that control reports.
     """
 
     def __init__(self, session: str, client: Client, senders: Senders) -> None:
-        self.newest: _Opening | None = None
+        self.newest: _OpenedSession | None = None
         self._session = session
         self._client = client
         self._senders = senders
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> _Search:
+    def __enter__(self) -> _SessionFinder:
         self._thread.start()
         return self
 
@@ -90,7 +90,7 @@ class _Search:
                 ]
                 if published:
                     newest = min(published, key=lambda state: state.age_s)
-                    self.newest = _Opening(
+                    self.newest = _OpenedSession(
                         newest.session, asked_s - newest.age_s, answered_s - newest.age_s
                     )
                 face = status.resting_face
@@ -98,9 +98,9 @@ class _Search:
                     self._senders.express(face["expressions"], face["hold_s"])
 
 
-def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
+def _send_frames(search: _SessionFinder, client: Client, senders: Senders) -> None:
     """Send the frames of the session that was found last, forever."""
-    followed: _Opening | None = None
+    followed: _OpenedSession | None = None
     session: Session | None = None
     frames: Results[FapFrame] | None = None
     while True:

@@ -11,7 +11,7 @@ from kouxing_client import Client, KouxingError, Phone, Refused
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kouxing.shared.audio_file import AudioSource, clipping_remarks, num_clipped
+from kouxing.shared.audio_file import AudioSource, clipping_warnings, num_clipped
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt
@@ -61,7 +61,7 @@ def stream(
         )
 
 
-def missed_remark(count: int, noun: str) -> str:
+def missed_warning(count: int, noun: str) -> str:
     """Return the message about results that did not arrive."""
     return (
         f"missed at least {plural(count, noun)}; close other programs or use a faster network,"
@@ -113,9 +113,9 @@ class _Streaming:
             reason = "; it is silent" if self._peak < QUIET_PEAK else ""
             self._warn(f"{source.name}: no speech was found{reason}")
         if self._phones.num_missed:
-            self._warn(missed_remark(self._phones.num_missed, "phone"))
-        for remark in (*source.remarks, *clipping_remarks(source.name, self._clipped)):
-            self._warn(remark)
+            self._warn(missed_warning(self._phones.num_missed, "phone"))
+        for warning in (*source.warnings, *clipping_warnings(source.name, self._clipped)):
+            self._warn(warning)
         return StreamSummary(self._session.name, self._duration_s, self._num_phones, video)
 
     def _progress(self) -> Progress:

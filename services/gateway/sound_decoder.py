@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.shared.audio_file import clipping_remarks, limited_blocks, num_clipped, open_audio
+from kouxing.shared.audio_file import clipping_warnings, limited_blocks, num_clipped, open_audio
 from kouxing.shared.errors import USER_ERROR, UserError
 
 MAX_DURATION_S = 3600
@@ -16,7 +16,7 @@ MAX_MEMORY_BYTES = 4 << 30
 
 
 def decode(path: Path) -> None:
-    """Write the sound, mono, and print the remarks of a file to standard error.
+    """Write the sound, mono, and print the warnings of a file to standard error.
 
     Raises ``UserError`` if the file cannot be read or is too long.
     """
@@ -30,8 +30,8 @@ def decode(path: Path) -> None:
             mono = np.rint(block.mean(axis=1) * 32768).clip(-32768, 32767)
             output.writeframes(mono.astype("<i2").tobytes())
     share = clipped / max(1, num_samples * source.num_channels)
-    for remark in (*source.notices, *source.remarks, *clipping_remarks(str(path), share)):
-        print(remark, file=sys.stderr)
+    for warning in (*source.notices, *source.warnings, *clipping_warnings(str(path), share)):
+        print(warning, file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -37,11 +37,11 @@ def template(node: ast.expr) -> str:
 
 
 def sent_texts(source: str) -> Iterator[str]:
-    """Yield the texts of errors, remarks and problems in a module."""
+    """Yield the texts of errors, warnings and problems in a module."""
     for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8"))):
         if isinstance(node, ast.Call) and node.args:
             name = ast.unparse(node.func)
-            if name.endswith(("UserError", "_error", "remarks.append", "notices.append")):
+            if name.endswith(("UserError", "_error", "warnings.append", "notices.append")):
                 yield template(node.args[-1])
         elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith(".problem"):
             yield template(node.value)

@@ -69,7 +69,7 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
         host = system.instance_of(session.name, host)
     steps: list[tuple[float, Callable[[], object]]] = [
         (CUT_AT_S, functools.partial(system.network.cut, host)),
-        (CUT_AT_S + cut_s, system.network.mend),
+        (CUT_AT_S + cut_s, system.network.restore),
     ]
 
     def on_step() -> None:

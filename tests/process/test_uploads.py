@@ -42,7 +42,7 @@ time.sleep(60)
 """
 
 
-Answer = tuple[int, bytes, str]  # status, body, remarks
+Answer = tuple[int, bytes, str]  # status, body, warnings
 Post = Callable[..., Awaitable[Answer]]
 SINE = 0.5 * np.sin(np.arange(32_000) * 0.1)
 
@@ -58,8 +58,8 @@ async def serve(uploads: Uploads) -> AsyncIterator[Post]:
 
         async def post(data: bytes = b"abc", name: str = "") -> Answer:
             async with http.post(address, params={"name": name}, data=io.BytesIO(data)) as answer:
-                remarks = unquote(answer.headers.get(REMARKS_HEADER, ""))
-                return answer.status, await answer.read(), remarks
+                warnings = unquote(answer.headers.get(REMARKS_HEADER, ""))
+                return answer.status, await answer.read(), warnings
 
         try:
             yield post
@@ -158,8 +158,8 @@ async def test_answers_a_file_with_its_sound() -> None:
     six = np.zeros((len(SINE), 6))
     six[:, 2] = SINE  # which browsers would mix into another sound than FFmpeg
     async with serve(SoundUpload()) as post:
-        status, data, remarks = await post(written("FLAC", six), "a film.flac")
-    assert (status, remarks) == (200, "")
+        status, data, warnings = await post(written("FLAC", six), "a film.flac")
+    assert (status, warnings) == (200, "")
     samples, rate_hz = soundfile.read(io.BytesIO(data))
     assert rate_hz == 16_000
     np.testing.assert_allclose(samples, 0.707 * SINE, atol=1e-3)
@@ -169,10 +169,10 @@ async def test_answers_a_file_with_its_sound() -> None:
 async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
     async with serve(SoundUpload()) as post:
         for name in ("wave.py", "../../x", "-", "口型.wav"):
-            status, _, remarks = await post(written("WAV", SINE)[:40_000], name)
+            status, _, warnings = await post(written("WAV", SINE)[:40_000], name)
             assert status == 200
-            assert "the file is cut off after 1.2 s of 2.0 s" in remarks
-            assert "/" not in remarks.partition(":")[0]
+            assert "the file is cut off after 1.2 s of 2.0 s" in warnings
+            assert "/" not in warnings.partition(":")[0]
 
 
 @async_test

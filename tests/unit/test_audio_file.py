@@ -89,7 +89,7 @@ def test_reads_a_wav_file_whose_header_states_no_length(
     path.write_bytes(data)
     source = open_audio(path)
     np.testing.assert_allclose(np.concatenate([*source.blocks])[:, 0], sine, atol=1e-4)
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_uses_one_channel_of_two_that_cancel_each_other(tmp_path: Path) -> None:
     source = open_audio(tmp_path / "a.wav")
     read = np.concatenate([*source.blocks])
     np.testing.assert_allclose(read.mean(axis=1), sine, atol=1e-4)
-    (remark,) = source.remarks
-    assert "only channel 1 is used" in remark
+    (warning,) = source.warnings
+    assert "only channel 1 is used" in warning
 
 
 def test_keeps_two_channels_unchanged(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_reads_the_formats_of_phones_and_browsers(
     assert {len(block) for block in blocks[:-1]} == {round(0.02 * rate_hz)}
     assert len(samples) / rate_hz == pytest.approx(1.0, abs=0.1)
     assert np.argmax(np.abs(np.fft.rfft(samples[:rate_hz]))) == pytest.approx(440, abs=10)
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 @pytest.mark.parametrize("suffix", ["ul", "al", "sw"])

@@ -77,7 +77,7 @@ def test_decodes_a_pipe_like_a_file(
     assert is_read_first or source.duration_s is None
     assert len(samples) == len(expected) or suffix == "mp3"  # its padding at the end
     np.testing.assert_array_equal(samples[: len(expected)], expected)
-    assert source.remarks == source.notices == []
+    assert source.warnings == source.notices == []
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_reports_a_caf_file_that_is_cut_off(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-32_000])
     source = open_audio(path)
     assert sum(map(len, source.blocks)) == 16_000
-    (remark,) = source.remarks
-    assert remark.startswith(f"{path}: the file is cut off after 1.0 s of")
+    (warning,) = source.warnings
+    assert warning.startswith(f"{path}: the file is cut off after 1.0 s of")
 
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "PCM_24", "PCM_U8", "ALAW", "ULAW"])
@@ -143,7 +143,7 @@ def test_reads_all_parts_of_a_wav_file(monkeypatch: pytest.MonkeyPatch, tmp_path
     for source in (open_audio(path), _open(monkeypatch, path.read_bytes())):
         samples = np.concatenate([*source.blocks])[:, 0]
         np.testing.assert_allclose(samples, np.tile(SPEECH, 2), atol=1e-4)
-        assert source.remarks == []
+        assert source.warnings == []
 
 
 @pytest.mark.parametrize(("bits", "valid_bits"), [(32, 24), (32, 20), (32, 16), (24, 20)])
@@ -182,7 +182,7 @@ def test_reports_a_wrong_wav_header(
         try:
             source = _open(monkeypatch, bytes(data)) if is_pipe else open_audio(path)
             assert sum(map(len, source.blocks)) == 8000
-            text = source.remarks[0]
+            text = source.warnings[0]
         except UserError as error:
             text = str(error)
         assert message in text
@@ -195,7 +195,7 @@ def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(
     source = _open(monkeypatch, (tmp_path / "a.wav").read_bytes()[: 2 * 96_000 * 2 + 44])
     for _ in source.blocks:
         pass
-    assert "cut off after 2.0 s of 4.0 s" in source.remarks[0]
+    assert "cut off after 2.0 s of 4.0 s" in source.warnings[0]
 
 
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])

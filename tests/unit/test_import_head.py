@@ -39,8 +39,8 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Head:
         part.vertices = place(part.vertices)
     write_glb(folder / "face.glb", parts)
     (folder / "points.tsv").write_text(lines(ORIGINAL, place), encoding="utf-8")
-    remarks = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
-    assert remarks == [
+    warnings = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
+    assert warnings == [
         "no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"
     ]
     return Head.load(folder / "face.npz")
@@ -98,8 +98,8 @@ def test_obj_with_vertex_numbers_and_seams(tmp_path: Path) -> None:
     eyes = {"3.5": ORIGINAL.eye_centers[0], "3.6": ORIGINAL.eye_centers[1]}
     rows += [f"{name} {' '.join(map(str, place))}  # inside" for name, place in eyes.items()]
     (tmp_path / "points.txt").write_text("\n".join(rows), encoding="utf-8")
-    remarks = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
-    assert "no eyeballs separate from the skin: the eyes do not rotate" in remarks
+    warnings = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
+    assert "no eyeballs separate from the skin: the eyes do not rotate" in warnings
     head = Head.load(tmp_path / "out.npz")
     shift = moved(head, OPEN)
     assert shift[head.feature_points["2.3"], 1] < -0.4 * head.fapu["MNS"]
@@ -229,5 +229,5 @@ def test_reports_joined_lips(tmp_path: Path) -> None:
     write_glb(tmp_path / "face.glb", [part])
     rows = [f"{name} {' '.join(map(str, part.vertices[v]))}" for name, v in points.items()]
     (tmp_path / "points.tsv").write_text("\n".join(rows), encoding="utf-8")
-    remarks = import_head(tmp_path / "face.glb", tmp_path / "points.tsv", tmp_path / "out.npz")
-    assert any("the lips are joined" in remark for remark in remarks)
+    warnings = import_head(tmp_path / "face.glb", tmp_path / "points.tsv", tmp_path / "out.npz")
+    assert any("the lips are joined" in warning for warning in warnings)

@@ -26,7 +26,7 @@ from kouxing.evaluation.lips.closures import Detections, closures, contacts, is_
 from kouxing.evaluation.lips.curves import num_turns, pooled_moments
 from kouxing.evaluation.lips.effort import correlate_by_speaker, lip_intensity, opening_range
 from kouxing.evaluation.lips.extrema import match_extrema, misalignment_s, warping_path
-from kouxing.evaluation.lips.mouths import Mouth, made_mouth, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.lips.references import Reference
 from kouxing.evaluation.lips.take import Take
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -42,7 +42,7 @@ def mouth_of(opening: Array) -> Mouth:
     faps = np.zeros((len(opening), NUM_FAPS))
     faps[:, 4] = -opening
     faps[:, 5] = faps[:, 2] = opening
-    return made_mouth(faps)
+    return predicted_mouth(faps)
 
 
 def mouth(*closed: tuple[float, float], opening: float = 300.0) -> Mouth:
@@ -104,7 +104,7 @@ def test_counts_missed_and_false_closures() -> None:
     real = mouth((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
     made = mouth((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
     hits = closures(made, real)
-    assert hits == Detections(real=3, met=2, made=4, true=2)
+    assert hits == Detections(real=3, met=2, predicted=4, true=2)
     assert hits.recall == pytest.approx(2 / 3)
     assert hits.precision == 0.5
     assert hits.f1 == pytest.approx(4 / 7)
@@ -124,7 +124,7 @@ def test_closures_after_the_end_of_the_clip_do_not_count() -> None:
     is_known = real.time_s < 3.0
     curves = {"opening": real.opening[is_known]}
     clip = Mouth(real.time_s[is_known], curves, real.is_closed[is_known])
-    assert closures(made, clip) == Detections(real=2, met=1, made=1, true=1)
+    assert closures(made, clip) == Detections(real=2, met=1, predicted=1, true=1)
 
 
 def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:

@@ -39,14 +39,14 @@ def test_honors_gaps_in_timestamps(tmp_path: Path, name: str, codec: str) -> Non
     (first, second) = _spans(samples[: len(samples) // 480 * 480])
     assert first == pytest.approx((0.0, 1.0), abs=0.06)
     assert second == pytest.approx((5.0, 6.0), abs=0.06)
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 def test_an_avi_file_with_a_gap_is_not_cut_off(tmp_path: Path) -> None:
     write_tracks(tmp_path / "a.avi", "libmp3lame", [[(0.0, TONE), (5.0, TONE)]], RATE_HZ)
     source = open_audio(tmp_path / "a.avi")
     assert len(_read(source)) == pytest.approx(2 * RATE_HZ, abs=3000)
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_honors_the_start_of_a_late_track(tmp_path: Path, name: str, codec: str)
     source = open_audio(tmp_path / name)
     samples = _read(source)
     assert _spans(samples[: len(samples) // 480 * 480]) == [pytest.approx((2.0, 3.0), abs=0.06)]
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_honors_the_start_of_the_only_track(
     write_media(tmp_path / "a.mkv", "pcm_s16le", TONE, RATE_HZ, start_s=start_s)
     source = open_audio(tmp_path / "a.mkv")
     assert _spans(_read(source)) == [pytest.approx((silence_s, silence_s + 1.0), abs=0.02)]
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 @pytest.mark.parametrize(
@@ -101,8 +101,8 @@ def test_says_where_a_joined_file_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "a.ogg").write_bytes(data)
     source = open_audio(tmp_path / "a.ogg")
     assert len(_read(source)) == pytest.approx(16_000, abs=600)
-    (remark,) = source.remarks
-    assert "cannot be read after 1.0 s" in remark
+    (warning,) = source.warnings
+    assert "cannot be read after 1.0 s" in warning
 
 
 @pytest.mark.parametrize("codec", ["aac", "pcm_s16le"])
@@ -152,7 +152,7 @@ def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
     "name",
     [f"a.{suffix}" for suffix in "wav rf64 w64 aiff flac mp3 mkv mp4 avi wma ogg".split()],
 )
-def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
+def test_warns_about_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     path, samples = tmp_path / name, np.tile(TONE, 3)
     codecs = {".mp4": "aac", ".wma": "wmav2", ".ogg": "libopus"}
     codecs |= dict.fromkeys((".mkv", ".avi"), "pcm_s16le")
@@ -162,7 +162,7 @@ def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
         soundfile.write(path, samples, RATE_HZ)
     source = open_audio(path)
     assert len(_read(source)) >= 3 * RATE_HZ
-    assert source.remarks == []
+    assert source.warnings == []
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2 + 1])
     source = open_audio(path)
@@ -170,16 +170,16 @@ def test_remarks_on_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     samples = _read(source)[:RATE_HZ]
     spans = _spans(samples[: len(samples) // 480 * 480])
     assert spans == [pytest.approx((delay_s, 1.0), abs=0.06)]
-    (remark,) = source.remarks
-    assert "cut off after" in remark
-    assert "of 3." in remark or name == "a.ogg"  # its header states no length
+    (warning,) = source.warnings
+    assert "cut off after" in warning
+    assert "of 3." in warning or name == "a.ogg"  # its header states no length
 
 
 def test_a_track_that_ends_before_the_video_is_not_cut_off(tmp_path: Path) -> None:
     write_media(tmp_path / "a.mkv", "aac", TONE, RATE_HZ, video_s=4.0)
     source = open_audio(tmp_path / "a.mkv")
     assert len(_read(source)) == pytest.approx(RATE_HZ, abs=4000)
-    assert source.remarks == []
+    assert source.warnings == []
 
 
 def test_leaves_out_damage_and_reports_it(tmp_path: Path) -> None:
@@ -192,8 +192,8 @@ def test_leaves_out_damage_and_reports_it(tmp_path: Path) -> None:
     samples = _read(source)
     np.testing.assert_allclose(samples[-RATE_HZ:], noise[-RATE_HZ:], atol=1e-4)
     assert len(samples) == 4 * RATE_HZ
-    (remark,) = source.remarks
-    assert "damaged near 2." in remark
+    (warning,) = source.warnings
+    assert "damaged near 2." in warning
 
 
 def test_rejects_encrypted_sound(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_a_cover_picture_is_not_a_video(tmp_path: Path) -> None:
     (tmp_path / "a.mp3").write_bytes(data)
     source = open_audio(tmp_path / "a.mp3")
     assert len(_read(source)) == RATE_HZ
-    assert source.remarks == []
+    assert source.warnings == []
     with pytest.raises(UserError, match="must have images"):
         check_video(tmp_path / "a.mp3")
 

@@ -11,7 +11,7 @@ from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.closures import closures
 from kouxing.evaluation.lips.curve_tables import read_table, read_tables, shipped_mouth
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import made_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
 from kouxing.evaluation.lips.other_programs import load_programs, load_shipped
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -68,7 +68,7 @@ def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
 def test_the_faps_of_a_program_are_at_its_best_delay(tmp_path: Path) -> None:
     write_table(tmp_path / "held_1.csv", late_opening())
     real = real_mouth(HELD.time_s, real_faps(HELD))
-    made = made_mouth(load_shipped(tmp_path, [HELD])(HELD, np.arange(430) / FRAME_RATE_HZ))
+    made = predicted_mouth(load_shipped(tmp_path, [HELD])(HELD, np.arange(430) / FRAME_RATE_HZ))
     correlation = moments([(made, real)], "opening").correlation
     assert correlation is not None
     assert correlation > 0.99

@@ -44,7 +44,7 @@ Index = NDArray[np.int64]
 def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     """Write a head (``.npz``) made from a mesh and its feature points.
 
-    The mesh is a face at rest with a closed mouth; y is up. Returns remarks for the user about
+    The mesh is a face at rest with a closed mouth; y is up. Returns warnings for the user about
     parts that will not move.
 
     Raises ``UserError`` if a file cannot be read or written, or the mesh and points are not a face.
@@ -57,10 +57,10 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
         raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
     given = read_points(points)
     places = _places(mesh, points, pieces, given)
-    arrays, remarks = _Import(mesh, points, pieces, places, given).run()
+    arrays, warnings = _Import(mesh, points, pieces, places, given).run()
     with open_output(output) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-    return remarks
+    return warnings
 
 
 def _places(mesh: Path, path: Path, pieces: list[Primitive], points: Points) -> dict[str, Float64]:
@@ -94,14 +94,14 @@ class _Import:
         given: Points,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
-        self._remarks: list[str] = []
+        self._warnings: list[str] = []
         self._fapu_given = given.fapu
         self._find_frame(places)
         self._join()
         self._snap(places)
 
     def run(self) -> tuple[dict[str, NDArray[np.generic]], list[str]]:
-        """Return the arrays of the head's file, and remarks."""
+        """Return the arrays of the head's file, and warnings."""
         fapu = self._measure()
         skin, local, inside = self._skin
         points = {name: int(local[v]) for name, v in self._points.items() if local[v] >= 0}
@@ -124,7 +124,7 @@ class _Import:
             },
             eye_centers=self._eyes,
         )
-        return arrays, self._remarks
+        return arrays, self._warnings
 
     def _fail(self, text: str) -> UserError:
         return UserError(f"{self._path}: {text}")
@@ -313,7 +313,7 @@ class _Import:
                 for fap, field in face.fields.items():
                     fields[fap][rows] = share * field[nearest]
         if (roles == 0).all():
-            self._remarks.append("no eyeballs separate from the skin: the eyes do not rotate")
+            self._warnings.append("no eyeballs separate from the skin: the eyes do not rotate")
         return {fap: field[self._weld_of] for fap, field in fields.items()}, roles[self._weld_of]
 
     def _eye_of(self, middle: Float64, size: Float64) -> int:
@@ -358,12 +358,12 @@ class _Import:
             if fap.number not in fields and fap.fapu != "AU" and fap.number not in (27, 28)
         ]
         if still:
-            self._remarks.append(
+            self._warnings.append(
                 f"no points for these FAPs, so they have no effect: {', '.join(still)}"
             )
         skin, _, inside = self._skin
         along = Geodesics(self._welded[skin], inside).distance(np.array([points["2.2"]]))
         if along[points["2.3"]] < 0.05 * EYE_DISTANCE_M:
-            self._remarks.append(
+            self._warnings.append(
                 "the lips are joined between 2.2 and 2.3, so the mouth cannot open; cut it open"
             )
