@@ -54,7 +54,7 @@ def heads(
     ] = None,
 ) -> None:
     """Create a study of the built-in heads, with a one-minute video of each head."""
-    from kouxing.evaluation.mos.heads import write_head_videos
+    from kouxing.evaluation.head_videos import write_head_videos
     from kouxing.evaluation.mos.study import check_no_study, new_study
     from kouxing.services.recognizer.acoustic.load import load_model
 

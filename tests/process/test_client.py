@@ -88,7 +88,7 @@ def test_streams_audio_and_receives_results(control: FakeControl, client: Client
         control.publish(control.faps, frame(1), frame(2), END)
         found = list(results)
         assert results.has_ended
-        with pytest.raises(KouxingError, match="whole samples"):
+        with pytest.raises(KouxingError, match="complete samples"):
             session.try_push(bytes(6))
     frames = [result for result in found if isinstance(result, FapFrame)]
     shapes = [result for result in found if isinstance(result, Shapes)]

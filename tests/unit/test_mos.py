@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from kouxing.evaluation.head_videos import join_recordings
 from kouxing.evaluation.mos.commands import app
-from kouxing.evaluation.mos.heads import join_recordings
 from kouxing.evaluation.mos.report import make_report, mean_of, opinion_of, print_report
 from kouxing.evaluation.mos.store import FILE_NAME as ANSWERS
 from kouxing.evaluation.mos.store import Answer, Store, read_answers

@@ -1,7 +1,7 @@
-"""A client of kouxing: send speech to a running system, receive phones, faces and blend shapes.
+"""The kouxing client: send speech to a running system; receive phones, FAP frames and blendshapes.
 
-``Client`` is for programs without an event loop, ``AsyncClient`` for asyncio. Both do the same. A
-thread in the background sends lost messages again, and follows sessions that move.
+``Client`` blocks. ``AsyncClient`` has the same methods for asyncio. A background thread resends
+lost messages and follows sessions that move to another worker.
 """
 
 from kouxing_client.aio import AsyncClient, AsyncResults, AsyncSession

@@ -1,4 +1,4 @@
-"""The client for asyncio: like ``client``, but calls that block there are awaited here."""
+"""The asyncio client. It has the methods of ``Client``; those that block are coroutines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ T = TypeVar("T", bound=Result | Event)
 
 
 class AsyncSignal:
-    """Wakes tasks of the event loop that waits first."""
+    """Wakes the waiting tasks of one event loop."""
 
     def __init__(self) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -90,12 +90,12 @@ class AsyncClient(BaseClient):
         await self.request("set-face", session, face=settings)
 
     async def request(self, kind: str, session: str = "", **fields: object) -> Fields:
-        """Send any request, as ``Client.request``."""
+        """Send a request, as ``Client.request``."""
         return await asyncio.wrap_future(self._request(kind, session, fields))
 
 
 class AsyncSession(BaseSession):
-    """One session; ``BaseSession`` describes what it does by itself."""
+    """One session. ``BaseSession`` describes the common behavior."""
 
     _signal: AsyncSignal
 
@@ -118,7 +118,7 @@ class AsyncSession(BaseSession):
         self._finish()
 
     async def flush(self) -> None:
-        """Interrupt, as ``Session.flush``."""
+        """Interrupt the speech, as ``Session.flush``."""
         await asyncio.wrap_future(self._flush())
 
     async def set_face(self, **settings: Unpack[FaceSettings]) -> None:
@@ -137,25 +137,25 @@ class AsyncSession(BaseSession):
         await asyncio.wrap_future(self._thread.forget(self._core))
 
     async def frames(self) -> AsyncResults[FapFrame]:
-        """Return the FAP frames from now on, as ``Session.frames``."""
+        """Subscribe to FAP frames, as ``Session.frames``."""
         return await self._join((FapFrame,))
 
     async def phones(self) -> AsyncResults[Phone]:
-        """Return the phones from now on, as ``Session.phones``."""
+        """Subscribe to phones, as ``Session.phones``."""
         return await self._join((Phone,))
 
     async def shapes(self, name: str) -> AsyncResults[Shapes]:
-        """Return weights of blend shapes from now on, as ``Session.shapes``."""
+        """Subscribe to blendshape weights, as ``Session.shapes``."""
         return await self._join((Shapes,), name)
 
     async def results(
         self, *classes: type[Result], shapes: str = "", keep_all: bool = False
     ) -> AsyncResults[Any]:
-        """Return results of several classes from now on, as ``Session.results``."""
+        """Subscribe to results of several classes, as ``Session.results``."""
         return await self._join(classes, shapes, keep_all)
 
     def events(self) -> AsyncResults[Event]:
-        """Return control's events about the session, as ``Session.events``."""
+        """Subscribe to control's events about the session, as ``Session.events``."""
         return AsyncResults(*self._read_events())
 
     async def _join(
@@ -172,7 +172,7 @@ class AsyncSession(BaseSession):
 
 
 class AsyncResults(BaseResults, Generic[T]):
-    """Results of one session; iteration ends with the session's last face."""
+    """Results of one session. Iteration ends with the session's last frame."""
 
     _signal: AsyncSignal
 

@@ -22,30 +22,30 @@ LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before
 
 
 class FaceSettings(TypedDict, total=False):
-    """How a face moves; a setting that is absent stays as it is."""
+    """How a face moves. Omitted settings keep their values."""
 
     lip_model: str
-    """lip model that moves the mouth"""
+    """name of the lip model"""
     acoustic: str
-    """``light`` finds phones in less time with more errors; ``full`` switches back"""
+    """acoustic model: ``full``, or ``light`` with less processor time and more errors"""
     expressions: Mapping[str, float]
-    """strengths from 0 to 1 by name, in place of those before; ``{}`` fades them now"""
+    """strengths from 0 to 1 by name; they replace the current ones, and ``{}`` removes them"""
     hold_s: float
-    """how long the expressions stay before they fade"""
+    """time until the expressions fade, s"""
     expressiveness: float
-    """scale of the mouth's motion, 0.5 to 2"""
+    """scale of the mouth movements, 0.5 to 2"""
     feeling: float
-    """strength of the voice's feeling on the face, 0 to 1"""
+    """how strongly the face shows the emotion in the voice, 0 to 1"""
     still: bool
-    """whether head and brows stay still"""
+    """whether to keep the head and the brows still"""
     eye_contact: bool
-    """whether the eyes stay on the viewer"""
+    """whether the eyes always look at the viewer"""
     listen_to: str
-    """session to listen to: the face looks at the viewer and nods in pauses; ``""``: none"""
+    """session to which the face listens: it looks at the viewer and nods in pauses; or ``""``"""
     listening: bool
-    """whether someone else speaks, if no session carries that voice"""
+    """whether someone without a session is speaking, to whom the face listens"""
     shapes: Sequence[str]
-    """sets of blend shapes to publish as well"""
+    """blendshape sets to publish in addition to FAPs"""
 
 
 class BaseClient:
@@ -93,10 +93,10 @@ class BaseClient:
 
 
 class BaseSession:
-    """One session: this program may send audio if it opened the session, and receives results.
+    """One session. Any program can receive its results; the program that opened it sends audio.
 
-    Lost messages are sent again, and results follow when the session moves to another process.
-    Leaving the session as a context manager closes it.
+    Lost messages are resent. Results continue when the session moves to another worker. The session
+    is a context manager that closes it at the end.
     """
 
     _signal: Any  # wakes what waits for the session
@@ -129,12 +129,12 @@ class BaseSession:
         return 0 if self._core.stream is None else self._core.stream.media_time
 
     def try_push(self, pcm: bytes) -> bool:
-        """Send PCM without waiting; return False if too much audio is on its way.
+        """Send PCM without blocking. Return False if too much audio is unacknowledged.
 
         Raises
         ------
         KouxingError
-            If the session is over, or another program opened it.
+            If the session has ended, or another program opened it.
         """
         self._num_frames(pcm)
         self._check_open()
@@ -145,7 +145,7 @@ class BaseSession:
         return True
 
     def skip(self, num_frames: int) -> None:
-        """Leave out audio of ``num_frames`` samples per channel: media time advances."""
+        """Advance media time by ``num_frames`` samples per channel without sending audio."""
 
         def skip() -> None:
             if self._core.stream is not None:
@@ -154,12 +154,12 @@ class BaseSession:
         self._thread.call(skip)
 
     def take_errors(self) -> list[Refused]:
-        """Return the recognizer's complaints about audio since the last call, of this or ``push``.
+        """Return errors about audio since the last call of this method or ``push``.
 
         Raises
         ------
         KouxingError
-            If the session is over.
+            If the session has ended.
         """
         self._check_open()
         errors = self._core.errors
@@ -173,12 +173,16 @@ class BaseSession:
 
     def _check_sender(self) -> None:
         if self._options is None:
-            raise KouxingError("another program opened this session, and sends its audio")
+            raise KouxingError(
+                "another program opened this session; only that program can send audio"
+            )
 
     def _num_frames(self, pcm: bytes) -> int:
         num_frames, rest = divmod(len(pcm), self._frame_bytes)
         if rest:
-            raise KouxingError(f"{len(pcm)} bytes are not whole samples; use push for any length")
+            raise KouxingError(
+                f"{len(pcm)} bytes are not complete samples; use push, which accepts any length"
+            )
         return num_frames
 
     def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
@@ -264,7 +268,7 @@ class BaseSession:
         return inbox, lambda: thread.call(lambda: core.remove_inbox(self.name, inbox))
 
     def _check(self) -> None:
-        """Raise an error that has occurred since the last call."""
+        """Raise the oldest error since the last call."""
         self._check_open()
         if self._core.errors:
             raise self._core.errors.popleft()
@@ -290,7 +294,7 @@ class BaseSession:
 
 
 class BaseResults:
-    """Results of one session, or its events; after ``close()`` no more arrive."""
+    """Results or events of one session. After ``close()``, no more arrive."""
 
     _signal: Any  # wakes what waits for results
 
@@ -301,7 +305,7 @@ class BaseResults:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the session's last face has arrived, or the session is closed."""
+        """Whether the session's last frame has arrived, or the session is closed."""
         return self._inbox.is_over
 
     @property

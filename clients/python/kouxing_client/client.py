@@ -1,4 +1,4 @@
-"""The client for programs without an event loop: calls block."""
+"""The blocking client."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ class ThreadSignal:
 class Client(BaseClient):
     """A connection to a running system; ``BaseClient`` describes the parameters.
 
-    All requests raise ``Refused`` if control refuses, and ``KouxingError`` if it does not answer.
+    All requests raise ``Refused`` if control rejects them, and ``KouxingError`` if control does not
+    answer.
     """
 
     _make_signal = ThreadSignal
@@ -57,7 +58,7 @@ class Client(BaseClient):
         self.close()
 
     def close(self) -> None:
-        """Close all connections; control closes sessions that are left open a minute later."""
+        """Close all connections. Control closes sessions that are still open after a minute."""
         self._thread.close()
 
     def open_session(
@@ -70,18 +71,18 @@ class Client(BaseClient):
         shapes: Sequence[str] = (),
         **options: object,
     ) -> Session:
-        """Open a session to send audio to.
+        """Open a session, to which this program can send audio.
 
         Parameters
         ----------
         name
             Session name. If empty, control chooses one.
         sample_rate_hz, num_channels
-            8000 to 48000 Hz, 1 or 2 channels.
+            Format of the audio: 8000 to 48000 Hz, 1 or 2 channels.
         encoding
-            ``s16le`` or ``f32le``, of bytes that are pushed and on the wire.
+            Encoding of pushed bytes and of messages: ``s16le`` or ``f32le``.
         shapes
-            Sets of blend shapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``.
+            Sets of blendshapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``.
         options
             Other fields of ``open-session``, such as ``paced=False`` for audio that arrives faster
             than real time, or ``language="de"``.
@@ -91,29 +92,29 @@ class Client(BaseClient):
         return Session(self._thread, core, fields)
 
     def follow(self, name: str = "", *, paced: bool = True) -> Session:
-        """Follow a session that another program opened; if the name is empty, the newest one.
+        """Follow a session that another program opened. An empty name selects the newest session.
 
-        If ``paced`` is set, old frames are dropped after this process was suspended, as is right
-        for a face that is shown live. Otherwise no result is dropped, however late it is.
+        If ``paced`` is true and this process was suspended, outdated frames are dropped. Use this
+        to show a live face. If ``paced`` is false, every result is delivered, even if it is late.
         """
         core = self._thread.submit(lambda core: core.follow(name, is_live=paced)).result()
         return Session(self._thread, core, None)
 
     def status(self, session: str = "") -> Status:
-        """Return the state of all services and sessions, or of one session and its services."""
+        """Return the state of all services and sessions, or of one session and its workers."""
         return self._thread.submit(lambda core: core.status(session)).result()
 
     def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
-        """Change the face of any session; the keywords are those of ``FaceSettings``."""
+        """Change the face of any session. ``FaceSettings`` lists the keywords."""
         self.request("set-face", session, face=settings)
 
     def request(self, kind: str, session: str = "", **fields: object) -> Fields:
-        """Send any request of PROTOCOL.md; return the fields of the answer."""
+        """Send a request of PROTOCOL.md and return the fields of the answer."""
         return self._request(kind, session, fields).result()
 
 
 class Session(BaseSession):
-    """One session; ``BaseSession`` describes what it does by itself."""
+    """One session. ``BaseSession`` describes the common behavior."""
 
     _signal: ThreadSignal
 
@@ -124,23 +125,23 @@ class Session(BaseSession):
         self.close()
 
     def push(self, audio: Any, timeout_s: float | None = None) -> None:
-        """Send audio, and wait while too much of it is on its way.
+        """Send audio. Block while too much audio is unacknowledged.
 
         Parameters
         ----------
         audio
-            Bytes of PCM in the session's encoding, of any length, or numbers (16-bit integers, or
-            floats within ±1): a list, an ``array`` or a NumPy array of shape ``(n,)`` or
+            PCM bytes of any length in the session's encoding, or numbers (16-bit integers, or
+            floats within ±1): a list, an ``array``, or a NumPy array of shape ``(n,)`` or
             ``(n, channels)``.
         timeout_s
-            How long to wait until the recognizer takes more audio; None: without limit.
+            Maximum wait for the recognizer to accept more audio; None: no limit.
 
         Raises
         ------
         Refused
             If the recognizer rejected earlier audio; the session continues.
         KouxingError
-            If the session is over, another program opened it, or the time limit has passed.
+            If the session has ended, another program opened it, or the wait timed out.
         """
         for pcm, num_frames in self._chunks(audio):
             if not self._signal.wait(self._can_push, timeout_s):
@@ -152,19 +153,19 @@ class Session(BaseSession):
             self._add(pcm, num_frames)
 
     def finish(self) -> None:
-        """End the audio; results continue until the last face. Raises as ``push``."""
+        """End the audio. Results arrive until the last frame. Raises the errors of ``push``."""
         self._finish()
 
     def flush(self) -> None:
-        """Interrupt: audio not yet shown is dropped, and the face returns to rest."""
+        """Interrupt the speech: drop audio that is not shown yet, and return the face to rest."""
         self._flush().result()
 
     def set_face(self, **settings: Unpack[FaceSettings]) -> None:
-        """Change the face, as ``Client.set_face``."""
+        """Change the face. ``FaceSettings`` lists the keywords."""
         self._request("set-face", {"face": settings}).result()
 
     def close(self) -> None:
-        """Close the session if this program opened it, and all its connections."""
+        """Close the connections of the session, and the session if this program opened it."""
         if self._core.is_over:
             return
         if self._options is not None:
@@ -174,15 +175,15 @@ class Session(BaseSession):
         self._thread.forget(self._core).result()
 
     def frames(self) -> Results[FapFrame]:
-        """Return the FAP frames from now on; raises ``KouxingError`` if the session is over."""
+        """Subscribe to FAP frames. Raises ``KouxingError`` if the session has ended."""
         return self._join((FapFrame,))
 
     def phones(self) -> Results[Phone]:
-        """Return the phones from now on; each arrives at least twice. Raises as ``frames``."""
+        """Subscribe to phones; each arrives at least twice. Raises the errors of ``frames``."""
         return self._join((Phone,))
 
     def shapes(self, name: str) -> Results[Shapes]:
-        """Return the weights of a set of blend shapes from now on; raises as ``frames``."""
+        """Subscribe to the weights of a blendshape set. Raises the errors of ``frames``."""
         return self._join((Shapes,), name)
 
     def results(
@@ -192,24 +193,24 @@ class Session(BaseSession):
         keep_all: bool = False,
         on_result: Callable[[Any], None] | None = None,
     ) -> Results[Any]:
-        """Return results of several classes from now on; raises as ``frames``.
+        """Subscribe to results of several classes. Raises the errors of ``frames``.
 
-        A call in the first 10 s after the session opens or moves also returns the results since
-        that moment.
+        In the first 10 s after the session opens or moves, a subscription also returns the results
+        since that time.
 
         Parameters
         ----------
         shapes
-            Name of the set of blend shapes, if the classes include ``Shapes``.
+            Name of the blendshape set, if ``classes`` contains ``Shapes``.
         keep_all
-            Whether all unread results of a live session are kept, not only the newest 100.
+            Keep all unread results of a live session instead of the newest 100.
         on_result
-            The client's thread calls this with each result, instead of keeping it.
+            Function that the client's thread calls with each result. Results are then not stored.
         """
         return self._join(classes, shapes, keep_all, on_result)
 
     def events(self) -> Results[Event]:
-        """Return control's events about the session from now on, even after it is closed."""
+        """Subscribe to control's events about the session, including those after it has closed."""
         return Results(*self._read_events())
 
     def _join(
@@ -230,7 +231,7 @@ class Session(BaseSession):
 
 
 class Results(BaseResults, Generic[T]):
-    """Results of one session; iteration ends with the session's last face."""
+    """Results of one session. Iteration ends with the session's last frame."""
 
     _signal: ThreadSignal
 
@@ -244,18 +245,18 @@ class Results(BaseResults, Generic[T]):
         return result
 
     def get(self, timeout_s: float | None = None) -> T | None:
-        """Return the next result; None at the end, or if none arrives in time.
+        """Return the next result, or None at the end or after the timeout.
 
         Raises
         ------
         KouxingError
-            If the session failed before its last face.
+            If the session failed before its last frame.
         """
         self._signal.wait(self._has_news, timeout_s)
         return cast("T | None", self._take())
 
     def available(self, timeout_s: float = 0.0) -> Iterator[T]:
-        """Yield the results that have arrived, waiting for the first one; raises as ``get``."""
+        """Wait for a result, then yield all that have arrived. Raises the errors of ``get``."""
         while (result := self.get(timeout_s)) is not None:
             yield result
             timeout_s = 0.0

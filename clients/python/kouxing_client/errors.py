@@ -1,15 +1,15 @@
-"""Errors, with messages for the person who runs the program."""
+"""Errors, whose messages are meant for the user."""
 
 
 class KouxingError(Exception):
-    """The system does not answer, a key is missing, or a session has ended."""
+    """Raised if the system does not answer, a key is missing, or a session has ended."""
 
 
 class Refused(KouxingError):
-    """A service refused a request or audio; ``code`` is one of the error codes of PROTOCOL.md."""
+    """Raised if a service rejects a request or audio. ``code`` is an error code of PROTOCOL.md."""
 
     def __init__(self, code: str, text: str, retry_after_s: float = 0.0) -> None:
         super().__init__(f"{code}: {text}")
         self.code = code
         self.text = text
-        self.retry_after_s = retry_after_s  # when to try again; 0 if the service did not say
+        self.retry_after_s = retry_after_s  # retry after this time; 0 if unknown

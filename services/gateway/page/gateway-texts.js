@@ -52,7 +52,7 @@ const CHINESE = {
   "control at {address} does not accept this key. If it runs on this machine, restart it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here": "控制服务（{address}）不接受网关的密钥，请在两台机器上运行 kouxing doctor",
   "control has closed the session: {reason}": "控制服务关闭了会话（{reason}）",
   "the session is closed": "会话已关闭",
-  "another program opened this session, and sends its audio": "另一个程序在使用此会话",
+  "another program opened this session; only that program can send audio": "另一个程序在使用此会话",
 
   // Learn my mouth
   "the gateway is stopping": "网关正在停止",
