@@ -87,9 +87,9 @@ class RowErrors:
 
     messages: list[str] = field(default_factory=list)
 
-    def add(self, place: str, what: str) -> None:
+    def add(self, row_name: str, what: str) -> None:
         """Add a bad row."""
-        self.messages.append(f"{place}: {what}; row skipped")
+        self.messages.append(f"{row_name}: {what}; row skipped")
 
     def report_to(self, report: Callable[[str], None]) -> None:
         """Report each skipped row, then their number."""
@@ -142,8 +142,8 @@ def read_corpus(
             "text, or with AISHELL's wav and transcript folders"
         )
     with check_content(folder, "a corpus"):
-        chosen = [(place, row) for place, row in rows if split in (None, _split_of(row))]
-    utterances = [_utterance(place, row, errors, inventory) for place, row in chosen]
+        chosen = [(row_name, row) for row_name, row in rows if split in (None, _split_of(row))]
+    utterances = [_utterance(row_name, row, errors, inventory) for row_name, row in chosen]
     return [utterance for utterance in utterances if utterance]
 
 
@@ -160,7 +160,7 @@ def _split_of(row: dict[str, str]) -> str:
 
 
 def _utterance(
-    place: str, row: dict[str, str], errors: RowErrors, inventory: PhoneInventory
+    row_name: str, row: dict[str, str], errors: RowErrors, inventory: PhoneInventory
 ) -> Utterance | None:
     path = Path(row["path"])
     try:
@@ -172,14 +172,14 @@ def _utterance(
             syllables = inventory.pronounce(row.get("pinyin") or row["text"])
         seconds = float(row.get("seconds") or duration_s(path))
     except (UserError, ValueError, OSError) as error:  # OSError: invalid file name
-        errors.add(place, str(error))
+        errors.add(row_name, str(error))
         return None
     phones = tuple(inventory.index[phone] for syllable in syllables for phone in syllable)
     if not phones:
-        errors.add(place, "no text")
+        errors.add(row_name, "no text")
         return None
     if not len(phones) * _MIN_PHONE_S <= seconds < math.inf:
-        errors.add(place, f"{len(phones)} phones do not fit into {seconds:.2f} s")
+        errors.add(row_name, f"{len(phones)} phones do not fit into {seconds:.2f} s")
         return None
     return Utterance(
         utterance_id=row["utt_id"],
@@ -206,11 +206,11 @@ def duration_s(path: Path) -> float:
 def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:
     rows = read_rows(path, ("utt_id", "path", "pinyin or text"))
     for number, row in enumerate(rows, start=2):
-        place = f"{path.name} row {number} ({row['utt_id']})"
+        row_name = f"{path.name} row {number} ({row['utt_id']})"
         for name in ("path", "phones_path"):
             if row.get(name):
                 row[name] = str((audio or path.parent) / row[name])
-        yield place, {"text": "", **row}
+        yield row_name, {"text": "", **row}
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:

@@ -134,8 +134,8 @@ def _open_pipe(
     begin = pipe.peek()
     if not begin:
         raise UserError(f"{name}: no sound arrived; check the command that writes it")
-    place = find_sound_start(begin)
-    if place is None:
+    start = find_sound_start(begin)
+    if start is None:
         if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")
         raw = raw or RawFormat()
@@ -151,7 +151,7 @@ def _open_pipe(
             f"{name}: the format of this sound states its rate and channels; leave out --rate and"
             " --channels, or add --raw if these are raw samples"
         )
-    begin = pipe.skip(place)
+    begin = pipe.skip(start)
     if stream.seekable() or needs_whole_file(begin):
         file = stream if stream.seekable() else pipe.read_all()
         file.seek(0)
@@ -163,7 +163,7 @@ def _open_pipe(
 
 
 def _wav_audio(stream: Readable, begin: bytes, wav: WavPcm, name: str) -> AudioSource:
-    stream.read(wav.place)
+    stream.read(wav.offset)
     parts = WavParts(stream, begin, wav.num_bytes, name)
     return raw_audio(parts, wav.format, name, lambda: parts.num_missing)
 

@@ -57,7 +57,7 @@ class WavPcm(NamedTuple):
     """The samples in a WAV file."""
 
     format: RawFormat
-    place: int  # position of the first sample, bytes
+    offset: int  # position of the first sample, bytes
     num_bytes: int | None  # None: until the end of the file
 
 
@@ -135,12 +135,14 @@ class MediaSound:
             kinds = {stream.type for stream in self._container.streams}
             only = " and ".join(sorted(kinds))
             raise UserError(f"{self._name}: the file has no audio, only {only}; record the sound")
-        listing = "; ".join(f"{place} {_describe(one)}" for place, one in enumerate(tracks, 1))
+        listing = "; ".join(f"{number} {_describe(one)}" for number, one in enumerate(tracks, 1))
         if track is not None and not 1 <= track <= len(tracks):
             raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")
-        decodable = [place for place, one in enumerate(tracks, 1) if one.codec_context is not None]
+        decodable = [
+            number for number, one in enumerate(tracks, 1) if one.codec_context is not None
+        ]
         default = av.stream.Disposition.default
-        decodable.sort(key=lambda place: not tracks[place - 1].disposition & default)
+        decodable.sort(key=lambda number: not tracks[number - 1].disposition & default)
         chosen = track or next(iter(decodable), 1)
         stream = tracks[chosen - 1]
         if stream.codec_context is None:
@@ -372,21 +374,21 @@ def pcm_of_wav(begin: bytes) -> WavPcm | None:
             codec: Any = container.streams.audio[0].codec_context
             if codec is None:
                 return None
-            place = next(container.demux()).pos
+            offset = next(container.demux()).pos
     except (av.error.FFmpegError, ValueError, IndexError, StopIteration):
         return None
     dtype = _WAV_TYPES.get(codec.name)
     if (
         dtype is None
         or codec.channels not in (1, 2)
-        or place is None
-        or begin[place - 8 : place - 4] != b"data"
+        or offset is None
+        or begin[offset - 8 : offset - 4] != b"data"
     ):
         return None
-    stated = int.from_bytes(begin[place - 4 : place], "little")
+    stated = int.from_bytes(begin[offset - 4 : offset], "little")
     is_known = 0 < stated < MIN_UNKNOWN_BYTES
     raw = RawFormat(codec.sample_rate, codec.channels, np.dtype(dtype))
-    return WavPcm(raw, place, stated if is_known else None)
+    return WavPcm(raw, offset, stated if is_known else None)
 
 
 def _describe(stream: Any) -> str:

@@ -43,10 +43,10 @@ _FRAMED = (
 # Free and invalid bit rates are excluded, because quiet samples often look like them.
 _MP3_FRAME = re.compile(rb"\xff[\xe2\xe3\xf2\xf3\xfa\xfb][\x10-\xef]")
 _TS_SYNC = 0x47
-_TS_PACKETS = ((0, 188), (4, 192))  # the place of the first byte, and the packet's size
+_TS_PACKETS = ((0, 188), (4, 192))  # the offset of the first byte, and the packet's size
 MAX_OGG_PAGE_BYTES = 27 + 255 + 255 * 255
 MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
-# The place of a file's size, its number of bytes and their order, and the bytes that it leaves out.
+# Offset of a file's size, its number of bytes and their order, and the bytes that it excludes.
 _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
     b"RIFF": (4, 4, "little", 8),
     b"RIFX": (4, 4, "big", 8),
@@ -73,7 +73,7 @@ _OTHER = {
 def is_sound(begin: bytes) -> bool:
     """Return whether the first bytes are those of a sound or video format."""
     return (
-        any(begin.startswith(mark, place) for place, mark in (*_SOUND, *_UNPROBED.values()))
+        any(begin.startswith(mark, offset) for offset, mark in (*_SOUND, *_UNPROBED.values()))
         or (begin.startswith(b"\x80\0") and b"(c)CRI" in begin)  # ADX
         or is_transport_stream(begin)
         or _consists_of_frames(begin)
@@ -86,14 +86,14 @@ def find_sound_start(begin: bytes) -> int | None:
     Zeros may precede it. An MP3 stream may begin within a frame.
     """
     num_zeros = len(begin) - len(begin.lstrip(b"\0"))
-    places = [0, *range(max(1, num_zeros - _MAX_LEADING_ZEROS), num_zeros + 1)]
-    places += [match.start() for match in _MP3_FRAME.finditer(begin, num_zeros)]
-    return next((place for place in places if is_sound(begin[place:][:NUM_BEGIN_BYTES])), None)
+    offsets = [0, *range(max(1, num_zeros - _MAX_LEADING_ZEROS), num_zeros + 1)]
+    offsets += [match.start() for match in _MP3_FRAME.finditer(begin, num_zeros)]
+    return next((start for start in offsets if is_sound(begin[start:][:NUM_BEGIN_BYTES])), None)
 
 
 def unprobed_format(begin: bytes) -> str | None:
     """Return FFmpeg's name of a format that FFmpeg does not recognize by its first bytes."""
-    names = [name for name, (place, mark) in _UNPROBED.items() if begin.startswith(mark, place)]
+    names = [name for name, (offset, mark) in _UNPROBED.items() if begin.startswith(mark, offset)]
     if begin.startswith(b"\x9c") and is_sound(begin):
         names = ["sbc"]
     return names[0] if names else None
@@ -146,18 +146,18 @@ def stated_bytes(begin: bytes) -> int | None:
         if begin.startswith(mark):
             stated = int.from_bytes(begin[start : start + size], order) + num_before
             return stated if stated < MIN_UNKNOWN_BYTES else None
-    if (place := begin.find(_ASF_PROPERTIES)) > 0:
-        return int.from_bytes(begin[place + 40 : place + 48], "little")
+    if (offset := begin.find(_ASF_PROPERTIES)) > 0:
+        return int.from_bytes(begin[offset + 40 : offset + 48], "little")
     return None
 
 
 def _stated_bytes_of_caf(begin: bytes) -> int | None:
-    place = 8
-    while place + 12 <= len(begin):
-        end = place + 12 + int.from_bytes(begin[place + 4 : place + 12], "big", signed=True)
-        if begin[place : place + 4] == b"data":
-            return end if end > place + 12 else None
-        place = max(end, place + 12)
+    offset = 8
+    while offset + 12 <= len(begin):
+        end = offset + 12 + int.from_bytes(begin[offset + 4 : offset + 12], "big", signed=True)
+        if begin[offset : offset + 4] == b"data":
+            return end if end > offset + 12 else None
+        offset = max(end, offset + 12)
     return None
 
 
@@ -182,8 +182,8 @@ def codec_of_padded_wav(begin: bytes) -> str | None:
 
 def misread_wav_codec(begin: bytes) -> str | None:
     """Return the codec of a WAV file if FFmpeg mistakes it for another one."""
-    place = begin.find(b"fmt ") + 8
-    kind = int.from_bytes(begin[place : place + 2], "little")
+    offset = begin.find(b"fmt ") + 8
+    kind = int.from_bytes(begin[offset : offset + 2], "little")
     return _MISREAD_WAV_CODECS.get(kind) if begin[8:12] == b"WAVE" else None
 
 
@@ -195,23 +195,23 @@ def needs_whole_file(begin: bytes) -> bool:
 
 
 def _has_index_first(begin: bytes) -> bool:
-    place = 0
-    while place + 8 <= len(begin):
-        kind = begin[place + 4 : place + 8]
+    offset = 0
+    while offset + 8 <= len(begin):
+        kind = begin[offset + 4 : offset + 8]
         if kind == b"moov":
             return True
-        size = int.from_bytes(begin[place : place + 4], "big")
+        size = int.from_bytes(begin[offset : offset + 4], "big")
         if kind == b"mdat" or size < 8:
             return False
-        place += size
+        offset += size
     return False
 
 
 def is_transport_stream(begin: bytes) -> bool:
     """Return whether the first bytes are packets of MPEG."""
     return any(
-        len(syncs := begin[place::size]) >= 5 and set(syncs[:5]) == {_TS_SYNC}
-        for place, size in _TS_PACKETS
+        len(syncs := begin[offset::size]) >= 5 and set(syncs[:5]) == {_TS_SYNC}
+        for offset, size in _TS_PACKETS
     )
 
 

@@ -73,15 +73,15 @@ class WavParts:
 
 def num_parts(file: BinaryIO) -> int:
     """Return the number of parts of sound, or 0 if this is not a WAV file; rewind the file."""
-    count = place = file.seek(0)
+    count = offset = file.seek(0)
     while (kind := file.read(4)).strip().isalnum():
         size = int.from_bytes(file.read(4), "little")
         if kind == b"RIFF" and file.read(4) == b"WAVE":
             size = 4
-        elif place == 0:
+        elif offset == 0:
             break
         count += kind == b"data" and size > 0
-        place += 8 + size + size % 2
-        file.seek(place)
+        offset += 8 + size + size % 2
+        file.seek(offset)
     file.seek(0)
     return count

@@ -49,9 +49,9 @@ def match_extrema(predicted: Array, real: Array) -> list[int]:
     offsets = []
     for j, i in warping_path(*(np.diff(curve, prepend=curve[:1]) for curve in (predicted, real))):
         if kinds[1][i] and kinds[0][j] == kinds[1][i]:
-            place = int(np.searchsorted(real_extrema, i))
-            first = real_extrema[place - 1] if place else 0
-            last = real_extrema[place + 1] if place + 1 < len(real_extrema) else len(real) - 1
+            index = int(np.searchsorted(real_extrema, i))
+            first = real_extrema[index - 1] if index else 0
+            last = real_extrema[index + 1] if index + 1 < len(real_extrema) else len(real) - 1
             if first <= j <= last:
                 offsets.append(j - i)
     return offsets

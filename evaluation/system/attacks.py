@@ -108,10 +108,10 @@ def measure(path: Path, names: Collection[str], console: Console) -> list[Attack
     with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
         _delays_ms(system.control, speech)  # the first session of a process is slow
         results = []
-        for place, (name, target) in enumerate(runs, start=2):
+        for number, (name, target) in enumerate(runs, start=2):
             console.print(f"attack: {name}" + (f" on {target}" if target else ""))
             # A new source address each time: a service may reject one that has misbehaved.
-            results.append(_result(system, name, target, f"127.0.0.{place}", speech))
+            results.append(_result(system, name, target, f"127.0.0.{number}", speech))
         return results
 
 
@@ -172,7 +172,7 @@ def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | N
         times_s, delays_s, _ = stream(client, speech, SynthesizerConfig().delay_ms / 1e3)
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)
-    delays_ms = [delays_s[phase == place] * 1e3 for place in range(len(PHASES))]
+    delays_ms = [delays_s[phase == number] * 1e3 for number in range(len(PHASES))]
     p95_ms = [percentiles(values)["p95"] if values.size else None for values in delays_ms]
     return dict(zip(PHASES, p95_ms, strict=True))
 

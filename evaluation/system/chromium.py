@@ -135,13 +135,13 @@ class Chromium:
         return result["result"].get("value")
 
     def click(self, name: str) -> None:
-        """Click on an element with the mouse, as a user does; see ``place_of``."""
-        x, y = self.place_of(name)
+        """Click on an element with the mouse, as a user does; see ``center_of``."""
+        x, y = self.center_of(name)
         press: dict[str, object] = {"x": x, "y": y, "button": "left", "clickCount": 1}
         for event in ("mousePressed", "mouseReleased"):
             self.command("Input.dispatchMouseEvent", type=event, **press)
 
-    def place_of(self, name: str) -> tuple[float, float]:
+    def center_of(self, name: str) -> tuple[float, float]:
         """Scroll to an element, and return its center in pixels of the window.
 
         ``name`` is the element's ID, which the rest of a CSS selector may follow. Raises
@@ -158,10 +158,10 @@ class Chromium:
             "target.scrollIntoView({ block: 'nearest' });"
             "({ x, y, width, height } = target.getBoundingClientRect());"
             "} while (before !== x + ',' + y);"
-            "const place = [x + width / 2, y + height / 2];"
-            "const hit = document.elementFromPoint(...place);"
-            "if (!target.contains(hit)) throw Error(`at ${place}: ${hit?.outerHTML}`);"
-            "return place; })()"
+            "const center = [x + width / 2, y + height / 2];"
+            "const hit = document.elementFromPoint(...center);"
+            "if (!target.contains(hit)) throw Error(`at ${center}: ${hit?.outerHTML}`);"
+            "return center; })()"
         )
         return x, y
 

@@ -102,7 +102,7 @@ def measure_images() -> Rendering:
         load_s[detail] = time.perf_counter() - start_s
         renderer = Renderer(head, *size, samples=samples)
         opengl = renderer.description
-        frames = [_frame(place) for place in range(NUM_IMAGES)]
+        frames = [_frame(number) for number in range(NUM_IMAGES)]
         images = [renderer.draw(faps) for faps in frames[:10]]  # warm up
         start_s = time.perf_counter()
         for faps in frames:
@@ -137,12 +137,12 @@ def show_images(rendering: Rendering, console: Console) -> None:
     console.print(f"the head: {rendering.asset_bytes / 1e6:.2f} MB, load time: {loading}")
 
 
-def _frame(place: int) -> NDArray[np.float32]:
+def _frame(number: int) -> NDArray[np.float32]:
     """Return the FAPs (68,) of an image: one viseme after another, blinks and nods."""
-    amount = np.float32(0.5 - 0.5 * np.cos(place * 0.7))
-    faps: NDArray[np.float32] = VISEMES[1 + place // 5 % 14] * amount
+    amount = np.float32(0.5 - 0.5 * np.cos(number * 0.7))
+    faps: NDArray[np.float32] = VISEMES[1 + number // 5 % 14] * amount
     faps[18:20] = 500 * amount
-    faps[47] = 3000 * np.sin(place * 0.3)
+    faps[47] = 3000 * np.sin(number * 0.3)
     return faps
 
 
@@ -151,6 +151,6 @@ def _encode_ms(images: list[NDArray[np.uint8]]) -> float:
     with tempfile.TemporaryDirectory() as folder:
         with VideoWriter(Path(folder) / "bench.mp4", width_px, height_px, 25.0, None) as writer:
             start_s = time.perf_counter()
-            for place in range(NUM_IMAGES):
-                writer.write_image(images[place % len(images)])
+            for number in range(NUM_IMAGES):
+                writer.write_image(images[number % len(images)])
         return 1e3 * (time.perf_counter() - start_s) / NUM_IMAGES

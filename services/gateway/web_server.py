@@ -104,7 +104,7 @@ class _Connection(web.RequestHandler):
         self._log_limit = log_limit
 
     def connection_lost(self, exc: BaseException | None) -> None:
-        """Release the connection's place."""
+        """Mark the connection as lost."""
         super().connection_lost(exc)
         self.is_lost.set()
 
@@ -169,15 +169,15 @@ class _Connection(web.RequestHandler):
     def log_exception(self, *args: object, **_options: object) -> None:
         """Log the current exception, once a minute for each place in the code."""
         error = sys.exception()
-        if not isinstance(error, ConnectionError) and self._log_limit.allows(_place(error)):
+        if not isinstance(error, ConnectionError) and self._log_limit.allows(_code_location(error)):
             LOG.error(*args, exc_info=True)
 
     def _warn(self, text: str, error: BaseException | None = None) -> None:
-        if self._log_limit.allows(_place(error) or text):
+        if self._log_limit.allows(_code_location(error) or text):
             LOG.warning("%s", text)
 
 
-def _place(error: BaseException | None) -> str:
+def _code_location(error: BaseException | None) -> str:
     frames = traceback.extract_tb(error.__traceback__, -1) if error else []
     return "".join(f"{frame.filename}:{frame.lineno}" for frame in frames)
 
@@ -190,9 +190,9 @@ async def _set_headers(_request: web.Request | None, response: web.StreamRespons
 class WebServer:
     """Accepts connections and serves them with an aiohttp application.
 
-    ``listening`` is from ``bind_port``. One address gets at most ``address_share`` of all places.
-    If all are taken, a new connection replaces another one, except a connection with a complete
-    request for an unlimited path. It replaces the one that has waited for the longest time.
+    ``listening`` is from ``bind_port``. One address gets at most ``address_share`` of the
+    connections. If the server is full, a new connection replaces the one that has waited for the
+    longest time. Connections with a complete request for an unlimited path are never replaced.
     """
 
     def __init__(

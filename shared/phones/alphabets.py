@@ -58,8 +58,8 @@ def respell(
 def _split(phone: Phone, inventory: PhoneInventory) -> Iterator[Phone]:
     symbols = inventory.universal[phone.symbol]
     duration_s = phone.duration_s / len(symbols)
-    for place, symbol in enumerate(symbols):
-        onset_s = phone.onset_s + place * duration_s
+    for number, symbol in enumerate(symbols):
+        onset_s = phone.onset_s + number * duration_s
         yield replace(phone, symbol=symbol, onset_s=onset_s, duration_s=duration_s)
 
 

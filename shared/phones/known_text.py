@@ -23,18 +23,18 @@ def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) ->
         for j, spoken in enumerate(text):
             both = costs[i - 1][j] + _syllable_distance(syllable, spoken)
             costs[i].append(min(both, GAP + costs[i - 1][j + 1], GAP + costs[i][j]))
-    places: list[int | None] = [None] * len(recognized)
+    indices: list[int | None] = [None] * len(recognized)
     i = len(recognized)
     j = min(range(len(text) + 1), key=costs[i].__getitem__)  # the rest is not spoken yet
     while i and j:
         if costs[i][j] == costs[i - 1][j - 1] + _syllable_distance(recognized[i - 1], text[j - 1]):
             i, j = i - 1, j - 1
-            places[i] = j
+            indices[i] = j
         elif costs[i][j] == GAP + costs[i - 1][j]:
             i -= 1
         else:
             j -= 1
-    return places
+    return indices
 
 
 def _syllable_distance(one: Syllable, other: Syllable) -> float:

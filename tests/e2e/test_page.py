@@ -230,10 +230,10 @@ def test_every_control_can_be_clicked(
         "item.checkVisibility()).map((item, index) => (item.id ||= `control-${{index}}`))"
     )
     for name in page.evaluate(shown.format("footer")):
-        page.place_of(name)
+        page.center_of(name)
     page.click("open-settings")
     for name in page.evaluate(shown.format("#settings")):
-        page.place_of(name)
+        page.center_of(name)
     page.evaluate("document.getElementById('settings').hidePopover()")
     page.resize(*SIZE_PX)
 

@@ -75,7 +75,7 @@ def padded_batch(group: Sequence[Sample]) -> Batch:
     for number, (rows, targets) in enumerate(group):
         inputs[number, : len(rows)] = rows
         inputs[number, len(rows) :] = rows[-1]
-        place = number, slice(len(targets)), slice(targets.states.shape[1])
-        states[place] = targets.states
-        probs[place] = targets.probs
+        region = number, slice(len(targets)), slice(targets.states.shape[1])
+        states[region] = targets.states
+        probs[region] = targets.probs
     return torch.from_numpy(inputs), torch.from_numpy(states), torch.from_numpy(probs)

@@ -85,7 +85,7 @@ def label(
     """
     rng = np.random.default_rng(seed)
     folders = [load_untranscribed([folder], errors) for folder in untranscribed]
-    in_random_order = [examples[place] for place in rng.permutation(len(examples))]
+    in_random_order = [examples[index] for index in rng.permutation(len(examples))]
     aligned = _align_all(aligner, in_random_order)
     recordings = _recordings(aligned, mix)
     num_of_kind = dict.fromkeys(mix.kinds, 0)

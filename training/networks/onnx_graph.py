@@ -174,14 +174,14 @@ class Graph:
 
     def convolutions(self, frames: str, parameters: Mapping[str, Floats], length: int) -> str:
         """Run both convolutions: (batch, 2 length + 3, 80) to (batch * length, width)."""
-        places = self._places(frames, 2 * length + 1, 1, NUM_MELS)
-        hidden = self.node("Gelu", [self.product(places, parameters, "first", "frames")])
+        windows = self._windows(frames, 2 * length + 1, 1, NUM_MELS)
+        hidden = self.node("Gelu", [self.product(windows, parameters, "first", "frames")])
         width = len(parameters["first.bias"])
         by_frame = self.integers("by_frame_of_batch", -1, 2 * length + 1, width)
-        places = self._places(self.node("Reshape", [hidden, by_frame]), length, 2, width)
-        return self.node("Gelu", [self.product(places, parameters, "second")])
+        windows = self._windows(self.node("Reshape", [hidden, by_frame]), length, 2, width)
+        return self.node("Gelu", [self.product(windows, parameters, "second")])
 
-    def _places(self, inputs: str, number: int, stride: int, size: int) -> str:
+    def _windows(self, inputs: str, number: int, stride: int, size: int) -> str:
         """Concatenate groups of three neighbors: (batch, n, size) to (batch * number, 3 size)."""
         one, step = self.integers("axis_1", 1), self.integers(f"stride_{stride}", stride)
         pieces = []

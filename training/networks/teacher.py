@@ -88,7 +88,7 @@ class WholeEncoder(Encoder):
         for layer in self.layers:
             hidden = layer(hidden)
             after.append(hidden)
-        return torch.cat([after[place] for place in self.kept_layers], dim=-1)
+        return torch.cat([after[layer] for layer in self.kept_layers], dim=-1)
 
     @torch.no_grad()
     def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
@@ -129,7 +129,7 @@ class Teacher:
         for number in track(order, "labeled recordings"):
             batch.append(number)
             if number == order[-1] or len(batch) * len(sounds[number]) > _BATCH_SAMPLES:
-                targets = self._targets_of([sounds[place] for place in batch])
+                targets = self._targets_of([sounds[index] for index in batch])
                 labels.update(zip(batch, targets, strict=True))
                 batch = []
         return [labels[number] for number in range(len(sounds))]

@@ -79,9 +79,9 @@ def draw_phones(
     num_chains = min(_NUM_CHAINS, num_words)
     num_drawn = max(1, num_words // num_chains)
     drawn = np.zeros((num_chains, _CONTEXT_WORDS + num_drawn), np.int64)
-    for place in track(range(_CONTEXT_WORDS, drawn.shape[1]), description="words"):
-        context = drawn[:, place - _CONTEXT_WORDS : place]
-        drawn[:, place] = _next_words(levels, context, rng)
+    for step in track(range(_CONTEXT_WORDS, drawn.shape[1]), description="words"):
+        context = drawn[:, step - _CONTEXT_WORDS : step]
+        drawn[:, step] = _next_words(levels, context, rng)
     return _stream(drawn.ravel(), words, inventory)  # word 0, before each chain, is a pause
 
 

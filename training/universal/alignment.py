@@ -68,15 +68,15 @@ class Aligner:
         if not any(by_hand):
             raise UserError("no recording has hand-made labels; add the Berlin EmoDB")
         for number in range(_NUM_ROUNDS):
-            known = [place for place, phones in enumerate(labels) if len(phones)]
+            known = [index for index, phones in enumerate(labels) if len(phones)]
             classifier, log_prior = _classifier(
-                [components[place] for place in known],
-                [labels[place] for place in known],
+                [components[index] for index in known],
+                [labels[index] for index in known],
                 self.num_phones,
             )
             similar = self._similar(labels) if number == 0 else None
-            for place, rows in enumerate(track(components, f"alignment, round {number + 1}")):
-                if by_hand[place]:
+            for index, rows in enumerate(track(components, f"alignment, round {number + 1}")):
+                if by_hand[index]:
                     continue
                 with torch.no_grad():
                     log_probs = classifier(rows).log_softmax(dim=-1).numpy()
@@ -84,8 +84,8 @@ class Aligner:
                     scores = log_probs - _PRIOR_SCALE * log_prior
                 else:
                     scores = np.log(np.exp(log_probs) @ similar.T + _MIN_PROB)
-                graph = self._graph(stored[place].name, 1)
-                labels[place] = _states_on_path(scores.astype(np.float32), graph)
+                graph = self._graph(stored[index].name, 1)
+                labels[index] = _states_on_path(scores.astype(np.float32), graph)
         return {
             one.name: _thirds(phones.repeat(2))
             for one, phones in zip(stored, labels, strict=True)
@@ -131,7 +131,7 @@ def _components(stored: Sequence[Features], seed: int) -> list[Tensor]:
     rng = np.random.default_rng(seed)
     size = min(_NUM_FOR_COMPONENTS, len(stored))
     some = np.concatenate(
-        [stored[place].settled() for place in rng.choice(len(stored), size, replace=False)]
+        [stored[index].settled() for index in rng.choice(len(stored), size, replace=False)]
     )
     mean = some.mean(axis=0)
     variance, axes = np.linalg.eigh(np.cov((some - mean).T))

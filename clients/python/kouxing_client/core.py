@@ -224,7 +224,7 @@ class ClientCore:
             return
         self._asked_s[session.name] = now_s
 
-        def place(answer: Future[Status]) -> None:
+        def on_status(answer: Future[Status]) -> None:
             try:
                 state = newest_session(answer.result(), session.name)
             except Refused as refusal:
@@ -235,7 +235,7 @@ class ClientCore:
             else:
                 session.set_endpoints({name: state[name] for name in ("phones", "faps")})
 
-        self.status(session.name).add_done_callback(place)
+        self.status(session.name).add_done_callback(on_status)
 
     def _on_command(self, parts: list[bytes]) -> None:
         if (message := decode(parts)) is None:

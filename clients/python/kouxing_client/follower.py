@@ -266,10 +266,10 @@ class Follower:
         self._epochs[publisher] = message.epoch
         self._newest[kind] = max(number, self._newest.get(kind, number))
         if kind == "fap-frame":
-            place = (message.media_time, message.sequence)
-            if place <= self._last_frame:
+            number = (message.media_time, message.sequence)
+            if number <= self._last_frame:
                 return True
-            self._last_frame = place
+            self._last_frame = number
         return False
 
     def _enter_epoch(self, epoch: int) -> None:

@@ -146,8 +146,8 @@ class Subscription:
         if Shapes in self._classes and isinstance(message, FapFrame):
             weights = message.shapes.get(self._shape_set)
             if weights is not None:
-                place = {name: getattr(message, name) for name in Message.__struct_fields__}
-                self._on_result(Shapes(**place, set=self._shape_set, weights=weights))
+                header = {name: getattr(message, name) for name in Message.__struct_fields__}
+                self._on_result(Shapes(**header, set=self._shape_set, weights=weights))
 
     def _on_end(self) -> None:
         """End; before that, wait for the last phones, because they have another publisher.

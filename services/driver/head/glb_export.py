@@ -135,10 +135,10 @@ def export_glb(
 def _add_skeleton(document: GlbDocument, nodes: dict[str, int]) -> None:
     """Attach the node ``body`` to an avatar's bones."""
     entries = document.json["nodes"]
-    for bone, parent, place in vrm.BONES:
+    for bone, parent, position in vrm.BONES:
         if bone not in nodes:
             nodes[bone] = document.add("nodes", {"name": bone})
-        entries[nodes[bone]]["translation"] = place
+        entries[nodes[bone]]["translation"] = position
         if parent:
             entries[nodes[parent]].setdefault("children", []).append(nodes[bone])
 

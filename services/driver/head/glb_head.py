@@ -185,15 +185,15 @@ def fade(height: Float64) -> Float64:
 def _check_single_face(pieces: list[Primitive], known: Names) -> None:
     """Raise ``BadGlbError`` if two meshes far from each other have a mouth."""
     opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
-    places: list[Float64] = []
+    centers: list[Float64] = []
     size = 0.0
     for piece in pieces:
         moved = np.linalg.norm(piece.shapes.get(opener, np.zeros((1, 3))), axis=1)
         if moved.max() > 0:
             shown = piece.vertices[moved > 0.1 * moved.max()]
-            places.append(shown.mean(axis=0))
+            centers.append(shown.mean(axis=0))
             size = max(size, float(np.linalg.norm(np.ptp(shown, axis=0))))
-    if places and np.linalg.norm(np.ptp(places, axis=0)) > _MAX_FACES_APART * size > 0:
+    if centers and np.linalg.norm(np.ptp(centers, axis=0)) > _MAX_FACES_APART * size > 0:
         raise BadGlbError("it has several faces; export only one avatar")
 
 
@@ -225,7 +225,7 @@ def _upright(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Floa
 def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
     """Return the centers of the left and right eye (2, 3), from bones, eyeballs, lids or mouth."""
     bones = {bone: number for number, bone in find_bones(glb).items()}
-    places = dict(glb.nodes())
+    matrices = dict(glb.nodes())
     centers = []
     for side in ("left", "right"):
         balls = [
@@ -234,8 +234,8 @@ def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
             if name.startswith(f"eye_{side}")
         ]
         lids = _moved_center(pieces, [f"eyeBlink{side.title()}", f"blink{side.title()}"])
-        if bones.get(f"{side}Eye") in places:
-            centers.append(places[bones[f"{side}Eye"]][:3, 3])
+        if bones.get(f"{side}Eye") in matrices:
+            centers.append(matrices[bones[f"{side}Eye"]][:3, 3])
         elif balls:
             whole = np.concatenate(balls)
             centers.append((whole.min(axis=0) + whole.max(axis=0)) / 2)
@@ -257,20 +257,20 @@ def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
 
 def _moved_center(pieces: list[Primitive], names: list[str]) -> Float64 | None:
     """Return the mean position of the vertices that some shapes move."""
-    total, place = 0.0, np.zeros(3)
+    total, center = 0.0, np.zeros(3)
     for piece in pieces:
         for name in set(names) & set(piece.shapes):
             size = np.linalg.norm(piece.shapes[name], axis=1)
             total += float(size.sum())
-            place += size @ piece.vertices
-    return place / total if total > 0 else None
+            center += size @ piece.vertices
+    return center / total if total > 0 else None
 
 
 def _pivot(glb: Glb, turn: Float64, middle: Float64, unit: float) -> Float64:
     """Return the position of the joint that the head rotates about."""
     bones = find_bones(glb)
-    for number, place in glb.nodes():
-        at = turn @ place[:3, 3]
+    for number, matrix in glb.nodes():
+        at = turn @ matrix[:3, 3]
         is_joint = bones.get(number) == "head" and "mesh" not in glb.item("nodes", number)
         if is_joint and np.linalg.norm(at - middle) < 4 * unit:
             return at

@@ -31,12 +31,12 @@ _LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes at full weight o
 def read_pieces(glb: Glb) -> list[Primitive]:
     """Return the triangles of the scene with everything that moves them."""
     nodes = glb.nodes()
-    places = dict(nodes)
-    turn_shares = _turn_shares(glb, places)
+    matrices = dict(nodes)
+    turn_shares = _turn_shares(glb, matrices)
     expressions = _expressions(glb)
     pieces: list[Primitive] = []
     num_vertices = num_triangles = num_shifts = 0
-    for number, place in nodes:
+    for number, matrix in nodes:
         node = glb.item("nodes", number)
         if "mesh" not in node:
             continue
@@ -56,7 +56,7 @@ def read_pieces(glb: Glb) -> list[Primitive]:
             ):
                 if count_so_far > limit:
                     raise BadGlbError(f"it has more than {limit} {what}")
-            piece = _piece(glb, node, mesh, primitive, places, place, turn_shares, binds)
+            piece = _piece(glb, node, mesh, primitive, matrices, matrix, turn_shares, binds)
             if piece.head_weight is None and turn_shares:
                 piece.head_weight = np.full(len(piece.vertices), turn_shares.get(number, 0.0))
             pieces.append(piece)
@@ -152,8 +152,8 @@ def _piece(
     node: dict[str, Any],
     mesh: dict[str, Any],
     primitive: dict[str, Any],
-    places: dict[int, Float64],
-    place: Float64,
+    matrices: dict[int, Float64],
+    matrix: Float64,
     turn_shares: dict[int, float],
     binds: Binds,
 ) -> Primitive:
@@ -178,8 +178,8 @@ def _piece(
     texture = glb.image(base["index"]) if base else b""
     skin = None
     if "skin" in node and "JOINTS_0" in attributes:
-        skin = _Skin(glb, node["skin"], attributes, places)
-    placed = skin.matrices() if skin else np.broadcast_to(place, (count, 4, 4))
+        skin = _Skin(glb, node["skin"], attributes, matrices)
+    placed = skin.matrices() if skin else np.broadcast_to(matrix, (count, 4, 4))
     if not len(uv) == len(colors) == len(placed) == count:
         raise ValueError("the attributes of a mesh have different lengths")
     shapes, rest = _shapes(glb, node, mesh, primitive, placed[:, :3, :3], binds)
@@ -270,8 +270,8 @@ def _corners(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
 def _target_names(glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any]) -> list[str]:
     """Return a name for each morph target; programs write them in different places."""
     targets = primitive.get("targets", [])
-    for place in (primitive, mesh):
-        names = (place.get("extras") or {}).get("targetNames", [])
+    for owner in (primitive, mesh):
+        names = (owner.get("extras") or {}).get("targetNames", [])
         if isinstance(names, list) and names:
             return [str(name) for name in names]
     entries = [

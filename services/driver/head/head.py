@@ -163,15 +163,15 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
     first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
     ends = after_coarse if coarse else after
     kept = np.concatenate([np.arange(a, b) for a, b in zip(first, ends, strict=True)])
-    place = np.full(int(after[-1]), -1, dtype=np.int64)
-    place[kept] = np.arange(len(kept))
+    new_index = np.full(int(after[-1]), -1, dtype=np.int64)
+    new_index[kept] = np.arange(len(kept))
 
     parts, triangles, coarse_triangles = [], [], []
     num_triangles = 0
     bounds = arrays["part_triangles"].astype(np.int64)  # fine start and end, coarse start and end
     for row, part_name in enumerate(arrays["part_names"].astype(str)):
         fine_part, coarse_part = (
-            place[arrays["triangles"][start:end].astype(np.int64)]
+            new_index[arrays["triangles"][start:end].astype(np.int64)]
             for start, end in (bounds[row, :2], bounds[row, 2:])
         )
         part_triangles = coarse_part if coarse else fine_part
@@ -179,7 +179,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
             raise ValueError(f"part {part_name} refers to missing vertices")
         triangles.append(part_triangles.astype(np.uint32))
         coarse_triangles.append(coarse_part.astype(np.uint32))
-        from_vertex = int(place[first[row]])
+        from_vertex = int(new_index[first[row]])
         parts.append(
             HeadPart(
                 name=str(part_name),
@@ -195,8 +195,8 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
 
     faces = np.concatenate(triangles)
     vertices = arrays["vertices"].astype(np.float32)[kept]
-    basis = _basis(arrays, place, len(kept))
-    welds = place[arrays["welds"].astype(np.int64)[kept]] if "welds" in arrays else None
+    basis = _basis(arrays, new_index, len(kept))
+    welds = new_index[arrays["welds"].astype(np.int64)[kept]] if "welds" in arrays else None
     shading = Shading.of(vertices, faces, basis, welds)
     return Head(
         name=name,
@@ -211,7 +211,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         basis=basis,
         fapu=_by_name(arrays["fapu_names"], arrays["fapu"].astype(float)),
         feature_points=_by_name(
-            arrays["feature_point_names"], place[arrays["feature_points"].astype(np.int64)]
+            arrays["feature_point_names"], new_index[arrays["feature_points"].astype(np.int64)]
         ),
         eye_centers=arrays["eye_centres"].astype(np.float32),
         textures={
@@ -256,13 +256,13 @@ def _check(arrays: dict[str, NDArray[np.generic]]) -> None:
 
 
 def _basis(
-    arrays: dict[str, NDArray[np.generic]], place: NDArray[np.int64], num_vertices: int
+    arrays: dict[str, NDArray[np.generic]], new_index: NDArray[np.int64], num_vertices: int
 ) -> sparse.csr_array:
     """Return the displacement fields as a sparse matrix (3 V, 68)."""
     bounds = arrays["field_bounds"].astype(np.int64)
     column = np.repeat(arrays["field_faps"].astype(np.int64) - 1, np.diff(bounds))
     unit = np.repeat(arrays["field_units"].astype(np.float64), np.diff(bounds))
-    vertex = place[arrays["field_vertices"].astype(np.int64)]
+    vertex = new_index[arrays["field_vertices"].astype(np.int64)]
     shift = arrays["field_shifts"].astype(np.float64) / unit[:, None]
     kept = vertex >= 0
     rows = (3 * vertex[kept, None] + np.arange(3)).ravel()

@@ -89,8 +89,8 @@ class SkinFields:
         return fields
 
     def _point(self, name: str) -> Float:
-        place: Float = self._vertices[self._points[name]]
-        return place
+        point: Float = self._vertices[self._points[name]]
+        return point
 
     def _points_named(self, *names: str) -> Index:
         return np.array([self._points[name] for name in names if name in self._points], np.int64)

@@ -56,30 +56,32 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     if count > MAX_VERTICES:
         raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
     given = read_points(points)
-    places = _places(mesh, points, pieces, given)
-    arrays, warnings = _Import(mesh, points, pieces, places, given).run()
+    positions = _positions(mesh, points, pieces, given)
+    arrays, warnings = _Import(mesh, points, pieces, positions, given).run()
     with open_output(output) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     return warnings
 
 
-def _places(mesh: Path, path: Path, pieces: list[Primitive], points: Points) -> dict[str, Float64]:
+def _positions(
+    mesh: Path, path: Path, pieces: list[Primitive], points: Points
+) -> dict[str, Float64]:
     """Return the coordinates of every point in the mesh's own axes."""
     vertices, named = numbered_vertices(mesh, pieces)
-    places = {}
-    for name, place in points.places.items():
-        if isinstance(place, np.ndarray):
-            places[name] = place
+    positions = {}
+    for name, position in points.positions.items():
+        if isinstance(position, np.ndarray):
+            positions[name] = position
         else:
-            mesh_name, number = place
+            mesh_name, number = position
             candidates = named.get(mesh_name, vertices)
             if number >= len(candidates):
                 raise UserError(
                     f"{path}: {name} is vertex {number}, but the last vertex is"
                     f" {len(candidates) - 1}; vertices count from 0"
                 )
-            places[name] = candidates[number]
-    return places
+            positions[name] = candidates[number]
+    return positions
 
 
 class _Import:
@@ -90,15 +92,15 @@ class _Import:
         mesh: Path,
         path: Path,
         pieces: list[Primitive],
-        places: dict[str, Float64],
+        positions: dict[str, Float64],
         given: Points,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
         self._warnings: list[str] = []
         self._fapu_given = given.fapu
-        self._find_frame(places)
+        self._find_frame(positions)
         self._join()
-        self._snap(places)
+        self._snap(positions)
 
     def run(self) -> tuple[dict[str, NDArray[np.generic]], list[str]]:
         """Return the arrays of the head's file, and warnings."""
@@ -109,8 +111,8 @@ class _Import:
         fields, roles = self._move(face, fapu)
         pieces, rows = self._split(roles)
         order = np.concatenate(rows)
-        place = np.empty(len(order), np.int64)
-        place[order] = np.arange(len(order))
+        new_index = np.empty(len(order), np.int64)
+        new_index[order] = np.arange(len(order))
         first_of = {int(w): int(v) for v, w in reversed(list(enumerate(self._weld_of)))}
         self._check_movements(fields, points)
         height = (self._vertices[order, 1] - self._eyes.mean(axis=0)[1]) / EYE_DISTANCE_M
@@ -120,7 +122,7 @@ class _Import:
             head_weight=fade(height),
             fapu=fapu | {"AU": RADIANS_PER_ANGLE_UNIT},
             feature_points={
-                name: int(place[first_of[vertex]]) for name, vertex in self._points.items()
+                name: int(new_index[first_of[vertex]]) for name, vertex in self._points.items()
             },
             eye_centers=self._eyes,
         )
@@ -131,22 +133,22 @@ class _Import:
 
     # --- the mesh in the axes of a head ---------------------------------------------------------
 
-    def _find_frame(self, places: dict[str, Float64]) -> None:
+    def _find_frame(self, positions: dict[str, Float64]) -> None:
         eyes = {}
         for name, lids in (("3.5", ("3.1", "3.3")), ("3.6", ("3.2", "3.4"))):
-            if name in places:
-                eyes[name] = places[name]
-            elif all(lid in places for lid in lids):
-                eyes[name] = (places[lids[0]] + places[lids[1]]) / 2
-        missing = [name for name in NEEDED if name not in places]
+            if name in positions:
+                eyes[name] = positions[name]
+            elif all(lid in positions for lid in lids):
+                eyes[name] = (positions[lids[0]] + positions[lids[1]]) / 2
+        missing = [name for name in NEEDED if name not in positions]
         missing += [f"{name} (or its eyelids)" for name in ("3.5", "3.6") if name not in eyes]
-        if "9.15" not in places and "MNS" not in self._fapu_given:
+        if "9.15" not in positions and "MNS" not in self._fapu_given:
             missing.append("9.15")
         if missing:
             raise self._fail(f"points are missing: {', '.join(missing)}")
         left, right = eyes["3.5"], eyes["3.6"]
         middle, unit = (left + right) / 2, float(np.linalg.norm(left - right))
-        down = middle - places["2.1"]
+        down = middle - positions["2.1"]
         sideways = left - right
         if unit == 0 or down[1] < 0.8 * np.linalg.norm(down) or abs(sideways[0]) < 0.8 * unit:
             raise self._fail(
@@ -154,7 +156,7 @@ class _Import:
                 " and the face looks along z"
             )
         turn = np.array([1.0, 1.0, 1.0]) if sideways[0] > 0 else np.array([-1.0, 1.0, -1.0])
-        pivot = places.get("7.1", middle + PIVOT * turn * unit)
+        pivot = positions.get("7.1", middle + PIVOT * turn * unit)
         scale = EYE_DISTANCE_M / unit
         self._pivot, self._turn, self._scale = pivot, turn, scale
         self._eyes = self._to_head(np.stack([left, right]))
@@ -188,14 +190,14 @@ class _Import:
         graph = sparse.coo_array((np.ones(len(edges)), edges.T), (count, count))
         _, self._component = csgraph.connected_components(graph, directed=False)
 
-    def _snap(self, places: dict[str, Float64]) -> None:
+    def _snap(self, positions: dict[str, Float64]) -> None:
         """Find the vertex of each point."""
         used = np.unique(self._triangles)
         tree = cKDTree(self._welded[used])
         self._points: dict[str, int] = {}
         off = []
-        for name, place in places.items():
-            distance, row = tree.query(self._to_head(place))
+        for name, position in positions.items():
+            distance, row = tree.query(self._to_head(position))
             if name in _OFF_SURFACE:
                 continue
             if distance <= _SNAP * EYE_DISTANCE_M:
@@ -209,7 +211,7 @@ class _Import:
         local[skin] = np.arange(len(skin))
         inside = local[self._triangles]
         self._skin = skin, local, inside[(inside >= 0).all(axis=1)]
-        self._part_lips(places)
+        self._part_lips(positions)
         lips = {name: self._points[name] for name in (*INNER, *OUTER, "2.1", "2.10")}
         apart = [name for name, vertex in lips.items() if local[vertex] < 0]
         if apart:
@@ -220,7 +222,7 @@ class _Import:
                 raise self._fail(f"{seen[vertex]} and {name} have the same vertex; separate them")
             seen[vertex] = name
 
-    def _part_lips(self, places: dict[str, Float64]) -> None:
+    def _part_lips(self, positions: dict[str, Float64]) -> None:
         """Move inner points of closed lips to the correct lip."""
         skin, local, inside = self._skin
         if local[self._points["8.2"]] < 0:
@@ -231,7 +233,7 @@ class _Import:
         )
         tree = cKDTree(self._welded[skin])
         for name in (*UPPER_LIP[:3], *LOWER_LIP[:3]):
-            here = self._to_head(places[name])
+            here = self._to_head(positions[name])
             near = np.array(tree.query_ball_point(here, 0.05 * EYE_DISTANCE_M), dtype=np.int64)
             this_lip, other_lip = (
                 (to_upper, to_lower) if name in UPPER_LIP else (to_lower, to_upper)

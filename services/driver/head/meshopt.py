@@ -94,7 +94,7 @@ def _decode_attributes(data: Bytes, end: int, tail: int, out: Bytes) -> bool:
 
 @numba.njit(cache=True)
 def _decode_varint(data: Bytes, at: int) -> tuple[np.int64, int]:
-    """Return a number in LEB128 and the place after it."""
+    """Return a number in LEB128 and the offset after it."""
     value, shift = np.int64(0), 0
     while True:
         byte = np.int64(data[at])

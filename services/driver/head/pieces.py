@@ -43,15 +43,15 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
     Vertices whose texture coordinates are also equal stay separate. Programs write such duplicates
     only for a slit, such as between closed lips.
     """
-    _, first, place = np.unique(
+    _, first, inverse = np.unique(
         np.round(vertices / 1e-6).astype(np.int64), axis=0, return_index=True, return_inverse=True
     )
-    place = place.ravel()
-    both = np.concatenate([place[:, None], np.round(uv * 65535)], axis=1)
+    inverse = inverse.ravel()
+    both = np.concatenate([inverse[:, None], np.round(uv * 65535)], axis=1)
     _, kind, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
     doubled = np.zeros(len(first), dtype=bool)
-    doubled[place[count[kind.ravel()] > 1]] = True
-    welded: NDArray[np.int64] = np.where(doubled[place], np.arange(len(vertices)), first[place])
+    doubled[inverse[count[kind.ravel()] > 1]] = True
+    welded: NDArray[np.int64] = np.where(doubled[inverse], np.arange(len(vertices)), first[inverse])
     return welded
 
 

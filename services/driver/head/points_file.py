@@ -24,14 +24,15 @@ MAX_BYTES = 4 * 1024 * 1024
 _GROUP_SIZES = {2: 14, 3: 14, 4: 6, 5: 4, 6: 4, 7: 1, 8: 10, 9: 15, 10: 10, 11: 6}
 _LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
 
-Place = NDArray[np.float64]
+Position = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Points:
     """The contents of a file."""
 
-    places: dict[str, Place | tuple[str, int]]  # coordinates (3,), or (mesh name or "", vertex)
+    positions: dict[str, Position | tuple[str, int]]
+    """coordinates (3,), or mesh name (may be empty) and vertex"""
     fapu: dict[str, float] = field(default_factory=dict)  # lengths in the mesh's own unit
 
 
@@ -43,19 +44,19 @@ def read_points(path: Path) -> Points:
     """
     text = read_file(path, MAX_BYTES).decode("utf-8-sig", "replace")
     points = _from_xml(path, text) if text.lstrip().startswith("<") else _from_lines(path, text)
-    if not points.places:
+    if not points.positions:
         raise UserError(f"{path} has no feature points; write lines such as '2.1 0.0 -0.07 0.07'")
     return points
 
 
 def _from_lines(path: Path, text: str) -> Points:
-    places: dict[str, Place | tuple[str, int]] = {}
+    positions: dict[str, Position | tuple[str, int]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.partition("#")[0].split()
         if not words or (number == 1 and not words[0][0].isdigit()):
             continue  # empty line, or column names
         where = f"{path}, line {number}"
-        name = _known(words[0], where, places)
+        name = _known(words[0], where, positions)
         try:
             values = [float(word) for word in words[1:]]
         except ValueError:
@@ -63,12 +64,12 @@ def _from_lines(path: Path, text: str) -> Points:
                 f"{where}: {line.strip()!r} contains an invalid number; correct it"
             ) from None
         if len(values) == 3 and all(map(math.isfinite, values)):
-            places[name] = np.array(values)
+            positions[name] = np.array(values)
         elif len(values) == 1 and values[0] >= 0 and values[0] == int(values[0]):
-            places[name] = ("", int(values[0]))
+            positions[name] = ("", int(values[0]))
         else:
             raise UserError(f"{where}: expected 'point x y z' or 'point vertex'")
-    return Points(places)
+    return Points(positions)
 
 
 def _from_xml(path: Path, text: str) -> Points:
@@ -78,12 +79,12 @@ def _from_xml(path: Path, text: str) -> Points:
         root = ET.fromstring(text)  # noqa: S314 - entities are refused above
     except ET.ParseError as error:
         raise UserError(f"{path}: invalid XML: {error}; export it again") from error
-    places: dict[str, Place | tuple[str, int]] = {}
+    positions: dict[str, Position | tuple[str, int]] = {}
     for entry in root.iter("fdp"):
         if "name" not in entry.attrib:
             continue
         where = f"{path}, <fdp name={entry.attrib['name']!r}>"
-        name = _known(entry.attrib["name"], where, places)
+        name = _known(entry.attrib["name"], where, positions)
         try:
             number = int(entry.attrib["index"])
         except (KeyError, ValueError):
@@ -92,7 +93,7 @@ def _from_xml(path: Path, text: str) -> Points:
             ) from None
         if number < 0:
             raise UserError(f"{where}: the vertex index {number} is negative; count from 0")
-        places[name] = (entry.attrib.get("affects", ""), number)
+        positions[name] = (entry.attrib.get("affects", ""), number)
     fapu = {}
     for entry in root.iter("fapu"):
         for name in _LENGTHS:
@@ -102,15 +103,15 @@ def _from_xml(path: Path, text: str) -> Points:
                 length = math.nan
             if 0 < length < math.inf:
                 fapu[name] = length
-    return Points(places, fapu)
+    return Points(positions, fapu)
 
 
-def _known(name: str, where: str, places: dict[str, Place | tuple[str, int]]) -> str:
+def _known(name: str, where: str, positions: dict[str, Position | tuple[str, int]]) -> str:
     match = re.fullmatch(r"(\d+)\.(\d+)", name)
     if not match or not 1 <= int(match[2]) <= _GROUP_SIZES.get(int(match[1]), 0):
         raise UserError(
             f"{where}: {name!r} is not an MPEG-4 feature point, such as 2.1; correct it"
         )
-    if name in places:
+    if name in positions:
         raise UserError(f"{where}: {name} occurs twice; delete one line")
     return name

@@ -66,14 +66,14 @@ def time_text(
         edges_s = [*phone_onsets(syllable, start_s, end_s, table), float(end_s)]
         phones += [
             Phone(
-                index=len(phones) + place,
+                index=len(phones) + number,
                 symbol=symbol,
-                onset_s=edges_s[place],
-                duration_s=edges_s[place + 1] - edges_s[place],
+                onset_s=edges_s[number],
+                duration_s=edges_s[number + 1] - edges_s[number],
                 confidence=1.0,
                 final=True,
             )
-            for place, symbol in enumerate(syllable)
+            for number, symbol in enumerate(syllable)
         ]
     return phones
 
