@@ -55,6 +55,7 @@ LONG_PENALTY_S = 3.0  # if no well-behaved peer could have done what it did
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
+_READABLE = int(zmq.POLLIN)
 _EVENT = struct.Struct("=HI")  # a monitor's event and descriptor
 _WARNINGS = RateLimit()
 
@@ -225,7 +226,7 @@ class LimitedSocket:
 
     def accepted(self) -> Iterator[int]:
         """Yield the descriptors of new connections."""
-        while int(self._monitor.get(zmq.EVENTS)) & zmq.POLLIN:
+        while int(self._monitor.get(zmq.EVENTS)) & _READABLE:
             data, _endpoint = self._monitor.recv_multipart()
             event, descriptor = _EVENT.unpack(data)
             if event == zmq.EVENT_ACCEPTED:

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 _IS_LINUX = sys.platform == "linux"
-_COUNTERS = struct.Struct("120x2Q")  # struct tcp_info: tcpi_bytes_acked, tcpi_bytes_received
-_SIOCOUTQNSD = 0x894B  # bytes that the kernel has not sent yet
+# struct tcp_info: tcpi_bytes_acked, tcpi_bytes_received, tcpi_notsent_bytes
+_COUNTERS = struct.Struct("120x2Q8xI")
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
 _DISCARD = getattr(socket, "MSG_DONTWAIT", 0) | socket.MSG_TRUNC
 _SINK = bytearray(1024 * 1024)
@@ -78,11 +78,14 @@ def traffic_of(descriptor: int) -> Traffic:
     if not _IS_LINUX:
         return Traffic()
     try:
-        with _borrow_socket(descriptor) as connection:
+        connection = socket.SocketType(socket.AF_INET, socket.SOCK_STREAM, 0, descriptor)
+        try:
             info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _COUNTERS.size)
-        acknowledged, received = _COUNTERS.unpack(info)
-        unread = _request(descriptor, termios.FIONREAD)
-        return Traffic(received - unread, acknowledged, _request(descriptor, _SIOCOUTQNSD))
+        finally:
+            connection.detach()
+        acknowledged, received, unsent = _COUNTERS.unpack(info)
+        (unread,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))
+        return Traffic(received - unread, acknowledged, unsent)
     except (OSError, struct.error):  # closed
         return Traffic()
 
@@ -124,10 +127,6 @@ def _shut_down(connection: socket.socket, how: int) -> None:
         connection.shutdown(how)
         while connection.recv_into(_SINK, 0, _DISCARD):  # or libzmq would read it
             pass
-
-
-def _request(descriptor: int, request: int) -> int:
-    return int(struct.unpack("i", fcntl.ioctl(descriptor, request, bytes(4)))[0])
 
 
 @contextlib.contextmanager

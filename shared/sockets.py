@@ -140,8 +140,8 @@ class Socket:
             for number in range(MAX_BATCH):
                 if self.raw.closed:  # by the handler of the last message
                     return
-                # Usually only one message is queued. This check is cheaper than an exception.
-                if number == 1 and not int(self.raw.get(zmq.EVENTS)) & _READABLE:
+                # This check is cheaper than an exception.
+                if number and not int(self.raw.get(zmq.EVENTS)) & _READABLE:
                     self.note_empty()
                     return
                 try:

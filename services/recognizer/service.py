@@ -373,19 +373,23 @@ class RecognizerService(Service):
         """Send new results to the subscribers, the synthesizer and control.
 
         Subscribers are first: a new recognizer does not repeat results that the synthesizer has.
-        All messages for the synthesizer are sent together, so that it wakes up only once.
+        All messages are sent together at the end, so that each receiver wakes up only once.
         """
         now_s = time.monotonic()
         results = session.new_results(self._recognizer)
-        if (acoustic := session.acoustic_message(results)) is not None:
+        acoustic = session.acoustic_message(results)
+        published = [*session.published_messages(results)]
+        messages = [message_of(result) for result in results if not isinstance(result, Waveform)]
+        if acoustic is not None:
             session.replay.send(acoustic, now_s)
-        for published in session.published_messages(results):
-            session.replay.send(published, now_s)
-            if isinstance(published, Speech):
-                self.send_to_control(published)
+        for message in published:
+            session.replay.send(message, now_s)
+        for message in messages:
+            session.link.send(message, now_s)
+        for message in published:
+            if isinstance(message, Speech):
+                self.send_to_control(message)
         for result in results:
-            if not isinstance(result, Waveform):
-                session.link.send(message_of(result), now_s)
             if isinstance(result, Progress) and result.is_laughter != session.is_laughing:
                 session.is_laughing = result.is_laughter
                 name = EventName.LAUGHTER_START if result.is_laughter else EventName.LAUGHTER_STOP
