@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence, Sized
 
+from kouxing.services.recognizer.acoustic.blocks import BlockRunner
 from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
@@ -62,7 +63,7 @@ class LiveBatches:
     @property
     def work(self) -> ProcessorTime:
         """The work of the service so far."""
-        network_s = self._recognizer.network_s
+        network_s = BlockRunner.run_s
         return ProcessorTime(network_s, time.thread_time() + self._network.work_s - network_s)
 
     def decode_all(self, sessions: Sequence[RecognizerSession]) -> None:
@@ -96,9 +97,9 @@ class LiveBatches:
                 session.accept_waveform(part_s, now_s, self._pace.hop)
             self._recognizer.run_ear([session.stream for session in group])
             if len(self._all) <= 1:  # no other session waits
-                network_s = self._recognizer.network_s
+                network_s = BlockRunner.run_s
                 self._decode(group)
-                self._busy.add((network_weight - 1.0) * (self._recognizer.network_s - network_s))
+                self._busy.add((network_weight - 1.0) * (BlockRunner.run_s - network_s))
             else:
                 self._decode([session for session in group if not self._waits_for_network(session)])
         self._network.start(now_s, saves_time=self._pace.hop > 1)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.ear import load_ear
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
@@ -92,12 +91,6 @@ class Recognizer:
             face_delay_s=face_delay_s,
             speech_time=speech_time,
         )
-
-    @property
-    def network_s(self) -> float:
-        """Processor time spent in block networks so far, seconds."""
-        models = [model for model in self._models.values() if isinstance(model, BlockModel)]
-        return sum(session.run_s for session in {model.session for model in models})
 
     def is_ready(self, stream: SpeechStream) -> bool:
         """Return whether a stream has audio to score."""

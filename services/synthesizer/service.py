@@ -62,7 +62,7 @@ from kouxing.shared.wire.speech import (
 
 MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
 MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
-DROP_INTERVAL_S = 1.0  # interval between searches for subscribers that stopped reading
+CHECK_INTERVAL_S = 1.0  # interval between checks for stopped subscribers and for lateness
 MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
 EXPRESSIONS = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
@@ -83,7 +83,7 @@ class SynthesizerService(Service):
         )
         self._sessions: dict[str, SynthesizerSession] = {}
         self._turn = 0  # round robin of sessions with queued events
-        self._dropped_s = 0.0  # last removal of frames for stopped subscribers
+        self._checked_s = 0.0  # last check for stopped subscribers and for lateness
         self._input = self.bus.bind_router(
             config.phone_input, "synthesizer.phone_input", PHONES, role="service"
         )
@@ -190,11 +190,13 @@ class SynthesizerService(Service):
         """Acknowledge, lead faces of stalled live streams to rest, drop old frames."""
         if not self._sessions:
             return math.inf
-        if now_s >= self._dropped_s + DROP_INTERVAL_S:
-            self._dropped_s = now_s
+        if now_s >= self._checked_s + CHECK_INTERVAL_S:
+            self._checked_s = now_s
             live = [name for name, session in self._sessions.items() if session.start.paced]
             self._faps.disconnect_stalled((FapFrame,), live)
-        due_s = self._dropped_s + DROP_INTERVAL_S
+            for session in self._sessions.values():
+                session.lateness.measure(now_s)
+        due_s = self._checked_s + CHECK_INTERVAL_S
         for name, session in self._sessions.items():
             due_s = min(due_s, session.receiver.tick(now_s))
             self.report_skipped(name, session.overload.take_report_s(now_s))
@@ -212,11 +214,10 @@ class SynthesizerService(Service):
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return, for each session, the end of its final phones, its lateness and skipped time."""
-        now_s = time.monotonic()
         return {
             name: SessionInput(
                 media_time=to_samples(session.final.time_s),
-                lateness=session.lateness.measure(now_s),
+                lateness=session.lateness.newest,
                 skipped_s=session.overload.skipped_s,
             )
             for name, session in self._sessions.items()

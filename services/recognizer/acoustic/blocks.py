@@ -48,7 +48,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,8 +173,9 @@ class Block(Record, frozen=True):
 class BlockRunner:
     """A network that is ready to run; ``ValueError`` if the file has another kind."""
 
+    run_s: ClassVar[float] = 0.0  # processor time spent in all networks so far
+
     def __init__(self, file: NDArray[np.uint8]) -> None:
-        self.run_s = 0.0  # processor time spent in the network so far
         content = file.tobytes()
         names = (_LAST_KEPT, f"{EXTENSION}{_LAST_KEPT}")  # a second readout may have its own
         self._last_kept = [name for name in names if name.encode() in content]
@@ -216,7 +217,7 @@ class BlockRunner:
             inputs["state"] = np.zeros((len(blocks), self._first_state), np.float32)
         start_s = time.thread_time()
         log_posteriors, state, new = run_session(self._session, self._outputs, inputs)
-        self.run_s += time.thread_time() - start_s
+        BlockRunner.run_s += time.thread_time() - start_s
         return log_posteriors, state, new
 
 
