@@ -8,6 +8,8 @@ selects. A softmax over log weights replaces the quotient, because the silences'
 overflow.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,8 +146,9 @@ def blend(
         return np.tile(parameters.neutral, (len(time_s), 1))
     sequence = sequence or sequence_parameters(parameters, timeline)
     weights = softmax(log_weights(parameters, sequence, timeline, time_s))  # (E + S, F, P)
-    curves: NDArray[np.float64] = np.einsum("efp,ep->fp", weights, sequence.target)
-    return curves  # Wang & Cai 2003, eq. 6
+    weights *= sequence.target[:, None]
+    curves: NDArray[np.float64] = np.add.reduce(weights)  # Wang & Cai 2003, eq. 6
+    return curves
 
 
 def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray[np.bool_]:
@@ -160,21 +163,16 @@ def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray
     return active
 
 
-class TargetTrajectory(Record, frozen=True):
-    """The trajectory of the mouth FAPs for a timeline."""
-
-    parameters: VisemeParameters
-    timeline: Timeline
-    sequence: SequenceParameters
-
-    def at(self, time_s: float) -> FapState:
-        """Return position and velocity at a media time."""
-        times = np.array([time_s - _STEP_S, time_s, time_s + _STEP_S])
-        before, here, after = blend(self.parameters, self.timeline, times, self.sequence)
-        return FapState(here, (after - before) / (2.0 * _STEP_S))
-
-    def value_at(self, time_s: float) -> NDArray[np.float64]:
-        """Return the position at a media time."""
-        faps = blend(self.parameters, self.timeline, np.array([time_s]), self.sequence)
-        value: NDArray[np.float64] = faps[0]
-        return value
+def states_at(
+    parameters: VisemeParameters,
+    timeline: Timeline,
+    times_s: Sequence[float],
+    sequence: SequenceParameters,
+) -> list[FapState]:
+    """Return position and velocity of the mouth FAPs at media times. Arguments as of `blend`."""
+    times = np.array(times_s)[:, None] + np.array([-_STEP_S, 0.0, _STEP_S])
+    curves = blend(parameters, timeline, times.reshape(-1), sequence)
+    return [
+        FapState(here, (after - before) / (2.0 * _STEP_S))
+        for before, here, after in curves.reshape(*times.shape, -1)
+    ]

@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
-    TargetTrajectory,
     active_visemes,
     sequence_parameters,
+    states_at,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.closures import ClosureTracker
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
@@ -110,8 +110,8 @@ class VisemeStream:
         self._closures = ClosureTracker(parameters, frame_rate_hz)
         self._timeline = self._build_timeline()
         self._current = self._timeline  # with open phone extended and late closures moved
-        sequence = sequence_parameters(parameters, self._timeline)
-        self._trajectory = TargetTrajectory(parameters, self._timeline, sequence)
+        self._active = self._timeline  # visemes that act at the time of the last frame
+        self._sequence = sequence_parameters(parameters, self._timeline)
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # set while media time stands still
@@ -140,23 +140,21 @@ class VisemeStream:
         extended = self._timeline.extend_open_phone(time_s + self._delay_s)
         self._current, is_postponed = self._closures.postpone(extended, self._time_s, time_s)
         active = self._current.select(active_visemes(self._current, time_s, self._delay_s))
-        before = self._trajectory
-        is_same = active.same_visemes(before.timeline)
-        has_same_sequence = is_same and len(active.silence_start_s) == len(
-            before.timeline.silence_start_s
-        )
-        self._trajectory = TargetTrajectory(
-            self._parameters,
-            active,
-            before.sequence if has_same_sequence else sequence_parameters(self._parameters, active),
-        )
-        if self._pending_s is not None or is_postponed or not is_same or self._rest is not None:
-            self._start_transition()
-        trajectory, transition = self._trajectory, self._transition
-        elapsed_s = time_s - self._transition_start_s
+        before, self._active = self._active, active
+        is_same = active.same_visemes(before)
+        if not is_same or len(active.silence_start_s) != len(before.silence_start_s):
+            self._sequence = sequence_parameters(self._parameters, active)
+        has_changed = self._pending_s is not None or is_postponed or not is_same
+        times_s = [time_s]
+        if has_changed or self._rest is not None:
+            times_s = [self._time_s, time_s]
+        *start, target = states_at(self._parameters, active, times_s, self._sequence)
+        if start:
+            self._start_transition(*start)
+        transition, elapsed_s = self._transition, time_s - self._transition_start_s
         # most frames need no velocity
-        self._mouth = lambda: self._within_hull(trajectory.at(time_s) + transition.at(elapsed_s))
-        faps = self._clip(trajectory.value_at(time_s) + transition.value_at(elapsed_s))
+        self._mouth = lambda: self._within_hull(target + transition.at(elapsed_s))
+        faps = self._clip(target.value + transition.value_at(elapsed_s))
         self._time_s = time_s
         self._closures.record_closures(active, time_s, faps)
         return self._frame(faps)
@@ -174,15 +172,13 @@ class VisemeStream:
         phones = self._known.in_order()
         return build_timeline(phones, self._inventory, self._known.speech_ends_s, live=True)
 
-    def _start_transition(self) -> None:
-        """Start a transition from the current mouth to the target trajectory."""
+    def _start_transition(self, target: FapState) -> None:
+        """Start a transition from the current mouth to the target trajectory, now at ``target``."""
         requested_s = self._pending_s or _TRANSITION_S
         duration_s = _SLOW_TRANSITION_S if self._rest is not None else requested_s
         self._transition = Transition(
-            self._mouth() - self._trajectory.at(self._time_s),
-            self._closures.shorten(
-                np.full(NUM_MOUTH_FAPS, duration_s), self._trajectory.timeline, self._time_s
-            ),
+            self._mouth() - target,
+            self._closures.shorten(np.full(NUM_MOUTH_FAPS, duration_s), self._active, self._time_s),
         )
         self._transition_start_s = self._time_s
         self._pending_s = self._rest = None
