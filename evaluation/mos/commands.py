@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.options import Assignments, ConfigFile, Output
+from kouxing.services.cli.options import Assignments, ConfigFile, Language, Output
 from kouxing.shared.terminal import (
     Force,
     JsonFile,
@@ -52,14 +52,15 @@ def heads(
         list[str] | None,
         typer.Option(help="Name of a built-in head; repeatable. Default: all heads."),
     ] = None,
+    language: Language = None,
 ) -> None:
     """Create a study of the built-in heads, with a one-minute video of each head."""
     from kouxing.evaluation.head_videos import write_head_videos
     from kouxing.evaluation.mos.study import check_no_study, new_study
-    from kouxing.services.recognizer.acoustic.load import load_model
+    from kouxing.services.recognizer.acoustic.languages import model_of_language
 
     check_no_study(folder)
-    write_head_videos(folder, load_model(), recordings, head or [])
+    write_head_videos(folder, model_of_language(language), recordings, head or [])
     study = new_study(folder)
     count = plural(len(study.conditions), "head")
     print_message(f"created a study of {count}; next: kouxing mos serve {folder}")

@@ -111,11 +111,16 @@ class Busy:
 
 
 def measure(
-    paths: Sequence[Path], programs: Sequence[int], load_s: float, console: Console
+    paths: Sequence[Path],
+    programs: Sequence[int],
+    load_s: float,
+    console: Console,
+    language: str | None = None,
 ) -> Busy:
     """Start all services, and speak while each number of busy programs runs.
 
-    Raises ``UserError`` if a file is not audio, or the services cannot start.
+    ``language`` is that of the speech, or None for the recognizer's. Raises ``UserError`` if a file
+    is not audio, or the services cannot start.
     """
     text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
@@ -128,18 +133,20 @@ def measure(
         processes = {name: system.supervisor.process(name).pid for name in KINDS}
         time.sleep(SETTLE_S)
         idle = _usage(processes, lambda: time.sleep(QUIET_S))
-        with _speaker(client, text) as (crowd, quiet_s):
+        with _speaker(client, text, language) as (crowd, quiet_s):
             speaking = _usage(processes, lambda: crowd.speak_until(quiet_s + QUIET_S))
         for num in programs:
             console.print(f"speaking with {num} busy programs")
-            runs.append(_run(client, text, num, load_s))
+            runs.append(_run(client, text, num, load_s, language))
     return Busy(runs=runs, idle=idle, speaking=speaking, machine_load=machine_load)
 
 
 @contextlib.contextmanager
-def _speaker(client: Client, text: NDArray[np.float32]) -> Iterator[tuple[Crowd, float]]:
+def _speaker(
+    client: Client, text: NDArray[np.float32], language: str | None
+) -> Iterator[tuple[Crowd, float]]:
     """Open a session and speak for a moment; yield the speaker and the time reached."""
-    crowd = Crowd(client, text, 1)
+    crowd = Crowd(client, text, 1, language)
     if not crowd.spoken:
         raise UserError(f"control rejects the session: {', '.join(crowd.refusals)}")
     crowd.start()
@@ -149,8 +156,14 @@ def _speaker(client: Client, text: NDArray[np.float32]) -> Iterator[tuple[Crowd,
     crowd.close()
 
 
-def _run(client: Client, text: NDArray[np.float32], num_programs: int, load_s: float) -> Run:
-    with _speaker(client, text) as (crowd, quiet_s):
+def _run(
+    client: Client,
+    text: NDArray[np.float32],
+    num_programs: int,
+    load_s: float,
+    language: str | None,
+) -> Run:
+    with _speaker(client, text, language) as (crowd, quiet_s):
         start_s = quiet_s + QUIET_S
         crowd.speak_until(start_s)
         with _busy_programs(num_programs):

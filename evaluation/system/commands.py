@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+from kouxing.services.cli.options import Language
 from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, write_json
 
 SENTENCE = Path(__file__).parents[2] / "shared" / "demo" / "hello-female.wav"
@@ -34,17 +35,19 @@ app = typer.Typer(cls=BenchGroup, add_completion=False, help="Measure the runnin
 def chain(
     audio: AudioFile,
     repeats: Annotated[int, typer.Option(min=1, help="Times to stream the file.")] = 3,
+    language: Language = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Measure latency, CPU time and images per second of the whole chain on this machine.
 
-    If Chromium is installed, the page is also measured.
+    If Chromium is installed, the page is also measured. ``--language`` is the language of the
+    streamed session; the other tables have their own.
     """
     from kouxing.evaluation.system import chromium, costs, latency, page
 
     check_output(json_file, force=force)
-    delays = latency.measure(audio, repeats, CONSOLE)
+    delays = latency.measure(audio, repeats, CONSOLE, language)
     sessions = costs.measure_sessions(audio)
     images = costs.measure_images()
     drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
@@ -108,6 +111,7 @@ def load(
     seconds: Annotated[
         float, typer.Option(min=1.0, help="Duration of each of up to 9 steps, in seconds.")
     ] = 12.0,
+    language: Language = None,
     picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
@@ -120,7 +124,8 @@ def load(
     from kouxing.evaluation.system.load import draw, measure, show
 
     check_output(picture, json_file, force=force)
-    figures = measure(audio or sorted(SENTENCE.parent.glob("*.wav")), sessions, seconds, CONSOLE)
+    paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
+    figures = measure(paths, sessions, seconds, CONSOLE, language)
     show(figures, Console())
     if picture is not None:
         save_figure(draw(figures), picture)
@@ -137,6 +142,7 @@ def busy(
         typer.Option(min=0, max=100, help="Number of busy programs; repeatable. Default: 0, 2, 6."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each load.")] = 30.0,
+    language: Language = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -148,7 +154,7 @@ def busy(
 
     check_output(json_file, force=force)
     paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
-    figures = measure(paths, programs or (0, 2, 6), seconds, CONSOLE)
+    figures = measure(paths, programs or (0, 2, 6), seconds, CONSOLE, language)
     show(figures, Console())
     write_json(json_file, asdict(figures) | {"summary": [run.summary for run in figures.runs]})
 

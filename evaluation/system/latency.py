@@ -44,8 +44,11 @@ class Latency:
     cpu_s_per_audio_s: dict[str, float]
 
 
-def measure(path: Path, num_repeats: int, console: Console) -> Latency:
-    """Start the services, stream the file and return the figures; UserError if that fails."""
+def measure(path: Path, num_repeats: int, console: Console, language: str | None = None) -> Latency:
+    """Start the services, stream the file and return the figures; UserError if that fails.
+
+    ``language`` is that of the speech, or None for the recognizer's.
+    """
     sound = to_16_khz(*read_audio(path))
     delay_s = SynthesizerConfig().delay_ms / 1e3
     with (
@@ -54,7 +57,7 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
         connect(system.control) as client,
     ):
         before = _cpu_s(client)
-        delays = [stream(client, sound, delay_s)[1:] for _ in range(num_repeats)]
+        delays = [stream(client, sound, delay_s, language)[1:] for _ in range(num_repeats)]
         time.sleep(1.0)  # for the last heartbeats
         after = _cpu_s(client)
     audio_s = num_repeats * len(sound) / MEDIA_RATE_HZ
@@ -81,13 +84,13 @@ def show(latency: Latency, console: Console) -> None:
 
 
 def stream(
-    client: Client, sound: NDArray[np.float32], delay_s: float
+    client: Client, sound: NDArray[np.float32], delay_s: float, language: str | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Stream in real time; return media time and both latencies of every frame, seconds.
 
     Frames after the last sample are omitted. Raises UserError if the session does not complete.
     """
-    session = client.open_session(encoding="f32le")
+    session = client.open_session(encoding="f32le", language=language)
     (seen,) = speak([session], sound)
     session.close()
     if seen.error or not seen.ended:

@@ -100,11 +100,18 @@ class Load:
         }
 
 
-def measure(paths: Sequence[Path], num_sessions: int, step_s: float, console: Console) -> Load:
+def measure(
+    paths: Sequence[Path],
+    num_sessions: int,
+    step_s: float,
+    console: Console,
+    language: str | None = None,
+) -> Load:
     """Start all services, put them under load, return the figures.
 
-    The last step has ``num_sessions``; each is measured for ``step_s``. Raises UserError if a file
-    is not audio or the services cannot start.
+    The last step has ``num_sessions``; each is measured for ``step_s``. ``language`` is that of
+    the speech, or None for the recognizer's. Raises UserError if a file is not audio or the
+    services cannot start.
     """
     text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
@@ -116,7 +123,7 @@ def measure(paths: Sequence[Path], num_sessions: int, step_s: float, console: Co
         LocalSystem(Path(folder), console, settings=settings) as system,
     ):
         for num in step_sizes(num_sessions):
-            steps.append(_step(system.control, text, num, step_s, delay_s))
+            steps.append(_step(system.control, text, num, step_s, delay_s, language))
             time.sleep(PAUSE_S)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Load(steps, cores or 1, machine_load, delay_s * 1e3)
@@ -128,10 +135,15 @@ def step_sizes(maximum: int) -> list[int]:
 
 
 def _step(
-    control: str, text: NDArray[np.float32], num_asked: int, step_s: float, delay_s: float
+    control: str,
+    text: NDArray[np.float32],
+    num_asked: int,
+    step_s: float,
+    delay_s: float,
+    language: str | None,
 ) -> Step:
     with connect(control) as client:
-        crowd = Crowd(client, text, num_asked)
+        crowd = Crowd(client, text, num_asked, language)
         crowd.start()
         from_s = time.perf_counter() + SETTLE_S
         crowd.speak_until(from_s)
@@ -327,14 +339,20 @@ class Spoken:
 class Crowd:
     """Sessions of one client with audio in real time, whose chunks are spread evenly."""
 
-    def __init__(self, client: Client, text: NDArray[np.float32], num_speakers: int) -> None:
+    def __init__(
+        self,
+        client: Client,
+        text: NDArray[np.float32],
+        num_speakers: int,
+        language: str | None = None,
+    ) -> None:
         self.spoken: list[Spoken] = []  # admitted
         self.refusals: dict[str, int] = {}  # number by code
         self.lateness_s: list[float] = []  # how late each chunk was sent
         self._turn = 0  # index of the next speaker
         for number in range(num_speakers):
             try:
-                session = client.open_session()
+                session = client.open_session(language=language)
             except Refused as refusal:
                 self.refusals[refusal.code] = self.refusals.get(refusal.code, 0) + 1
                 continue

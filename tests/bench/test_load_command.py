@@ -16,7 +16,16 @@ def test_prints_writes_and_plots_the_same_figures(
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.load.SETTLE_S", 1.0)
     figures, picture = tmp_path / "load.json", tmp_path / "load.png"
-    arguments = ["load", str(VOWELS_FILE), "--sessions", "2", "--seconds", "1"]
+    arguments = [
+        "load",
+        str(VOWELS_FILE),
+        "--sessions",
+        "2",
+        "--seconds",
+        "1",
+        "--language",
+        "auto",
+    ]
     result = CliRunner().invoke(
         app, [*arguments, "--json", str(figures), "--picture", str(picture)]
     )
