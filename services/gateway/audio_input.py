@@ -9,7 +9,7 @@ from kouxing_client import KouxingError
 
 from kouxing.services.gateway.audio_sessions import AudioSession
 from kouxing.services.gateway.limits import COMMAND_S, RealTimeLimit
-from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
+from kouxing.services.gateway.pcm_format import HEADER_BYTES, NoiseCheck, PcmFormat
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
@@ -31,6 +31,7 @@ class AudioInput:
         self._format = pcm_format
         self._is_ahead = is_ahead
         self._is_first = True
+        self._noise = NoiseCheck(pcm_format)
         self._incomplete = b""  # part of a sample, or of a file's header
         self._drained: asyncio.Task[None] | None = None  # done when all audio is passed on
         self._rate_limit = RealTimeLimit()
@@ -62,6 +63,7 @@ class AudioInput:
         end = num_frames * self._format.frame_bytes
         pcm, self._incomplete = pcm[:end], pcm[end:]
         self._format.check_samples(pcm, is_first=self._is_first)
+        self._noise.check(pcm)
         self._is_first = False
         duration_s = num_frames / self._format.sample_rate_hz
         if self._is_ahead or duration_s > MAX_LIVE_S or not self._queue.is_empty:

@@ -10,6 +10,7 @@ from kouxing.services.gateway.audio_input import AudioInput
 from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
 from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.limits import ConnectionQuota
+from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
@@ -80,18 +81,22 @@ class Microphones:
             audio_input = AudioInput(session, hello.pcm_format, is_ahead=hello.is_ahead)
             try:
                 async with audio_input.running():
-                    await self._forward_audio(browser, session, audio_input)
+                    await self._forward_audio(browser, session, audio_input, hello.pcm_format)
             finally:
                 self._session_names[browser] = ""
 
     async def _forward_audio(
-        self, browser: web.WebSocketResponse, session: AudioSession, audio_input: AudioInput
+        self,
+        browser: web.WebSocketResponse,
+        session: AudioSession,
+        audio_input: AudioInput,
+        pcm_format: PcmFormat,
     ) -> None:
         async for message in audio_input.messages(browser):
             if message.type is WSMsgType.BINARY:
                 await audio_input.push(message.data)
             elif message.type is WSMsgType.TEXT:
-                command = wire.parse_command(message.data)
+                command = wire.parse_command(message.data, pcm_format)
                 session.skip(command.num_skipped)
                 if command.flush:
                     await audio_input.flush()

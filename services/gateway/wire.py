@@ -109,13 +109,17 @@ class MicrophoneCommand:
     lip_model: str  # to change to; empty: no change
 
 
-def parse_command(message: str) -> MicrophoneCommand:
+def parse_command(message: str, pcm_format: PcmFormat | None = None) -> MicrophoneCommand:
     """Return a later text message of a microphone.
 
-    Raises ``UserError`` if the message is not a JSON object or a field is out of range.
+    Raises ``UserError`` if the message is not a JSON object, a field is out of range, or it
+    describes audio of another format than ``pcm_format``.
     """
     check_text(message)
     fields = parse_object(message)
+    for name in ("sample_rate_hz", "num_channels", "encoding"):
+        if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
+            raise UserError(f"{name} cannot change during a session; open another connection")
     num_skipped = fields.get("skip", 0)
     if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:
         raise UserError(f"skip must be an integer from 0 to {MAX_SKIPPED}")

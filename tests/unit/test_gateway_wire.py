@@ -60,6 +60,10 @@ def test_rejects_a_bad_hello_and_names_the_field(fields: object, field: str) -> 
 def test_parses_microphone_commands() -> None:
     assert wire.parse_command('{"flush": true}').flush
     assert wire.parse_command('{"skip": 960}').num_skipped == 960
+    pcm_format = PcmFormat(sample_rate_hz=16000)
+    wire.parse_command('{"sample_rate_hz": 16000, "encoding": "s16le"}', pcm_format)
+    with pytest.raises(UserError, match="sample_rate_hz cannot change during a session"):
+        wire.parse_command('{"sample_rate_hz": 48000}', pcm_format)
     assert wire.parse_command('{"lips": "ferguson"}').lip_model == "ferguson"
 
 
