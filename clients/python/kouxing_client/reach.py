@@ -16,7 +16,7 @@ def reach_error(host: str, port: str, timeout_s: float = 3.0, *, is_zeromq: bool
     except TimeoutError:
         return "the connection times out; open this port in the firewalls between the machines"
     except ConnectionRefusedError:
-        return "nothing listens there; start kouxing there, or correct the address"
+        return "nothing listens there; start kouxing there (kouxing run), or correct the address"
     except (socket.gaierror, UnicodeError):  # UnicodeError: a label of the name is too long
         return f"the host name {host!r} is unknown; correct it, or write an IP address"
     except OSError as error:
