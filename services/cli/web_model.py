@@ -87,7 +87,10 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "mel": (whisper_mel, "HOP_SAMPLES WINDOW_SAMPLES NUM_MELS FLOOR_BANDS _FLOOR _HANN _EDGES"),
     "modelFile": (model_file, "_LOG_STEP"),
     "network": (network, "MAX_POSITIONS FRAMES_PER_POSITION _LONGEST_WAVE"),
-    "nonverbal": (nonverbal, "_HOLD_S _LAUGHTER _BREATH"),
+    "nonverbal": (
+        nonverbal,
+        "_HOLD_S _LEAD_S _LAUGH_EASE_S _LOUDNESS_DB _FORGET_DB_S _BREATH _SMILING _LOUD_NOTE",
+    ),
     "pcm": (pcm, "MEDIA_RATE_HZ SLICE"),
     "resample": (
         resample,

@@ -6,6 +6,7 @@ import { clamp, smoothingShare } from "./math.js";
 /** The current expressions of the face. */
 export class Expressions {
   #c; // constants
+  #easeS; // time constant of each filter pole
   #faps; // FAPs of each expression at full strength
   #numFaps;
   #goal;
@@ -15,8 +16,9 @@ export class Expressions {
   #remainingS = 0;
   #free = 1;
 
-  constructor({ arrays, constants, expressionNames, numFaps }) {
+  constructor({ arrays, constants, expressionNames, numFaps }, easeS = constants.expression.EASE_S) {
     this.#c = constants.expression;
+    this.#easeS = easeS;
     this.#numFaps = numFaps;
     this.#faps = Object.fromEntries(expressionNames.map((name) => [name, arrays[`expressions.${name}`].values]));
     this.#goal = this.#halfway = this.#shown = new Float32Array(numFaps);
@@ -40,13 +42,13 @@ export class Expressions {
 
   /** Add the expressions to a frame, in place. */
   apply(faps, stepS, isSpeaking) {
-    const { EASE_S, FADE_S, FREE_S, BIND_S } = this.#c;
+    const { FADE_S, FREE_S, BIND_S } = this.#c;
     const isHeld = this.#remainingS > 0;
     this.#remainingS -= stepS;
     if (isSpeaking) this.#free = Math.max(this.#free - stepS / BIND_S, 0);
     else this.#free += (1 - this.#free) * smoothingShare(stepS, FREE_S);
     if (!isHeld && !this.#isShown) return;
-    const share = smoothingShare(stepS, isHeld ? EASE_S : FADE_S);
+    const share = smoothingShare(stepS, isHeld ? this.#easeS : FADE_S);
     this.#halfway = this.#halfway.map((x, i) => x + share * ((isHeld ? this.#goal[i] : 0) - x));
     this.#shown = this.#shown.map((x, i) => x + share * (this.#halfway[i] - x));
     this.#mix(faps);

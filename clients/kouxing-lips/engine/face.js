@@ -4,6 +4,7 @@
 import { Expressions, applyExpressiveness } from "./expressions.js";
 import { Feeling } from "./feeling.js";
 import { LearntLips } from "./learnt-lips.js";
+import { NonverbalSounds } from "./nonverbal.js";
 
 export class Face {
   #model;
@@ -12,10 +13,10 @@ export class Face {
   #expressiveness;
   #lips;
   #expressions;
-  #laughter;
-  #breath;
+  #nonverbal;
   #feeling;
   #voice = []; // the current progress and later ones
+  #levels = []; // progress since the last frame
   #nextFrame = 0;
   #isSpeaking = false; // at the last frame
   #changes = []; // changes in future frames
@@ -27,8 +28,7 @@ export class Face {
     this.#expressiveness = expressiveness;
     this.#lips = new LearntLips(model, delayS);
     this.#expressions = new Expressions(model);
-    this.#laughter = new Expressions(model);
-    this.#breath = new Expressions(model);
+    this.#nonverbal = new NonverbalSounds(model);
     this.#feeling = new Feeling(model, feeling);
   }
 
@@ -46,7 +46,10 @@ export class Face {
     }
     this.#lips.addEvent(event);
     if (event.type === "speech") this.#changes.push(event);
-    if (event.type === "progress") this.#voice.push(event);
+    if (event.type === "progress") {
+      this.#voice.push(event);
+      this.#levels.push(event);
+    }
     if (event.type === "end") return this.#framesUntil(event.timeS + this.#delayS + REST_S);
     return event.type === "progress" ? this.#framesUntil(event.timeS) : [];
   }
@@ -60,8 +63,11 @@ export class Face {
 
   #makeFrame(timeS) {
     const { MOUTH, SPEECH_LEAD_S, VOICE_LEAD_S } = this.#model.constants.animator;
-    const { LAUGHTER, BREATH, HOLD_S } = this.#model.constants.nonverbal;
-    while (this.#changes[0]?.timeS <= timeS) this.#isSpeaking = this.#changes.shift().active;
+    while (this.#changes[0]?.timeS <= timeS) {
+      const change = this.#changes.shift();
+      this.#isSpeaking = change.active;
+      if (change.active) this.#levels = this.#levels.filter((level) => level.timeS >= change.timeS); // earlier ones are noise
+    }
     const startsSoon = this.#changes.some((change) => change.active && change.timeS <= timeS + SPEECH_LEAD_S);
     while (this.#voice[1]?.timeS <= timeS + VOICE_LEAD_S) this.#voice.shift();
     const voice = this.#voice[0];
@@ -73,10 +79,9 @@ export class Face {
     const isSpeaking = this.#isSpeaking || startsSoon;
     this.#feeling.apply(faps, stepS, isSpeaking ? voice : null);
     this.#expressions.apply(faps, stepS, isSpeaking);
-    if (voice?.isLaughter) this.#laughter.showFaps(LAUGHTER, HOLD_S);
-    else if (voice?.isBreath) this.#breath.showFaps(BREATH, HOLD_S);
-    this.#laughter.apply(faps, stepS, isSpeaking);
-    this.#breath.apply(faps, stepS, isSpeaking);
+    const knownS = timeS + this.#delayS;
+    this.#nonverbal.apply(faps, { timeS, knownS, stepS, isSpeaking, voice, levels: this.#levels });
+    this.#levels = [];
     return { timeS, faps };
   }
 }

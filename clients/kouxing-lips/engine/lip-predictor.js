@@ -3,19 +3,16 @@
 import { sigmoid } from "./math.js";
 import { ProductMemory, alignedBytes } from "./products.js";
 
+const LANES = 4; // values that a product of floats processes together
+
 /** The lip frames of one session. */
 export class LipPredictor {
   #weights; // arrays by name
   #constants;
   #numMouthFaps;
   #delayS;
-  #state;
-  // Multiply buffers by matrices. The first multiplies those of x and u: nothing is between them.
-  #enter;
-  #multiplyInput;
-  #multiplyState;
-  #outputs; // weights at the used delay: an array for each output, and a bias
-  #buffers; // buffers of a step
+  #memory;
+  #arrays; // arrays in the memory, by name
 
   /** @param delayS delay of the face; the longest delay of the model that fits is used */
   constructor({ arrays, constants, mouthFaps }, delayS) {
@@ -28,27 +25,37 @@ export class LipPredictor {
     const inTime = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
     this.#delayS = inTime.at(-1) ?? delaysS[0];
     const { projection, entry_weights, input_weights, state_weights, output_bias } = this.#weights;
-    this.#outputs = this.#outputsAt(delaysS.indexOf(this.#delayS));
-    const matrices = [product(projection, entry_weights), input_weights, state_weights];
-    const [[numFeatures, width], [, gates]] = matrices.map(({ shape }) => shape);
-    const sizes = [...matrices.map(({ values }) => values.length), numFeatures, width, gates, width, gates];
-    const memory = new ProductMemory(sizes.reduce((sum, size) => sum + alignedBytes(Float32Array, size), 0));
-    const buffers = sizes.map((size) => memory.array(Float32Array, size));
-    matrices.forEach(({ values }, i) => buffers[i].set(values));
-    const [entry, input, state, centered, entered, fromInput, lastState, fromState] = buffers;
-    const multiply = (vector, matrix, out) => () =>
-      memory.multiply(...[vector, matrix, out].map(({ byteOffset }) => byteOffset), 1, vector.length, out.length);
-    this.#enter = multiply(centered, entry, entered);
-    this.#multiplyInput = multiply(entered, input, fromInput);
-    this.#multiplyState = multiply(lastState, state, fromState);
-    this.#state = lastState;
-    this.#buffers = [centered, entered, fromInput, fromState, new Float64Array(output_bias.shape[1])];
-    this.reset();
+    const entry = product(projection, entry_weights); // nothing is between these two
+    const [numFeatures, width] = entry.shape;
+    const gates = input_weights.shape[1];
+    const stateAt = Math.ceil(numFeatures / LANES) * LANES;
+    const numInputs = stateAt + 2 * width; // features, state and entry are the inputs of the outputs
+    const numOutputs = output_bias.shape[1];
+    const matrices = { entry: entry.values, input: input_weights.values, state: state_weights.values };
+    const outputs = this.#outputWeights(delaysS.indexOf(this.#delayS), numOutputs, stateAt, numInputs);
+    const sizes = { centered: numFeatures, inputs: numInputs, fromInput: gates, fromState: gates, outputs: numOutputs };
+    const lengths = [...Object.values(sizes), ...Object.values(matrices).map(({ length }) => length), outputs.length];
+    const memory = new ProductMemory(lengths.reduce((sum, length) => sum + alignedBytes(Float32Array, length), 0));
+    const stored = (values) => {
+      const array = memory.array(Float32Array, values.length);
+      array.set(values);
+      return array;
+    };
+    const buffers = Object.fromEntries(Object.entries(sizes).map(([name, size]) => [name, memory.array(Float32Array, size)]));
+    this.#memory = memory;
+    this.#arrays = {
+      ...buffers,
+      lastState: buffers.inputs.subarray(stateAt, stateAt + width),
+      entered: buffers.inputs.subarray(stateAt + width),
+      weights: Object.fromEntries(Object.entries(matrices).map(([name, values]) => [name, stored(values)])),
+      outputWeights: stored(outputs),
+      outputBias: output_bias.values.subarray(delaysS.indexOf(this.#delayS) * numOutputs),
+    };
   }
 
   /** Start a new segment of speech. */
   reset() {
-    this.#state.fill(0);
+    this.#arrays.lastState.fill(0);
   }
 
   /**
@@ -62,7 +69,7 @@ export class LipPredictor {
     const outputs = this.#step(features);
     const { COLUMNS, ONES, OTHERS, CLOSURE } = this.#constants;
     const faps = new Array(this.#numMouthFaps).fill(0);
-    COLUMNS.forEach((column, i) => (faps[column] = Math.fround(outputs[i])));
+    COLUMNS.forEach((column, i) => (faps[column] = outputs[i]));
     OTHERS.forEach((other, i) => (faps[other] = faps[ONES[i]]));
     return { timeS: knownS - this.#delayS, delayS: this.#delayS, faps, closure: sigmoid(outputs[CLOSURE]) };
   }
@@ -70,44 +77,56 @@ export class LipPredictor {
   /** Return the outputs at the delay, from features that stay unchanged. */
   #step(features) {
     const w = this.#weights;
-    const [centered, entered, fromInput, fromState, outputs] = this.#buffers;
+    const { centered, inputs, lastState, entered, fromInput, fromState, outputs, weights, outputWeights, outputBias } = this.#arrays;
+    const size = lastState.length;
+    inputs.set(features);
     for (let i = 0; i < centered.length; i++) centered[i] = features[i] - w.feature_mean.values[i];
-    this.#enter();
-    for (let i = 0; i < entered.length; i++) entered[i] = Math.max(entered[i] + w.entry_bias.values[i], 0);
-    this.#multiplyInput();
-    this.#multiplyState();
+    this.#multiply(centered, weights.entry, entered);
+    for (let i = 0; i < size; i++) entered[i] = Math.max(entered[i] + w.entry_bias.values[i], 0);
+    this.#multiply(entered, weights.input, fromInput);
+    this.#multiply(lastState, weights.state, fromState);
     for (let i = 0; i < fromInput.length; i++) {
       fromInput[i] += w.input_bias.values[i];
       fromState[i] += w.state_bias.values[i];
     }
-    const size = this.#state.length;
+    for (let i = 0; i < 2 * size; i++) fromInput[i] += fromState[i];
+    this.#activate(fromInput, 0, 2 * size, 0.5, 0.5); // reset and update gates
+    for (let i = 0; i < size; i++) fromInput[2 * size + i] += fromInput[i] * fromState[2 * size + i];
+    this.#activate(fromInput, 2 * size, size, 1, 0);
     for (let i = 0; i < size; i++) {
-      const reset = sigmoid(fromInput[i] + fromState[i]);
-      const update = sigmoid(fromInput[size + i] + fromState[size + i]);
-      const next = Math.tanh(fromInput[2 * size + i] + reset * fromState[2 * size + i]);
-      this.#state[i] = (1 - update) * next + update * this.#state[i];
+      const update = fromInput[size + i];
+      lastState[i] = (1 - update) * fromInput[2 * size + i] + update * lastState[i];
     }
-    for (let output = 0; output < outputs.length; output++) {
-      const { lips, state, bias } = this.#outputs[output];
-      let sum = bias;
-      for (let i = 0; i < lips.length; i++) sum += features[features.length - lips.length + i] * lips[i];
-      for (let i = 0; i < size; i++) sum += this.#state[i] * state[i];
-      for (let i = 0; i < size; i++) sum += entered[i] * state[size + i];
-      outputs[output] = sum;
-    }
+    const places = [inputs, outputWeights, outputs].map(({ byteOffset }) => byteOffset);
+    this.#memory.multiplyTransposed(...places, 1, inputs.length, outputs.length, 1);
+    for (let i = 0; i < outputs.length; i++) outputs[i] += outputBias[i];
     return outputs;
   }
 
-  #outputsAt(delay) {
-    const { lip_weights, output_weights, output_bias } = this.#weights;
-    const [numDelays, numOutputs] = output_bias.shape;
-    const column = ({ values, shape: [rows] }, output) =>
-      Float32Array.from({ length: rows }, (_, row) => values[(row * numDelays + delay) * numOutputs + output]);
-    return Array.from({ length: numOutputs }, (_, output) => ({
-      lips: column(lip_weights, output),
-      state: column(output_weights, output),
-      bias: output_bias.values[delay * numOutputs + output],
-    }));
+  #multiply(vector, matrix, out) {
+    this.#memory.multiply(vector.byteOffset, matrix.byteOffset, out.byteOffset, 1, vector.length, out.length);
+  }
+
+  /** Replace a part of an array by factor * tanh(factor * x) + offset. */
+  #activate(array, at, count, factor, offset) {
+    const place = array.byteOffset + at * Float32Array.BYTES_PER_ELEMENT;
+    this.#memory.activate(place, place, count, factor, offset);
+  }
+
+  /** Return the weights of the outputs at a delay, (outputs, inputs): of the features, the state and the entry. */
+  #outputWeights(delay, numOutputs, stateAt, numInputs) {
+    const weights = new Float32Array(numOutputs * numInputs);
+    for (const [{ values, shape: [rows, numDelays] }, at] of [
+      [this.#weights.lip_weights, 0],
+      [this.#weights.output_weights, stateAt],
+    ]) {
+      for (let row = 0; row < rows; row++) {
+        for (let output = 0; output < numOutputs; output++) {
+          weights[output * numInputs + at + row] = values[(row * numDelays + delay) * numOutputs + output];
+        }
+      }
+    }
+    return weights;
   }
 }
 

@@ -19,6 +19,17 @@ export function smoothingShare(elapsedS, timeConstantS) {
   return -Math.expm1(-elapsedS / timeConstantS);
 }
 
+/** Return the values of some arrays, one after the other. */
+export function join(parts) {
+  const joined = new Float32Array(parts.reduce((sum, { length }) => sum + length, 0));
+  let at = 0;
+  for (const part of parts) {
+    joined.set(part, at);
+    at += part.length;
+  }
+  return joined;
+}
+
 /** Return a time in whole samples of media time. */
 export function wholeSamples(timeS, { constants: { clock } }) {
   return Math.round(timeS * clock.MEDIA_RATE_HZ) / clock.MEDIA_RATE_HZ;

@@ -4,7 +4,7 @@
 // returns the computation once all tensors have their place in a ProductMemory, and more tensors to store.
 // A tensor is { shape, length, values }. One that is a part of another is { shape, length, of, offset }.
 
-const LANES = 8; // values that products of 8-bit integers process together
+const LANES = 16; // values that products of 8-bit integers process together
 const MAX_BYTE = 255;
 const ROUNDER = 1.5 * 2 ** 52;
 const GELU_STEPS = 512; // per unit of the table
@@ -17,12 +17,6 @@ const UNARY = {
   },
   Relu(out, x) {
     for (let i = 0; i < out.length; i++) out[i] = x[i] > 0 ? x[i] : 0;
-  },
-  Sigmoid(out, x) {
-    for (let i = 0; i < out.length; i++) out[i] = 1 / (1 + Math.exp(-x[i]));
-  },
-  Tanh(out, x) {
-    for (let i = 0; i < out.length; i++) out[i] = Math.tanh(x[i]);
   },
   Gelu(out, x) {
     for (let i = 0; i < out.length; i++) {
@@ -64,6 +58,15 @@ function unary({ type }, [x]) {
   return { outputs: [out], start: () => () => compute(out.values, x.values) };
 }
 
+/** Return the operator that computes factor * tanh(factor * x) + offset. */
+function activation(factor, offset) {
+  return (_node, [x]) => {
+    const out = tensorOf(x.shape);
+    const start = (memory) => () => memory.activate(placeOf(x), placeOf(out), out.length, factor, offset);
+    return { outputs: [out], start };
+  };
+}
+
 function binary({ type }, [x, y]) {
   const out = tensorOf(broadcastShape(x.shape, y.shape));
   const compute = BINARY[type];
@@ -92,6 +95,8 @@ function rowwise(compute) {
 export const OPERATORS = {
   ...Object.fromEntries(Object.keys(UNARY).map((type) => [type, unary])),
   ...Object.fromEntries(Object.keys(BINARY).map((type) => [type, binary])),
+  Sigmoid: activation(0.5, 0.5),
+  Tanh: activation(1, 0),
   Softmax: rowwise((out, x, at, end) => {
     const most = largest(x, at, end);
     let sum = 0;

@@ -1,12 +1,23 @@
 // Resampling to 16 kHz; services/recognizer/front_end/resample.py has the formula.
 
+import { join } from "./math.js";
+import { ProductMemory, alignedBytes } from "./products.js";
+
+const LANES = 4; // taps that a product processes together
+const PIECE_S = 0.1; // longer audio is processed in pieces
+
 /** Streaming: any chunking gives the same samples. */
 export class Resampler {
   #up;
   #down;
+  #memory;
+  #numTaps; // a multiple of LANES: zeros follow the filter
   #table; // rows of the filter, one for each phase
+  #known; // newest samples; only the first #numKnown are valid
+  #out;
   #half;
-  #known;
+  #numKnown;
+  #maxPiece; // samples
   #first; // number of the first known sample
   #numIn = 0;
   #numOut = 0;
@@ -24,8 +35,16 @@ export class Resampler {
     [this.#up, this.#down] = [c.SAMPLE_RATE_HZ / common, rateHz / common];
     const lower = Math.min(1, c.SAMPLE_RATE_HZ / rateHz);
     this.#half = Math.ceil(c.HALF_WIDTH / lower);
-    this.#table = filterRows(this.#up, this.#half, lower * c.CUTOFF, c.KAISER_BETA);
-    this.#known = new Float32Array(this.#half);
+    const rows = filterRows(this.#up, this.#half, lower * c.CUTOFF, c.KAISER_BETA);
+    this.#numTaps = Math.ceil((2 * this.#half) / LANES) * LANES;
+    this.#maxPiece = Math.ceil(PIECE_S * rateHz);
+    const numOut = Math.ceil((this.#maxPiece * this.#up) / this.#down) + 1;
+    const numKept = 2 * this.#half + Math.ceil(this.#down / this.#up); // between pieces
+    const sizes = [this.#up * this.#numTaps, numKept + this.#maxPiece, numOut];
+    this.#memory = new ProductMemory(sizes.reduce((sum, size) => sum + alignedBytes(Float32Array, size), 0));
+    [this.#table, this.#known, this.#out] = sizes.map((size) => this.#memory.array(Float32Array, size));
+    rows.forEach((row, phase) => this.#table.set(row, phase * this.#numTaps));
+    this.#numKnown = this.#half; // silence
     this.#first = -this.#half;
   }
 
@@ -45,25 +64,34 @@ export class Resampler {
   }
 
   #resample(samples) {
-    const known = new Float32Array(this.#known.length + samples.length);
-    known.set(this.#known);
-    known.set(samples, this.#known.length);
-    const end = this.#first + known.length;
-    const numReady = Math.max(0, Math.ceil(((end - this.#half) * this.#up) / this.#down) - this.#numOut);
-    const out = new Float32Array(numReady);
-    for (let row = 0; row < numReady; row++) {
-      const position = (this.#numOut + row) * this.#down;
-      const begin = Math.floor(position / this.#up) - this.#half + 1 - this.#first;
-      const filter = this.#table[position % this.#up];
-      let total = 0;
-      for (let tap = 0; tap < filter.length; tap++) total += filter[tap] * known[begin + tap];
-      out[row] = total;
+    const pieces = [];
+    for (let begin = 0; begin < samples.length; begin += this.#maxPiece) {
+      pieces.push(this.#resamplePiece(samples.subarray(begin, begin + this.#maxPiece)));
     }
+    return join(pieces);
+  }
+
+  #resamplePiece(samples) {
+    const [up, down, known, out] = [this.#up, this.#down, this.#known, this.#out];
+    known.set(samples, this.#numKnown);
+    this.#numKnown += samples.length;
+    const end = this.#first + this.#numKnown;
+    const numReady = Math.max(0, Math.ceil(((end - this.#half) * up) / down) - this.#numOut);
+    const begin = this.#neededFrom(this.#numOut);
+    const input = known.byteOffset + begin * known.BYTES_PER_ELEMENT;
+    const phase = (this.#numOut * down) % up;
+    this.#memory.resample(input, this.#table.byteOffset, out.byteOffset, numReady, this.#numTaps, up, down, phase);
     this.#numOut += numReady;
-    const drop = Math.max(0, Math.floor((this.#numOut * this.#down) / this.#up) - this.#half + 1 - this.#first);
-    this.#known = known.slice(drop);
-    this.#first += drop;
-    return out;
+    const numOld = Math.max(0, this.#neededFrom(this.#numOut));
+    known.copyWithin(0, numOld, this.#numKnown);
+    this.#numKnown -= numOld;
+    this.#first += numOld;
+    return out.slice(0, numReady);
+  }
+
+  /** Return the place of the first known sample that a sample of the result depends on. */
+  #neededFrom(number) {
+    return Math.floor((number * this.#down) / this.#up) - this.#half + 1 - this.#first;
   }
 }
 

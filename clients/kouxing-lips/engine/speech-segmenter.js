@@ -3,7 +3,7 @@
 
 import { LipPredictor } from "./lip-predictor.js";
 import { LogMel } from "./log-mel.js";
-import { frameTimeS, wholeSamples } from "./math.js";
+import { frameTimeS, join, wholeSamples } from "./math.js";
 import { VoiceTraits } from "./voice-traits.js";
 
 class VoiceActivityDetector {
@@ -139,16 +139,6 @@ export class SpeechSegmenter {
     const [timeS, delayS] = [frame.timeS, frame.delayS].map((time) => wholeSamples(time, this.#model));
     return [{ ...frame, type: "lips", timeS, delayS }];
   }
-}
-
-function join(parts) {
-  const joined = new Float32Array(parts.reduce((sum, { length }) => sum + length, 0));
-  let at = 0;
-  for (const part of parts) {
-    joined.set(part, at);
-    at += part.length;
-  }
-  return joined;
 }
 
 function eventOf(phone) {

@@ -27,7 +27,7 @@ test("the binary code equals products.wat", async () => {
 for (const [rows, size, columns] of [
   [1, 160, 448],
   [3, 16, 5],
-  [2, 8, 4],
+  [2, 32, 4],
 ]) {
   test(`products of bytes, ${rows} x ${size} x ${columns}`, () => {
     const memory = new ProductMemory(MEMORY_BYTES);
@@ -67,4 +67,32 @@ test("rounds half to even, and clips", () => {
   const out = memory.array(Int16Array, x.length);
   memory.quantize(x.byteOffset, scales.byteOffset, out.byteOffset, 2, 8, -128, 127);
   assert.deepEqual([...out], [0, 2, 0, -2, 2, 127, 127, -128, 0, 2, 2, 4, 0, -2, -2, -4]);
+});
+
+test("sigmoid and hyperbolic tangent", () => {
+  const memory = new ProductMemory(MEMORY_BYTES);
+  const values = [-30, -9, -3, -1, -0.1, 0, 1e-4, 0.5, 2, 8, 100];
+  const x = stored(memory, Float32Array, values);
+  for (const [factor, offset, exact] of [
+    [1, 0, Math.tanh],
+    [0.5, 0.5, (value) => 1 / (1 + Math.exp(-value))],
+  ]) {
+    const out = memory.array(Float32Array, values.length);
+    memory.activate(x.byteOffset, out.byteOffset, values.length, factor, offset);
+    values.forEach((value, i) => assert.ok(Math.abs(out[i] - exact(value)) < 2e-7, `${value}: ${out[i]}`));
+  }
+});
+
+test("filters at fractional positions", () => {
+  const memory = new ProductMemory(MEMORY_BYTES);
+  const [size, up, down, first, count] = [8, 3, 4, 2, 5];
+  const x = stored(memory, Float32Array, table(1, 32, integer));
+  const filters = stored(memory, Float32Array, table(up, size, integer));
+  const out = memory.array(Float32Array, count);
+  memory.resample(...[x, filters, out].map(({ byteOffset }) => byteOffset), count, size, up, down, first);
+  const expected = table(1, count, (_, i) => {
+    const [begin, phase] = [Math.floor((first + i * down) / up), (first + i * down) % up];
+    return sum(size, (tap) => x[begin + tap] * filters[phase * size + tap]);
+  });
+  assert.deepEqual([...out], expected);
 });
