@@ -4,8 +4,10 @@ Blinks: 17 to 20 per minute in conversation, at log-normal intervals. The lid fa
 and rises half as fast (Bentivoglio et al. 1997; VanderWerf et al. 2003). Gaze: saccades last 21 ms
 plus 2.2 ms per degree (Bahill et al. 1975). Speakers look at the listener during most fixations,
 but less often while they pause to think (Kendon 1967). Head: turns of about a third of a degree,
-slower than 1.5 Hz; larger movements belong to speech. Breath: 14 times a minute, a third of a
-degree of head motion. The eyes compensate head turns (vestibulo-ocular reflex).
+slower than 1.5 Hz; larger movements belong to speech. Breath: 14 times a minute, a quarter of a
+degree of head motion, with varying intervals and depths (Tobin et al. 1988, "Variability of resting
+respiratory drive and timing in healthy subjects"). The eyes compensate head turns
+(vestibulo-ocular reflex).
 
 The motion depends only on the seed, the time and recent states. A generator that starts late soon
 makes the same motion as one that started with the session.
@@ -46,9 +48,9 @@ _LID_PER_GAZE = 0.012  # FAP units of the upper lid per unit of downward gaze
 
 _HEAD_SD_DEG = (0.32, 0.38, 0.21)  # pitch, yaw, roll
 _HEAD_HZ = (0.07, 1.4)
-_NUM_WAVES = 9
+_NUM_WAVES = 24  # with fewer, the motion nearly repeats within a minute
 _STATE_S = 0.8  # time constant of a change of the head's motion
-_BREATH_HZ, _BREATH_DEG = 0.23, 0.35
+_BREATH_HZ, _BREATH_SD_DEG = (0.18, 0.28), 0.2
 
 
 def fap_slice(first: str, last: str) -> slice:
@@ -97,15 +99,16 @@ class IdleMotion:
         waves, self._blink_rng, self._fixation_rng = (
             np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
         )
-        # pink-like noise as a sum of sines: a pure function of time
-        wave_hz = np.geomspace(*_HEAD_HZ, _NUM_WAVES) * waves.uniform(0.85, 1.15, (3, _NUM_WAVES))
+        # breath and pink-like noise as sums of sines: pure functions of time
+        bands = np.array([_BREATH_HZ, _HEAD_HZ, _HEAD_HZ, _HEAD_HZ])
+        wave_hz = np.geomspace(*bands.T, _NUM_WAVES, axis=1)
+        wave_hz *= waves.uniform(0.95, 1.05, wave_hz.shape)
         self._wave_rate = 2.0 * np.pi * wave_hz  # radians per second
-        self._wave_phase = waves.uniform(0.0, 2.0 * np.pi, (3, _NUM_WAVES))
+        self._wave_phase = waves.uniform(0.0, 2.0 * np.pi, wave_hz.shape)
         size = wave_hz**-0.5
         size *= np.sqrt(2.0 / np.sum(size**2, axis=1, keepdims=True))
-        self._wave_size = size * np.array(_HEAD_SD_DEG)[:, None] * _DEGREE
+        self._wave_size = size * np.array([_BREATH_SD_DEG, *_HEAD_SD_DEG])[:, None] * _DEGREE
         self._liveliness = 1.0
-        self._breath_phase = waves.uniform(0.0, 2.0 * np.pi)
         self._time_s = 0.0
         self._state = State.LISTENING
         self._blink_s = self._draw_blink(0.0)
@@ -129,9 +132,9 @@ class IdleMotion:
         change = (0.0 if self.is_still else goal) - self._liveliness
         self._liveliness += change * smoothing_share(elapsed_s, _STATE_S)
         angles = self._wave_rate * time_s + self._wave_phase
-        head = self._liveliness * (self._wave_size * np.sin(angles)).sum(axis=1)
-        breath = math.sin(2.0 * math.pi * _BREATH_HZ * time_s + self._breath_phase)
-        head[0] += _BREATH_DEG * _DEGREE * breath
+        breath, *sway = (self._wave_size * np.sin(angles)).sum(axis=1)
+        head = self._liveliness * np.array(sway)
+        head[0] += breath
         yaw, pitch = self._gaze(time_s)
         lid = self._lid(time_s)
         faps[_HEAD] += head.astype(np.float32)

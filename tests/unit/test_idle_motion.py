@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.modifiers.speech_motion import Behavior
-from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.idle_motion import IdleMotion
 from kouxing.shared.phones.events import Progress, SpeechChange
 from tests.lips import make_face
 
@@ -152,3 +153,15 @@ def test_no_loop_can_be_seen_in_the_motion_of_a_minute() -> None:
         for lag in range(250, 1500, 25):
             assert np.corrcoef(centered[:-lag], centered[lag:])[0, 1] < 0.8
         assert np.ptp(motion[-250:]) > 0.0  # never frozen
+
+
+def test_the_head_does_not_repeat_its_motion_within_a_minute() -> None:
+    for seed in SEEDS:
+        motion = IdleMotion(seed)
+        faps = np.zeros((2500, NUM_FAPS), np.float32)  # 4 minutes
+        for number, frame in enumerate(faps):
+            motion.apply(frame, number / 10)
+        for curve in faps[:, [PITCH, YAW, ROLL]].astype(np.float64).T:
+            centered = curve - curve.mean()
+            similarity = np.correlate(centered, centered, "full")[len(curve) - 1 :]
+            assert similarity[30:600].max() < 0.5 * similarity[0]
