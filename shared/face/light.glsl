@@ -45,15 +45,17 @@ void light_vertex(vec3 n, vec3 v, vec3 tint, out vec3 light, out float high) {
   light *= share * tint / (1.0 + SHOULDER * light.g);
   vec3 half_way = normalize(KEY + v);
   float mirrored = max(dot(n, half_way), 0.0);
+  float open = min(1.0, tint.g * 1.6); // parts in shadow reflect less
   if (strands) { // darker strands have higher highlights
     vec3 strand = normalize(n * (dot(n, CROWN) - 0.6 + 0.3 * tint.g) - CROWN);
     float along = dot(strand, half_way);
     mirrored = sqrt(max(1.0 - along * along, 0.0));
+    open = sqrt(tint.g); // dark strands are as smooth as fair ones
   }
   float grazing = 1.0 - max(facing, 0.0);
   float fresnel = 0.04 + 0.5 * grazing * grazing * grazing * grazing;
   high = pow(mirrored, gloss) * max(key, 0.0) * (0.6 + fresnel);
-  high = (high + fresnel * 0.10) * shine * share * min(1.0, tint.g * 1.6);
+  high = (high + fresnel * 0.10) * shine * share * open;
 }
 
 // Color of a texel. Texel and result are sRGB; squares approximate linear light at low cost.

@@ -58,7 +58,8 @@ _FRINGES = {"bob01": 0.73, "bob02": 0.73}
 _SOFT_EDGE = 7  # texels across the edges of strands that may blend
 _COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
 _SWEEP = 0.62  # fraction of the angle to the right ear by which it is turned
-_BROW_RAISE = 0.006  # how far the inner ends rise, dm
+_BROW_RAISE = 0.016  # how far the inner ends rise, dm
+_WIDEST_HAIR = 5.9  # height, dm
 _HAIR_HEIGHT = 0.45  # above the scalp, dm
 _TEAR_HEIGHT = 0.006  # of the wet line above the lower lid, dm
 _TEAR_REACH = 1.015  # distance of its edge from the eye's center, in radii of the eyeball
@@ -228,7 +229,11 @@ class Builder:
         (H, W) is that of the texture.
         """
         hair = fitted.read(self._folder, f"hair/{person.hair}/{person.hair}")
-        points = hair.fit(vertices) * [person.hair_width, 1, 1]
+        points = hair.fit(vertices)
+        # a crown that narrows evenly toward its top looks pointed
+        height = (points[:, 1] - _WIDEST_HAIR) / (points[:, 1].max() - _WIDEST_HAIR)
+        crown = 1 + person.crown * np.sin(np.pi * np.clip(height, 0, 1) ** 1.7)
+        points[:, 0] *= person.hair_width * crown
         if person.hair in _FRINGES:
             points = self._swept_aside(points, vertices, _FRINGES[person.hair])
         quads, uv, welds = hair.quads, hair.uv, hair.welds

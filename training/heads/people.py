@@ -19,6 +19,7 @@ class Person:
     brows: str
     lashes: str = "eyelashes01"
     hair_width: float = 1.0  # factor on the width of MakeHuman's hair
+    crown: float = 0.0  # how much wider the hair is between its widest height and its top
     raised: float = 0.0  # offset of tongue and lower teeth, dm
     tucked: float = 0.0  # offset of the upper teeth, dm, so that f meets them and u and o differ
 
@@ -87,7 +88,8 @@ PEOPLE = {
         look=Look(),
         skin="young_lightskinned_female_diffuse",
         hair="bob02",
-        brows="eyebrow001",
+        crown=0.15,
+        brows="eyebrow008",
         tucked=0.0075,
     ),
     "man": Person(
@@ -98,12 +100,12 @@ PEOPLE = {
             *_both("cheek/cheek-volume-decr", 0.30), ("mouth/mouth-angles-up", 0.25),
             ("eyebrows/eyebrows-angle-up", 0.40)),
         face_units=_FRIENDLY,
-        look=Look(skin=(0.845, 0.660, 0.550), lip=(0.700, 0.440, 0.400), lip_strength=0.60,
+        look=Look(skin=(0.845, 0.660, 0.550), lip=(0.700, 0.440, 0.400), lip_strength=0.75,
             brow_strength=1.0, blush=0.35, stubble=0.55,
             cloth=(0.27, 0.29, 0.31)),
         skin="young_lightskinned_male_diffuse",
         hair="short01",
-        brows="eyebrow010",
+        brows="eyebrow012",
         tucked=0.0105,
     ),
     "elder": Person(
@@ -116,7 +118,7 @@ PEOPLE = {
             stubble=0.25, age=0.6, cloth=(0.34, 0.22, 0.20)),
         skin="old_lightskinned_male_diffuse2",
         hair="short01",
-        brows="eyebrow008",
+        brows="eyebrow012",
         tucked=0.0110,
     ),
     "child": Person(
@@ -132,7 +134,8 @@ PEOPLE = {
             brow_strength=0.75, blush=1.1, cloth=(0.62, 0.47, 0.17)),
         skin="young_lightskinned_male_diffuse3",
         hair="short02",
-        hair_width=0.95,
+        hair_width=0.86,
+        crown=0.16,
         brows="eyebrow001",
         tucked=0.0060,
     ),
@@ -147,7 +150,7 @@ PEOPLE = {
         face_units=_FRIENDLY,
         look=Look(skin=(0.540, 0.380, 0.305), lip=(0.510, 0.275, 0.255), lip_strength=0.80,
             hair=(0.105, 0.085, 0.080), brow=(0.11, 0.08, 0.07), iris=(0.30, 0.17, 0.10),
-            brow_strength=0.7, blush=0.7, cloth=(0.74, 0.42, 0.19)),
+            brow_strength=0.9, blush=0.7, cloth=(0.74, 0.42, 0.19)),
         skin="young_darkskinned_female_diffuse",
         hair="afro01",
         brows="eyebrow001",
@@ -165,12 +168,11 @@ PEOPLE = {
             *_both("ears/ear-wing-decr", 0.50), *_both("ears/ear-scale-decr", 0.20)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.880, 0.700, 0.605), lip=(0.700, 0.395, 0.365), lip_strength=0.80,
-            hair=(0.370, 0.270, 0.185), brow=(0.30, 0.20, 0.12), iris=(0.42, 0.54, 0.62),
-            blush=0.6, stubble=0.75, cloth=(0.24, 0.36, 0.30)),
+            hair=(0.370, 0.270, 0.185), brow=(0.33, 0.23, 0.15), iris=(0.42, 0.54, 0.62),
+            brow_strength=1.0, blush=0.6, stubble=0.75, cloth=(0.24, 0.36, 0.30)),
         skin="young_lightskinned_male_diffuse3",
-        hair="short02",
-        hair_width=0.95,
-        brows="eyebrow010",
+        hair="short01",
+        brows="eyebrow012",
         raised=0.008,
         tucked=0.0222,
     ),
@@ -180,7 +182,7 @@ PEOPLE = {
             *_both("eyes/eye-scale-incr", 0.40), *_both("ears/ear-wing-decr", 0.50)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.890, 0.720, 0.640), lip=(0.700, 0.370, 0.360), lip_strength=0.75,
-            hair=(0.62, 0.60, 0.58), brow=(0.42, 0.37, 0.33), iris=(0.40, 0.50, 0.42),
+            hair=(0.62, 0.60, 0.58), brow=(0.48, 0.43, 0.39), iris=(0.40, 0.50, 0.42),
             blush=0.9, age=0.6, cloth=(0.46, 0.33, 0.48)),
         skin="old_lightskinned_female_diffuse2",
         hair="ponytail01",
@@ -201,12 +203,12 @@ PEOPLE = {
             *_both("ears/ear-scale-decr", 0.50)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.965, 0.835, 0.770), lip=(0.820, 0.470, 0.455), lip_strength=1.0,
-            hair=(0.36, 0.42, 0.66), brow=(0.26, 0.29, 0.48), iris=(0.30, 0.62, 0.80),
+            hair=(0.36, 0.42, 0.66), brow=(0.14, 0.14, 0.28), iris=(0.30, 0.62, 0.80),
             iris_size=1.6, lash_line=1.9, blush=1.1, cloth=(0.66, 0.76, 0.86),
             cel=True),
         skin="young_lightskinned_female_diffuse",
         hair="bob01",
-        brows="eyebrow001",
+        brows="eyebrow008",
         tucked=0.0165,
     ),
 }  # fmt: skip

@@ -22,6 +22,7 @@ _JPEG_QUALITY = 88
 _SHADE = 24.0  # texels; changes of the brightness over longer distances are shade
 _SHADE_KEPT = 0.25  # exponent of the shade
 _MAX_RISE = -np.log(GRAY)  # makes gray white
+_SHADOW_WIDTH = 0.006  # of hairs, relative to the texture's height
 _RELIEF = 8.0  # slope at a relative change of the brightness from one texel to the next
 
 
@@ -97,7 +98,10 @@ def sample_alpha(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float
 
 def hairs(texture: Float, strength: float) -> Float:
     """Return the alpha of brows or lashes (H, W, 4), scaled, as even gray with alpha (H, W, 2)."""
-    alpha = np.round(np.clip(texture[..., 3] * strength, 0, 1) * 16) / 16  # compresses well
+    drawn = texture[..., 3]
+    # hairs that are thinner than a pixel would fade; their soft shadow fills the gaps
+    dense = np.maximum(drawn, ndimage.gaussian_filter(drawn, _SHADOW_WIDTH * len(drawn)))
+    alpha = np.round(np.clip(dense * strength, 0, 1) * 16) / 16  # compresses well
     return np.stack([np.full_like(alpha, GRAY), alpha], axis=2)
 
 

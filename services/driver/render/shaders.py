@@ -93,7 +93,7 @@ HAIR_CUTOFF, CUTOFF = 0.30, 0.02  # texels with less alpha are not drawn, in hai
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
 MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
-    "skin": ((0.50, 0.34, 0.29), 22.0, 0.16),
+    "skin": ((0.46, 0.30, 0.25), 20.0, 0.26),
     "garment": ((0.25, 0.25, 0.25), 8.0, 0.05),
     "eye_left": ((0.4, 0.36, 0.36), 8.0, 0.0),
     "eye_right": ((0.4, 0.36, 0.36), 8.0, 0.0),
@@ -101,7 +101,7 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "teeth_upper": ((0.4, 0.38, 0.36), 30.0, 1.0),
     "teeth_lower": ((0.4, 0.38, 0.36), 30.0, 1.0),
     "tongue": ((0.5, 0.3, 0.3), 14.0, 2.0),
-    "hair": ((0.3, 0.3, 0.3), 50.0, 0.50),
+    "hair": ((0.3, 0.3, 0.3), 45.0, 0.65),
     "brows": ((0.5, 0.34, 0.29), 8.0, 0.0),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
