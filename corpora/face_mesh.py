@@ -86,15 +86,15 @@ class FaceMesh:
 
     def _detect(self, image: UInt8) -> _Square | None:
         height, width, _ = image.shape
-        whole = _Square(np.array([width, height]) / 2, float(max(width, height)), 0.0)
-        pixels = _crop(image, whole, _DETECTOR_PX) / np.float32(127.5) - 1
+        whole_image = _Square(np.array([width, height]) / 2, float(max(width, height)), 0.0)
+        pixels = _crop(image, whole_image, _DETECTOR_PX) / np.float32(127.5) - 1
         boxes, scores = self._detector.run(None, {"input0": pixels[None]})
         best = int(scores[0, :, 0].argmax())
         if scores[0, best, 0] < 0:  # log odds
             return None
         center, size, right_eye, left_eye = boxes[0, best, :8].reshape(4, 2).astype(np.float64)
-        origin = whole.to_pixels(self._anchors[best] + center / _DETECTOR_PX - 0.5)
-        return _face_square(origin, whole.side * size / _DETECTOR_PX, left_eye - right_eye)
+        origin = whole_image.to_pixels(self._anchors[best] + center / _DETECTOR_PX - 0.5)
+        return _face_square(origin, whole_image.side * size / _DETECTOR_PX, left_eye - right_eye)
 
 
 def _anchors() -> Array:

@@ -89,8 +89,8 @@ def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
 
 def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
     """Convert samples in [-1, 1] to 16-bit integers, as in the cache."""
-    whole = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
-    integers: NDArray[np.int16] = whole.astype(np.int16)
+    scaled = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
+    integers: NDArray[np.int16] = scaled.astype(np.int16)
     return integers
 
 

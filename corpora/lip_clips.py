@@ -141,8 +141,8 @@ def read_clips(
         if (clip := _read_clip(path, language, any_license=any_license, held_out=held_out))
     ]
     if not clips:
-        what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
-        raise UserError(f"no {what} in {folder}; use a folder with .flac, .csv and .json files")
+        kind = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
+        raise UserError(f"no {kind} in {folder}; use a folder with .flac, .csv and .json files")
     return clips
 
 

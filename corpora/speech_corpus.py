@@ -87,9 +87,9 @@ class RowErrors:
 
     messages: list[str] = field(default_factory=list)
 
-    def add(self, row_name: str, what: str) -> None:
+    def add(self, row_name: str, problem: str) -> None:
         """Add a bad row."""
-        self.messages.append(f"{row_name}: {what}; row skipped")
+        self.messages.append(f"{row_name}: {problem}; row skipped")
 
     def report_to(self, report: Callable[[str], None]) -> None:
         """Report each skipped row, then their number."""

@@ -111,12 +111,15 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
         for speaker in speakers_of(spoken)
     ]
     sessions = [
-        _animate(model, own, config)
-        for own in track(by_speaker, "speakers", console=CONSOLE, transient=True)
+        _animate(model, speech, config)
+        for speech in track(by_speaker, "speakers", console=CONSOLE, transient=True)
     ]
-    labels = [np.array([FEELINGS[one.emotion or ""] for one in own]) for own in by_speaker]
+    labels = [
+        np.array([FEELINGS[recording.emotion or ""] for recording in speech])
+        for speech in by_speaker
+    ]
     frames = np.concatenate([session.faps for session in sessions])
-    minutes = sum(end - start for one in sessions for start, end in one.spans) / 60
+    minutes = sum(end - start for session in sessions for start, end in session.spans) / 60
     face = FaceAnimator(
         load_lip_model(name=config.lips),
         frame_rate_hz=config.frame_rate_hz,
@@ -125,10 +128,14 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
     )
     rest = np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
     blinks_s = _blinks(frames, config.frame_rate_hz)
-    nods = [_peaks(one, _PITCH, _NOD_DEG * _DEGREE, config.frame_rate_hz) for one in sessions]
-    raises = [_peaks(one, _BROW, _BROW_UNITS, config.frame_rate_hz) for one in sessions]
-    grid = [np.concatenate([np.arange(*span, 0.02) for span in one.spans]) for one in sessions]
-    still = [_is_still(one.faps) for one in sessions]
+    nods = [
+        _peaks(session, _PITCH, _NOD_DEG * _DEGREE, config.frame_rate_hz) for session in sessions
+    ]
+    raises = [_peaks(session, _BROW, _BROW_UNITS, config.frame_rate_hz) for session in sessions]
+    grid = [
+        np.concatenate([np.arange(*span, 0.02) for span in session.spans]) for session in sessions
+    ]
+    still = [_is_still(session.faps) for session in sessions]
     return FaceFigures(
         correlations=_correlations(sessions, labels, config.frame_rate_hz),
         nods=_movements(nods, sessions, minutes),

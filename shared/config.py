@@ -241,12 +241,12 @@ class Settings:
         self, config_type: type[ServiceConfig], overrides: Mapping[str, str] | None = None
     ) -> list[Setting]:
         """Return all keys of a service with their current values; raises as ``load``."""
-        config, given = self._resolve(config_type, overrides or {})
+        config, values = self._resolve(config_type, overrides or {})
         return [
             Setting(
                 key=key,
                 value=getattr(config, key),
-                origin=given[key].origin if key in given else _default_origin(config, field),
+                origin=values[key].origin if key in values else _default_origin(config, field),
                 default=_default(field),
                 allowed=allowed(field),
                 meaning=_key_help(config_type, key),
@@ -259,7 +259,7 @@ class Settings:
     ) -> tuple[Config, dict[str, _RawValue]]:
         table = next(name for name, known in self._tables.items() if known is config_type)
         assigned = self._assigned({f"{table}.{key}": text for key, text in overrides.items()})
-        given = {
+        values = {
             key: layer[name, key]
             for layer in (*self._layers, assigned)
             for name in (COMMON, table)
@@ -267,12 +267,12 @@ class Settings:
             if (name, key) in layer
         }
         try:
-            config = config_type.model_validate_strings({k: g.text for k, g in given.items()})
+            config = config_type.model_validate_strings({k: g.text for k, g in values.items()})
         except ValidationError as error:
             key = str(error.errors()[0]["loc"][0])
-            raise self._not_allowed((table, key), given[key]) from None
+            raise self._not_allowed((table, key), values[key]) from None
         _check_hosts(table, config)
-        return config, given
+        return config, values
 
     def _keys(self, table: str) -> Mapping[str, FieldInfo]:
         return self._tables[table].model_fields
@@ -299,10 +299,10 @@ class Settings:
                 raise self._not_allowed(address, layer[address])
         return layer
 
-    def _not_allowed(self, address: Address, given: _RawValue) -> UserError:
+    def _not_allowed(self, address: Address, value: _RawValue) -> UserError:
         table, key = address
         return UserError(
-            f"{table}.{key}: {given.text!r} (from {given.origin}) is not "
+            f"{table}.{key}: {value.text!r} (from {value.origin}) is not "
             f"{allowed(self._keys(table)[key])}"
         )
 
@@ -361,8 +361,8 @@ def _find(values: Mapping[str, str], known: Mapping[str, Address], origin: str =
     layer: Layer = {}
     for name, text in values.items():
         if name not in known:
-            what = f"{origin}: unknown key {name}" if origin else f"${name}: unknown variable"
-            raise UserError(f"{what}; {_hint(name, known)}")
+            problem = f"{origin}: unknown key {name}" if origin else f"${name}: unknown variable"
+            raise UserError(f"{problem}; {_hint(name, known)}")
         layer[known[name]] = _RawValue(text, origin or f"${name}")
     return layer
 

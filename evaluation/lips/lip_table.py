@@ -51,12 +51,12 @@ def _rows(results: Results, letters: Mapping[str, str]) -> Iterator[list[str]]:
 
 def _main_groups(real: Mapping[str, Scores]) -> list[str]:
     """Return each language unless all its speakers are new, its new speakers, mocap and all."""
-    shown = []
+    groups = []
     for language in sorted(group for group in real if " " not in group):
         if language not in (ALL, MOCAP):
             has_known = f"{language} known" in real
-            shown += [language, f"{language} new"] if has_known else [f"{language} new"]
-    return [group for group in (*shown, MOCAP, ALL) if group in real]
+            groups += [language, f"{language} new"] if has_known else [f"{language} new"]
+    return [group for group in (*groups, MOCAP, ALL) if group in real]
 
 
 class _Figure:

@@ -65,7 +65,7 @@ def choose(utterances: Sequence[Utterance], number: int = NUM_SENTENCES) -> list
     for utterance in sorted(utterances, key=lambda u: (abs(u.seconds - _MEAN_S), u.utterance_id)):
         by_speaker[utterance.speaker].append(utterance)
     rounds = zip_longest(*(by_speaker[speaker] for speaker in sorted(by_speaker)))
-    ranked = [utterance for one in rounds for utterance in one if utterance is not None]
+    ranked = [utterance for turn in rounds for utterance in turn if utterance is not None]
     return sorted(ranked[:number], key=lambda utterance: utterance.utterance_id)
 
 

@@ -50,8 +50,8 @@ _NAMES = {
 def title_of(face: str) -> str:
     """Return the title of a face such as ``wawa, fitted, 100 ms``."""
     program, _, rest = face.partition(", ")
-    shown = _NAMES.get(program, f"**{program}**")
-    return f"{shown}, {rest}"
+    name = _NAMES.get(program, f"**{program}**")
+    return f"{name}, {rest}"
 
 
 def agreement(results: Results) -> Table:
@@ -95,17 +95,17 @@ def better_programs(results: Results) -> list[str]:
             }
             best = min(losses, key=lambda face: losses[face], default=own)
             if own in losses and losses[best] < losses[own]:
-                shown = [_format_measure(measure, values[face]) for face in (best, own)]
+                figures = [_format_measure(measure, values[face]) for face in (best, own)]
                 if "precision" in measure:
                     recalls = (scores[face][group].get("closure_recall") for face in (best, own))
-                    shown = [
+                    figures = [
                         f"{figure}, recall {format_number(recall)}"
-                        for figure, recall in zip(shown, recalls, strict=True)
+                        for figure, recall in zip(figures, recalls, strict=True)
                     ]
                 if measure in _LIKE_REAL:
-                    shown.append(f"real lips {_format_measure(measure, real[measure])}")
-                sentence = f"{group_title}, {name}: {title_of(best)} ({shown[0]})"
-                sentences.append(f"{sentence}; {own} ({', '.join(shown[1:])})")
+                    figures.append(f"real lips {_format_measure(measure, real[measure])}")
+                sentence = f"{group_title}, {name}: {title_of(best)} ({figures[0]})"
+                sentences.append(f"{sentence}; {own} ({', '.join(figures[1:])})")
     return sentences
 
 

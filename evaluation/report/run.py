@@ -46,21 +46,21 @@ def run_steps(
         missing = [
             key for key, folder in folders.items() if not folder and f"{{{key}}}" in str(commands)
         ]
-        shown = [f"kouxing {_without_braces(command)}" for command in commands]
+        command_lines = [f"kouxing {_without_braces(command)}" for command in commands]
         code = code_hash(step.code)
         if not commands or missing:
             reason = f"add --{missing[0]}" if missing else "it is not part of a quick report"
             print_message(f"{name}: skipped ({reason})")
-        elif not is_fresh and _is_up_to_date(path, shown, code):
+        elif not is_fresh and _is_up_to_date(path, command_lines, code):
             print_message(f"{name}: up to date")
         else:
-            print_message(f"{name}: {shown[-1]}")
+            print_message(f"{name}: {command_lines[-1]}")
             measured = describe_run()
             figures = _run(commands, folders)
             if figures is None:
                 failed.append(name)
             else:
-                write_result(path, {"commands": shown, **measured, "code": code, **figures})
+                write_result(path, {"commands": command_lines, **measured, "code": code, **figures})
     return failed
 
 

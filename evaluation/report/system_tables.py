@@ -125,9 +125,9 @@ def better_packages(results: Results) -> list[str]:
     for key, (name, scale, unit) in _PACKAGE_FIGURES.items():
         best = min((browser, *browser["others"]), key=lambda package: package[key])
         if best is not browser:
-            shown = [f"{format_number(p[key] * scale, '.1f')} {unit}" for p in (best, browser)]
+            figures = [f"{format_number(p[key] * scale, '.1f')} {unit}" for p in (best, browser)]
             sentences.append(
-                f"browser, {name}: {best['name']} ({shown[0]}); {browser['name']} ({shown[1]})"
+                f"browser, {name}: {best['name']} ({figures[0]}); {browser['name']} ({figures[1]})"
             )
     return sentences
 

@@ -114,10 +114,10 @@ def speak(
     elif source == "monitor":
         audio = monitor(device)
     else:
-        given = (
+        raw_format = (
             None if rate is None and channels is None else RawFormat(rate or 16_000, channels or 1)
         )
-        audio = open_audio(Path(source), track=track, raw=given, is_raw=raw)
+        audio = open_audio(Path(source), track=track, raw=raw_format, is_raw=raw)
     summary = stream(
         audio,
         control_address(control),
@@ -319,24 +319,24 @@ def _is_drop_counter(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
 
 
-def control_address(given: str) -> str:
+def control_address(address: str) -> str:
     """Return the address of control, followed by its public key unless connections are insecure.
 
-    Without ``given`` and without a setting, it is that of the user's newest system.
+    Without ``address`` and without a setting, it is that of the user's newest system.
     """
-    running, config = find_system(given)
+    running, config = find_system(address)
     return running or control_endpoint(config.control, insecure=config.insecure)
 
 
-def find_system(given: str) -> tuple[str, ServiceConfig]:
+def find_system(address: str) -> tuple[str, ServiceConfig]:
     """Return control's endpoint in the user's newest system, if it applies, and the settings."""
-    if given:
-        split_endpoint(given, "--control")
-    settings, overrides = read_settings(), {"control": given} if given else {}
+    if address:
+        split_endpoint(address, "--control")
+    settings, overrides = read_settings(), {"control": address} if address else {}
     keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
     running = find_control() if keys["control"].is_default else ""
     config = settings.load(ServiceConfig, overrides)
     if "*" in config.control:
-        key = "--control" if given else "common.control"
+        key = "--control" if address else "common.control"
         raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
     return running, config

@@ -169,8 +169,8 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
 def _times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
     try:
         codes = [_TIME_CODE.fullmatch(str(time).strip()) for time in times]
-        given = [code.groups() if code else () for code in codes] if is_time_code else times
-        fields = np.array(given, np.float64)
+        values = [code.groups() if code else () for code in codes] if is_time_code else times
+        fields = np.array(values, np.float64)
         if len(fields.T) == 0 or not np.isfinite(fields).all():
             raise ValueError
     except ValueError:

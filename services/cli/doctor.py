@@ -35,25 +35,25 @@ class CheckResult(NamedTuple):
     fix: str = ""  # empty: the check passed
 
 
-def examine(given: str) -> Iterator[CheckResult]:
-    """Yield the result of each check; ``given`` is the address of control, empty by default."""
-    control, config = find_system(given)
+def examine(address: str) -> Iterator[CheckResult]:
+    """Yield the result of each check; ``address`` of control is empty by default."""
+    control, config = find_system(address)
     control = control or config.control
-    address = control.partition(" ")[0]
-    if reason := reach_error(*split_endpoint(address, "control"), is_zeromq=True):
-        yield CheckResult(f"control at {address}", "cannot be reached", reason)
+    endpoint_address = control.partition(" ")[0]
+    if reason := reach_error(*split_endpoint(endpoint_address, "control"), is_zeromq=True):
+        yield CheckResult(f"control at {endpoint_address}", "cannot be reached", reason)
         return
-    yield CheckResult(f"control at {address}", "can be reached")
+    yield CheckResult(f"control at {endpoint_address}", "can be reached")
     keys: Mapping[str, Key | None] = {"none": None}
     if not config.insecure:
         try:
-            keys = local_keys() or {CLIENT: user_key(control=address)}
+            keys = local_keys() or {CLIENT: user_key(control=endpoint_address)}
         except UserError as error:
             yield CheckResult("keys", "cannot be used", str(error))
             return
     accepted: dict[str, Key | None] = {}
     for name, key in keys.items():
-        finding = _check_key(name, key, address)
+        finding = _check_key(name, key, endpoint_address)
         if not finding.fix:
             accepted[name] = key
         yield finding
@@ -62,7 +62,7 @@ def examine(given: str) -> Iterator[CheckResult]:
     key = next(iter(accepted.values()))
     try:
         with connect(
-            with_key(address, key.control if key else ""), key=key, timeout_s=5.0
+            with_key(endpoint_address, key.control if key else ""), key=key, timeout_s=5.0
         ) as client:
             services = client.status().services
     except UserError as error:

@@ -279,7 +279,9 @@ class ControlService(Service):
             if record.lost:
                 self._lifecycle.move(record)
         if heartbeat.role == "observer":
-            uninformed = [one for one in self._sessions if one.name not in heartbeat.sessions]
+            uninformed = [
+                record for record in self._sessions if record.name not in heartbeat.sessions
+            ]
         for record in uninformed:
             self._commands.send(record.start_message(time.monotonic()), to=sender)
 

@@ -88,7 +88,7 @@ class AccessPolicy:
 
     def _check_token(self, request: web.Request) -> None:
         bearer = request.headers.get("Authorization", "").removeprefix("Bearer ")
-        given = request.query.get("token", bearer)
-        if self.token and not secrets.compare_digest(ascii(given), ascii(self.token)):
+        token = request.query.get("token", bearer)
+        if self.token and not secrets.compare_digest(ascii(token), ascii(self.token)):
             text = "the token is missing or wrong; use the whole address that kouxing printed\n"
             raise web.HTTPForbidden(text=text)

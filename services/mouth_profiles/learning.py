@@ -89,7 +89,7 @@ class Observations:
     def join(cls, parts: Sequence[Observations]) -> Self:
         """Concatenate observations."""
         arrays = [part._arrays() for part in parts]
-        return cls(**{name: np.concatenate([one[name] for one in arrays]) for name in arrays[0]})
+        return cls(**{name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

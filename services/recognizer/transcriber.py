@@ -51,14 +51,14 @@ def _recognizer_in(folder: Path) -> Any:
     parts = {name: _model_in(folder, name) for name in ("encoder", "decoder", "joiner", "model")}
     if not tokens.is_file():
         raise UserError(f"{folder} contains no tokens.txt; use the folder of a sherpa-onnx model")
-    given = {"tokens": str(tokens), "num_threads": 1}
+    options = {"tokens": str(tokens), "num_threads": 1}
     if parts["encoder"] and parts["decoder"] and parts["joiner"]:
         names = ("encoder", "decoder", "joiner")
-        return OfflineRecognizer.from_transducer(**given, **{name: parts[name] for name in names})
+        return OfflineRecognizer.from_transducer(**options, **{name: parts[name] for name in names})
     if parts["model"] and "paraformer" in folder.name:
-        return OfflineRecognizer.from_paraformer(**given, paraformer=parts["model"])
+        return OfflineRecognizer.from_paraformer(**options, paraformer=parts["model"])
     if parts["model"] and "sense-voice" in folder.name:
-        return OfflineRecognizer.from_sense_voice(**given, model=parts["model"], language="zh")
+        return OfflineRecognizer.from_sense_voice(**options, model=parts["model"], language="zh")
     raise UserError(
         f"{folder} contains no model of a known kind; use the folder of a sherpa-onnx transducer, "
         "or one whose name contains 'paraformer' or 'sense-voice'"

@@ -164,11 +164,11 @@ def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
     return " ".join(words[1:-2]), frame_rate_hz, num_frames
 
 
-def _parse_int(line_number: int, word: str, what: str) -> int:
+def _parse_int(line_number: int, word: str, description: str) -> int:
     try:
         return int(word)
     except ValueError:
-        raise _BadFileError(line_number, f"'{word}' is not {what}") from None
+        raise _BadFileError(line_number, f"'{word}' is not {description}") from None
 
 
 def _parse_mask(line_number: int, line: str) -> NDArray[np.bool_]:
@@ -209,15 +209,15 @@ def _parse_values(
 
 
 def _parse_high(
-    line_number: int, fap: int, given: list[float], limits: tuple[int, ...]
+    line_number: int, fap: int, numbers: list[float], limits: tuple[int, ...]
 ) -> list[int]:
-    if not given:
+    if not numbers:
         return [0] * len(limits)
-    if len(given) == 1:
-        given = [*given, *(_VISEME_ALONE if fap == 1 else _EXPRESSION_ALONE)]
-    for value, limit in zip(given, limits, strict=True):
+    if len(numbers) == 1:
+        numbers = [*numbers, *(_VISEME_ALONE if fap == 1 else _EXPRESSION_ALONE)]
+    for value, limit in zip(numbers, limits, strict=True):
         if not (0 <= value <= limit and value == int(value)):
             raise _BadFileError(
                 line_number, f"FAP {fap} is {value:g}; it must be an integer from 0 to {limit}"
             )
-    return [int(value) for value in given]
+    return [int(value) for value in numbers]

@@ -188,17 +188,20 @@ class Glb:
         if "sparse" in item:
             sparse = item["sparse"]
             size = int(sparse["count"])
-            where, what = sparse["indices"], sparse["values"]
+            indices, replacements = sparse["indices"], sparse["values"]
             rows = self._strided(
-                where["bufferView"],
-                int(where.get("byteOffset", 0)),
+                indices["bufferView"],
+                int(indices.get("byteOffset", 0)),
                 (size, 1),
-                np.dtype(_TYPES[where["componentType"]]),
+                np.dtype(_TYPES[indices["componentType"]]),
             )
             if size and rows.max() >= count:
                 raise ValueError("a sparse accessor writes outside itself")
             values[rows[:, 0]] = self._strided(
-                what["bufferView"], int(what.get("byteOffset", 0)), (size, width), kind
+                replacements["bufferView"],
+                int(replacements.get("byteOffset", 0)),
+                (size, width),
+                kind,
             )
         return _to_float(values, item)
 

@@ -237,8 +237,8 @@ def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
         if bones.get(f"{side}Eye") in matrices:
             centers.append(matrices[bones[f"{side}Eye"]][:3, 3])
         elif balls:
-            whole = np.concatenate(balls)
-            centers.append((whole.min(axis=0) + whole.max(axis=0)) / 2)
+            eyeball = np.concatenate(balls)
+            centers.append((eyeball.min(axis=0) + eyeball.max(axis=0)) / 2)
         elif lids is not None:
             centers.append(lids)
     if len(centers) == 2:

@@ -68,8 +68,8 @@ class SkinFields:
     def jaw_fields(self, vertices: Float) -> Fields:
         """Return the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
         lever = self._jaw_share(vertices[:, 2])
-        whole = np.ones(len(vertices))
-        moved = {3: lever, 14: whole, 15: lever}
+        full_weight = np.ones(len(vertices))
+        moved = {3: lever, 14: full_weight, 15: lever}
         return {fap: self._axis_field(fap, weight) for fap, weight in moved.items()}
 
     def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> Fields:

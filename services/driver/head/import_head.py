@@ -55,9 +55,9 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     count = sum(len(piece.vertices) for piece in pieces)
     if count > MAX_VERTICES:
         raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
-    given = read_points(points)
-    positions = _positions(mesh, points, pieces, given)
-    arrays, warnings = _Import(mesh, points, pieces, positions, given).run()
+    feature_points = read_points(points)
+    positions = _positions(mesh, points, pieces, feature_points)
+    arrays, warnings = _Import(mesh, points, pieces, positions, feature_points).run()
     with open_output(output) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     return warnings
@@ -93,11 +93,11 @@ class _Import:
         path: Path,
         pieces: list[Primitive],
         positions: dict[str, Float64],
-        given: Points,
+        feature_points: Points,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
         self._warnings: list[str] = []
-        self._fapu_given = given.fapu
+        self._stated_fapu = feature_points.fapu
         self._find_frame(positions)
         self._join()
         self._snap(positions)
@@ -142,7 +142,7 @@ class _Import:
                 eyes[name] = (positions[lids[0]] + positions[lids[1]]) / 2
         missing = [name for name in NEEDED if name not in positions]
         missing += [f"{name} (or its eyelids)" for name in ("3.5", "3.6") if name not in eyes]
-        if "9.15" not in positions and "MNS" not in self._fapu_given:
+        if "9.15" not in positions and "MNS" not in self._stated_fapu:
             missing.append("9.15")
         if missing:
             raise self._fail(f"points are missing: {', '.join(missing)}")
@@ -251,10 +251,10 @@ class _Import:
         def height(name: str) -> float:
             return float(self._welded[self._points[name], 1])
 
-        given = {name: length * self._scale for name, length in self._fapu_given.items()}
+        stated = {name: length * self._scale for name, length in self._stated_fapu.items()}
         eyes, points = float(self._eyes.mean(axis=0)[1]), self._points
         corners = self._welded[[points["8.3"], points["8.4"]], 0]
-        nose = height("9.15") if "9.15" in points else height("2.2") + given["MNS"]
+        nose = height("9.15") if "9.15" in points else height("2.2") + stated["MNS"]
         fapu = {
             "MNS": nose - height("2.2"),
             "MW": float(corners[0] - corners[1]),
@@ -263,7 +263,7 @@ class _Import:
             "IRISD": height("3.1") - height("3.3") if {"3.1", "3.3"} <= set(points) else 0.0,
         }
         if fapu["IRISD"] <= 0:
-            fapu["IRISD"] = given.get("IRISD", 0.163 * EYE_DISTANCE_M)
+            fapu["IRISD"] = stated.get("IRISD", 0.163 * EYE_DISTANCE_M)
         wrong = [name for name, length in fapu.items() if length <= 0]
         if wrong:
             raise self._fail(

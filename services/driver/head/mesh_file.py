@@ -107,11 +107,11 @@ def _from_trimesh(mesh: Any) -> Primitive:
             colors[:] = 1.0
         elif diffuse is not None and list(diffuse)[:3] != _NO_DIFFUSE:
             colors[:] = (np.asarray(diffuse, dtype=np.float64)[:3] / 255) ** 2
-    given = getattr(visual, "vertex_attributes", {}).get("color")
+    vertex_colors = getattr(visual, "vertex_attributes", {}).get("color")
     if getattr(visual, "kind", None) == "vertex":
-        given = visual.vertex_colors
-    if given is not None and len(given) == len(vertices):
-        colors = (np.asarray(given, dtype=np.float64)[:, :3] / 255) ** 2
+        vertex_colors = visual.vertex_colors
+    if vertex_colors is not None and len(vertex_colors) == len(vertices):
+        colors = (np.asarray(vertex_colors, dtype=np.float64)[:, :3] / 255) ** 2
     return Primitive(
         name=str(mesh.metadata.get("name", "part")),
         vertices=vertices,

@@ -148,6 +148,6 @@ def faps_of(openings: ArrayLike) -> Array:
     Jaw and lip feature points travel as measured; the other FAPs are 0.
     """
     travels = {point.fap: point.travel for point in lip_points().values()}
-    whole = np.array([travels.get(fap, 0.0) for fap in MOUTH_FAPS])
-    faps: Array = np.asarray(openings, dtype=np.float64)[:, None] / MAX_OPENING * whole
+    travel_of_fap = np.array([travels.get(fap, 0.0) for fap in MOUTH_FAPS])
+    faps: Array = np.asarray(openings, dtype=np.float64)[:, None] / MAX_OPENING * travel_of_fap
     return faps
