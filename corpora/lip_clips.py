@@ -189,7 +189,7 @@ def _read_clip(
             )
         values = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
         if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
-            raise ValueError("its times do not ascend")
+            raise ValueError("its times are not increasing")
         is_rig = "mouth_stretch_c" in values
         faps = _rig_faps(values) if is_rig else _tracked_faps(values)
         if np.isnan(faps).all():

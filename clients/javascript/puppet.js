@@ -39,7 +39,7 @@ export async function loadPuppet(url) {
   } catch (error) {
     const word = Object.keys(UNREADABLE).find((key) => error.message.includes(key));
     let text = error.message;
-    if (word) text = `it needs ${UNREADABLE[word]}, which kouxing cannot read; export it without`;
+    if (word) text = `it needs ${UNREADABLE[word]}, which kouxing does not support; export it without them`;
     if ([SyntaxError, RangeError, TypeError].includes(error.constructor)) text = DAMAGED;
     throw new Error(url.startsWith("blob:") ? `cannot show this file: ${text}` : `${url}: ${text}`, { cause: error });
   }

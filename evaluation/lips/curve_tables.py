@@ -90,7 +90,9 @@ def read_table(path: Path) -> CurveTable:
             raise ValueError("it has no rows, or a value is not finite")
         time_s = values[:, names.index(TIME)]
         if values.shape[1] != len(names) or not (np.diff(time_s) > 0.0).all():
-            raise ValueError("a row has too many or too few values, or the times do not ascend")
+            raise ValueError(
+                "a row has too many or too few values, or the times are not increasing"
+            )
     values = np.delete(values, names.index(TIME), axis=1)
     return CurveTable(time_s, tuple(name for name in names if name != TIME), values)
 

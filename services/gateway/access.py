@@ -90,5 +90,5 @@ class AccessPolicy:
         bearer = request.headers.get("Authorization", "").removeprefix("Bearer ")
         token = request.query.get("token", bearer)
         if self.token and not secrets.compare_digest(ascii(token), ascii(self.token)):
-            text = "the token is missing or wrong; use the whole address that kouxing printed\n"
+            text = "the token is missing or wrong; use the full URL that kouxing printed\n"
             raise web.HTTPForbidden(text=text)

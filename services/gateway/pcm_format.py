@@ -77,7 +77,7 @@ class PcmFormat:
         Raises ``UserError`` if they do not have this format; the text says what was expected.
         """
         if is_first and (kind := _file_kind(pcm)):
-            raise UserError(f"expected {self}; this begins like {kind}")
+            raise UserError(f"expected {self}; this looks like the start of {kind}")
         if self.encoding == "f32le":
             self._check_level(np.frombuffer(pcm, "<f4"))
 
@@ -86,7 +86,7 @@ class PcmFormat:
         if not peak <= MAX_FLOAT:  # also true for NaN
             raise UserError(
                 f"expected {self}, between -1 and 1, got {peak:g}: divide integers by 32768, "
-                "or announce encoding s16le"
+                "or set encoding to s16le"
             )
 
 
@@ -127,8 +127,8 @@ class NoiseCheck:
             self._is_sound = True
         if self._num_noisy == 2:
             raise UserError(
-                f"expected {self._format}; this is noise, as of compressed data or of samples of"
-                " another encoding: decode or convert it"
+                f"expected {self._format}; this looks like noise: decode it if it is compressed,"
+                " or convert it if it has another encoding"
             )
 
 

@@ -70,7 +70,7 @@ def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], ND
     landmarks = np.frombuffer(content[landmarks_at:audio_at], "<f4").astype(np.float32)
     pcm = np.frombuffer(content[audio_at:], "<i2")
     if not np.isfinite(time_s).all() or time_s[0] < 0 or (np.diff(time_s) <= 0).any():
-        raise ValueError("its times do not ascend from 0")
+        raise ValueError("its times do not increase from 0")
     if not (np.abs(landmarks) <= _MAX_PIXEL).all():  # false for NaN
         raise ValueError("its landmarks are not pixels")
     samples = to_16_khz(pcm.astype(np.float32) / np.float32(32768), rate_hz)

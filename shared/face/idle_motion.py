@@ -100,8 +100,8 @@ class IdleMotion:
             np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
         )
         # breath and pink-like noise as sums of sines: pure functions of time
-        bands = np.array([_BREATH_HZ, _HEAD_HZ, _HEAD_HZ, _HEAD_HZ])
-        wave_hz = np.geomspace(*bands.T, _NUM_WAVES, axis=1)
+        low_hz, high_hz = np.array([_BREATH_HZ, _HEAD_HZ, _HEAD_HZ, _HEAD_HZ]).T
+        wave_hz = np.geomspace(low_hz, high_hz, _NUM_WAVES, axis=1)
         wave_hz *= waves.uniform(0.95, 1.05, wave_hz.shape)
         self._wave_rate = 2.0 * np.pi * wave_hz  # radians per second
         self._wave_phase = waves.uniform(0.0, 2.0 * np.pi, wave_hz.shape)

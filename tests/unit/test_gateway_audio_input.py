@@ -19,13 +19,17 @@ FLOAT = PcmFormat(sample_rate_hz=16000, encoding="f32le")
 @pytest.mark.parametrize(
     ("pcm_format", "pcm", "error"),
     [
-        (PCM16, b"RIFF" + bytes(40), "s16le.*without a header; this begins like a WAV file"),
+        (
+            PCM16,
+            b"RIFF" + bytes(40),
+            "s16le.*without a header; this looks like the start of a WAV file",
+        ),
         (PCM16, b"\x1aE\xdf\xa3" + bytes(100), "WebM, the format of MediaRecorder"),
         (PCM16, b"\0\0\0\x20ftypM4A " + bytes(20), "an MP4 file"),
         (PCM16, json.dumps({"audio": "AAAA"}).encode(), "this is JSON: send it as a text message"),
         (FLOAT, np.array([0, 12345], "<f4").tobytes(), "between -1 and 1, got 12345"),
         (FLOAT, np.array([0, np.nan], "<f4").tobytes(), "between -1 and 1, got nan"),
-        (FLOAT, np.array([5, -5, 900, -900], "<i2").tobytes(), "or announce encoding s16le"),
+        (FLOAT, np.array([5, -5, 900, -900], "<i2").tobytes(), "or set encoding to s16le"),
     ],
 )
 def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, error: str) -> None:
@@ -77,7 +81,7 @@ def test_refuses_noise_of_another_encoding(pcm_format: PcmFormat, pcm: bytes, ch
         for begin in range(0, len(pcm), chunk):
             check.check(pcm[begin : begin + chunk])
 
-    with pytest.raises(UserError, match="this is noise, as of compressed data or of samples of"):
+    with pytest.raises(UserError, match="this looks like noise: decode it if it is compressed"):
         speak()
 
 

@@ -99,7 +99,7 @@ def test_shapes_open_the_mouth(tmp_path: Path, jaw: str) -> None:
         ("t,opening\n0,nan", "not finite"),
         ("t,opening\n", "no rows"),
         ("t,opening\n0,1,2", "too many or too few"),
-        ("t,opening\n1,1\n1,2", "do not ascend"),
+        ("t,opening\n1,1\n1,2", "are not increasing"),
     ],
 )
 def test_a_damaged_table_is_an_error(tmp_path: Path, text: str, fault: str) -> None:

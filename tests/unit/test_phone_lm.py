@@ -62,11 +62,15 @@ Change = Callable[[NDArray[Any]], NDArray[Any]]
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("lm_children", lambda c: with_values(c, {0: c[0] - 1, 1: c[1] + 1}), "not a tree"),
+        ("lm_children", lambda c: with_values(c, {0: c[0] - 1, 1: c[1] + 1}), "not form a tree"),
         # the sum is right, but a child is before its parent
-        ("lm_children", lambda _: np.array([NUM_PHONES, *LEAVES, 0, 3, 0]), "not a tree"),
+        ("lm_children", lambda _: np.array([NUM_PHONES, *LEAVES, 0, 3, 0]), "not form a tree"),
         # a sum that overflows to the right one
-        ("lm_children", lambda _: np.array([NUM_PHONES, *[2**62] * 4, *LEAVES[4:]]), "not a tree"),
+        (
+            "lm_children",
+            lambda _: np.array([NUM_PHONES, *[2**62] * 4, *LEAVES[4:]]),
+            "not form a tree",
+        ),
         ("lm_phone", lambda p: with_values(p, {3: p[4], 4: p[3]}), "not in order"),
         ("lm_phone", lambda p: with_values(p, {NUM_PHONES: 60}), "not in order"),
         ("lm_log_prob", lambda values: np.full(values.shape, np.nan), "not finite"),

@@ -87,7 +87,7 @@ def test_reads_tracked_clips_and_rigs(tmp_path: Path) -> None:
         ("{}", "", "no rows"),
         ("{}", "F3_open_jaw\n1\n", "it lacks 't'"),
         ("{}", "t,F3_open_jaw\n0,x\n", "'x'"),
-        ("{}", "t,F3_open_jaw\n0,1\n0,1\n", "do not ascend"),
+        ("{}", "t,F3_open_jaw\n0,1\n0,1\n", "are not increasing"),
         ("{}", "t,F1_viseme\n0,1\n", "no FAP of the mouth"),
         ("{}", "t,mouth_stretch_c\n0,1\n", "it lacks 'mouth_lowerLipDepress'"),
         ("{}", "t,F3_open_jaw\n0,1\n", "bad.flac"),

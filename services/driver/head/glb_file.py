@@ -89,7 +89,9 @@ class Glb:
         unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOKS)}
         if unknown:
             names = ", ".join(sorted(unknown))
-            raise BadGlbError(f"it needs {names}, which kouxing cannot read; export it without")
+            raise BadGlbError(
+                f"it needs {names}, which kouxing does not support; export it without them"
+            )
         self._buffer = cache(self._load_buffer)
         self._decompressed = cache(self._decompress)
 
@@ -196,7 +198,7 @@ class Glb:
                 np.dtype(_TYPES[indices["componentType"]]),
             )
             if size and rows.max() >= count:
-                raise ValueError("a sparse accessor writes outside itself")
+                raise ValueError("a sparse accessor has an index out of range")
             values[rows[:, 0]] = self._strided(
                 replacements["bufferView"],
                 int(replacements.get("byteOffset", 0)),
@@ -229,7 +231,7 @@ class Glb:
             number, parent = queue.pop(0)
             node = self.item("nodes", number)
             if number in worlds or len(worlds) > MAX_NODES:
-                raise ValueError("its nodes are not a tree")
+                raise ValueError("its nodes do not form a tree")
             worlds[number] = parent @ _local_matrix(node)
             queue += [(int(child), worlds[number]) for child in node.get("children", [])]
         return list(worlds.items())

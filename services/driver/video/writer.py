@@ -159,9 +159,7 @@ class VideoWriter:
                 f"cannot make a video of {width_px} x {height_px} pixels; use even, positive sizes"
             )
         if not 1 <= frame_rate_hz <= 1000:
-            raise UserError(
-                f"the frame rate {frame_rate_hz} Hz is not between 1 and 1000; choose one"
-            )
+            raise UserError(f"the frame rate is {frame_rate_hz} Hz; choose one from 1 to 1000 Hz")
         sound_codec = None if sample_rate_hz is None else form.sound
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz

@@ -190,7 +190,7 @@ def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
         or children.sum() != len(children) - 1
         or (first_child <= at)[children > 0].any()
     ):
-        raise ValueError("its phone language model is not a tree")
+        raise ValueError("its phone language model does not form a tree")
     phone = archive.array("lm_phone", children.shape).astype(np.int64)
     is_first = np.zeros(len(phone) + 1, dtype=bool)
     is_first[first_child] = True

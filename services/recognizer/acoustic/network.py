@@ -85,6 +85,6 @@ def run_session(session: Any, outputs: list[str], inputs: Mapping[str, NDArray[A
 def check_outputs(outputs: Sequence[NDArray[Any]], shapes: Sequence[tuple[int, ...]]) -> None:
     """Raise ``ValueError`` if a network's outputs do not have these shapes or are not finite."""
     if [array.shape for array in outputs] != list(shapes):
-        raise ValueError(f"its network scores {outputs[0].shape}, expected {shapes[0]}")
+        raise ValueError(f"its network outputs the shape {outputs[0].shape}, expected {shapes[0]}")
     if not all(np.isfinite(array).all() for array in outputs):
-        raise ValueError("its network scores with values that are not finite")
+        raise ValueError("its network outputs values that are not finite")
