@@ -16,16 +16,22 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
     Raises ``UserError`` if the file cannot be written.
     """
     try:
-        with path.open("wb") as file:
-            try:
-                yield file
-                file.flush()
-            except BaseException:
-                if path.is_file():  # not a device
-                    path.unlink()
-                raise
+        with path.open("wb") as file, delete_on_error(path):
+            yield file
+            file.flush()
     except OSError as error:
         raise write_error(path, error) from error
+
+
+@contextlib.contextmanager
+def delete_on_error(path: Path) -> Iterator[None]:
+    """Delete a file if an error or Ctrl-C interrupts the writing."""
+    try:
+        yield
+    except BaseException:
+        if path.is_file():  # not a device
+            path.unlink()
+        raise
 
 
 def write_error(path: Path, error: Any) -> UserError:

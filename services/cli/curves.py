@@ -28,7 +28,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.output_file import write_error
+from kouxing.shared.output_file import delete_on_error, write_error
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.terminal import write_text
 
@@ -82,9 +82,10 @@ class CurveExporter(ABC):
         """Write all frames of a motion and return their number."""
         rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
         duration_s = None if motion.samples is None else len(motion.samples) / MEDIA_RATE_HZ
-        return self.write(
-            Curves(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
-        )
+        with delete_on_error(self._output):
+            return self.write(
+                Curves(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
+            )
 
     @abstractmethod
     def write(self, curves: Curves) -> int:

@@ -16,7 +16,12 @@ from kouxing.services.driver.render.captions import band_height_px
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
 from kouxing.services.driver.video import film
-from kouxing.services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_sequence
+from kouxing.services.driver.video.writer import (
+    VIDEO_SUFFIXES,
+    check_name,
+    is_sequence,
+    picture_name,
+)
 from kouxing.shared.errors import UserError
 
 _DRAWING_OPTIONS = frozenset(
@@ -100,6 +105,13 @@ EXPORTERS: dict[str, type[Exporter]] = {
 def is_output(path: Path) -> bool:
     """Return whether a path is a file or a folder that an exporter writes."""
     return is_sequence(path) or path.suffix.lower() in EXPORTERS
+
+
+def existing_output(output: Path) -> Path | None:
+    """Return the file that must not exist: the first of a sequence of pictures, or the output."""
+    if is_sequence(output) and (first := picture_name(output, 0)).exists():
+        return first
+    return None if output.is_dir() else output
 
 
 def open_exporter(output: Path, options: ExportOptions) -> Exporter:

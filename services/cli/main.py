@@ -141,8 +141,10 @@ def main() -> None:
     Ctrl-C gives exit status 130, whatever exception a library turns it into. Python's shutdown is
     skipped, because native libraries can hang or crash during a shutdown.
     """
-    if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)  # also when it is a log file
+    if sys.stdout is None:  # closed, as with >&-
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 (until the end)
+    if isinstance(sys.stdout, TextIOWrapper):  # flush each line also in a log file
+        sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:
         _run_command()
     except (Exception, KeyboardInterrupt, SystemExit):
@@ -157,6 +159,8 @@ def main() -> None:
 
 def _run_command() -> None:
     try:
+        if "" in sys.argv:
+            raise UserError("an argument is empty; check the variables in your command")
         typer.main.get_command(app)(prog_name="kouxing")  # app() would replace sys.excepthook
     except UserError as error:
         if is_interrupted():

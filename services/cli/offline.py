@@ -150,7 +150,7 @@ def render(
     force: Force = False,
 ) -> None:
     """Make a video, pictures or curves from sound, or from curves."""
-    from kouxing.services.cli.exporters import is_output
+    from kouxing.services.cli.exporters import existing_output, is_output
 
     if live and text is not None:
         raise UserError("a live stream has no text in advance; use either --live or --text")
@@ -167,8 +167,7 @@ def render(
     inputs = [*(source for source, _ in pairs), sound, mouth, Path(head)]
     if text is not None:
         inputs.append(Path(text))
-    targets = (None if target.is_dir() else target for _, target in pairs)  # folder of pictures
-    check_output(*targets, inputs=inputs, force=force)
+    check_output(*(existing_output(target) for _, target in pairs), inputs=inputs, force=force)
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
         yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,

@@ -1,5 +1,6 @@
 """Reads the spoken texts of commands: given directly, or as a file."""
 
+import os
 import re
 from pathlib import Path
 
@@ -25,6 +26,7 @@ _TEXT_SUFFIXES = {
     *(".txt", ".text", ".md", ".markdown", ".html", ".htm", ".xml", ".ssml", ".json", ".textgrid"),
     *(".srt", ".vtt", ".lrc", ".ass", ".ssa", ".sbv", ".sub", ".ttml", ".dfxp", ".smi", ".tsv"),
     *(".pdf", ".rtf", ".doc", ".docx", ".odt", ".csv", ".xlsx"),
+    *(".svg", ".png", ".mp4", ".mp3", ".wav", ".flac", ".m4a"),
 }
 _TABLE_SUFFIXES = {".csv", ".xlsx"}
 _MARKDOWN_SUFFIXES = {".md", ".markdown"}
@@ -84,7 +86,8 @@ def text_of(text: str) -> str:
     """
     path = _path_of(text)
     if path is None:
-        spoken, encoding = extract_text(text), ""
+        given = SpokenText(text) if _is_unicode(text) else decode_text(os.fsencode(text))
+        spoken, encoding = extract_text(given.text), given.form
     else:
         content = read_file(path, _MAX_BYTES)
         try:
@@ -102,6 +105,11 @@ def text_of(text: str) -> str:
             f"{labels[0]!r} is read as spoken text; delete such labels if nobody says them"
         )
     return spoken.text
+
+
+def _is_unicode(text: str) -> bool:
+    """Return whether an argument has the encoding of the terminal."""
+    return not re.search("[\ud800-\udfff]", text)
 
 
 def _path_of(text: str) -> Path | None:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -250,6 +251,19 @@ command_line.main()
         text=True,
     )
     assert done.stdout == "step 1\n"
+
+
+def test_standard_output_may_be_closed() -> None:
+    command = shlex.join((sys.executable, "-m", "kouxing", "phones", str(VOWELS_FILE)))
+    done = subprocess.run(
+        ["sh", "-c", f"{command} >&-"], cwd=ROOT, stderr=subprocess.PIPE, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_an_empty_argument_is_refused() -> None:
+    refused = kouxing("render", VOWELS_FILE, "")
+    assert (refused.returncode, "an argument is empty" in refused.stderr) == (2, True)
 
 
 def test_a_full_disk_gives_one_line() -> None:

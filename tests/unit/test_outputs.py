@@ -1,14 +1,22 @@
 """Outputs are complete or absent; commands refuse useless options, and overwrite no input."""
 
 import errno
+from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 import pytest
+from rich.progress import Progress
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import plot_heads
+from kouxing.services.cli.animation import Motion
 from kouxing.services.cli.batch import pair_outputs, process_all
+from kouxing.services.cli.curves import CURVE_EXPORTERS
 from kouxing.services.cli.main import app
+from kouxing.services.cli.options import ExportOptions
+from kouxing.services.driver.video.film import Frame
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import open_output
 from kouxing.shared.terminal import check_output
@@ -162,6 +170,29 @@ def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="the disk is full"):
         fill_the_disk(path)
     assert not path.exists()
+
+
+def test_an_interrupted_table_is_deleted(tmp_path: Path) -> None:
+    def frames() -> Iterator[Frame]:
+        yield 0.0, np.zeros(68, np.float32)
+        raise KeyboardInterrupt
+
+    exporter = CURVE_EXPORTERS[".csv"](tmp_path / "face.csv", ExportOptions())
+    with pytest.raises(KeyboardInterrupt):
+        exporter.export(Motion(cast(list[Frame], frames()), 50.0, 25.0, None), Progress())
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("output", ["pictures", "face%03d.png"])
+def test_a_sequence_of_pictures_is_overwritten_only_with_force(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pictures").mkdir()
+    Path("pictures/00000.png").touch()
+    Path("face000.png").touch()
+    with pytest.raises(UserError, match=r"000\.png exists; add --force"):
+        app(["render", "my.wav", output], standalone_mode=False)
 
 
 def test_an_error_names_the_folder_to_create(tmp_path: Path) -> None:

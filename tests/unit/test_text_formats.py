@@ -1,5 +1,6 @@
 """Spoken texts in subtitles, markup and other encodings."""
 
+import os
 import re
 from pathlib import Path
 
@@ -290,7 +291,12 @@ def test_warns_about_labels_that_may_not_be_spoken(
     assert message.startswith(f"{label} is read as spoken text") if label else not message
 
 
-@pytest.mark.parametrize("name", ["no.srt", "no.TextGrid", "no.docx"])
+def test_decodes_an_argument_in_another_encoding(capsys: pytest.CaptureFixture[str]) -> None:
+    assert text_of(os.fsdecode("你好".encode("gb18030"))) == "你好"
+    assert "read as GB18030" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["no.srt", "no.TextGrid", "no.docx", "no.svg"])
 def test_rejects_a_missing_file(name: str) -> None:
     with pytest.raises(UserError, match=f"{re.escape(name)}: no such file"):
         text_of(name)

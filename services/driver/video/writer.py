@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import write_error
+from kouxing.shared.output_file import open_output, write_error
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -122,6 +122,13 @@ def is_sequence(path: Path) -> bool:
     if path.suffix == ".png":
         return _NUMBER.search(path.name) is not None
     return path.is_dir() or not path.suffix
+
+
+def picture_name(path: Path, number: int) -> Path:
+    """Return the file of a picture in a sequence: a folder, or a name such as ``face%05d.png``."""
+    if path.suffix != ".png":
+        path /= "%05d.png"
+    return path.with_name(_NUMBER.sub(lambda match: match[0] % number, path.name, count=1))
 
 
 class VideoWriter:
@@ -285,27 +292,25 @@ class PictureSequence:
     """
 
     def __init__(self, path: Path) -> None:
-        self._pattern = path
+        self._path = path
         self._num_images = 0
         if path.suffix != ".png":
             try:
                 path.mkdir(exist_ok=True)
             except OSError as error:
                 raise write_error(path, error) from error
-            self._pattern = path / "%05d.png"
 
     def write_image(self, image: UInt8) -> None:
         """Write a picture (H, W, 3) or (H, W, 4), sRGB."""
-        name = _NUMBER.sub(lambda match: match[0] % self._num_images, self._pattern.name, count=1)
-        write_picture(self._pattern.with_name(name), image)
+        write_picture(picture_name(self._path, self._num_images), image)
         self._num_images += 1
 
     def write_sound(self, samples: Float32) -> None:
         """Ignore the sound."""
 
     def close(self) -> Path:
-        """Return the name pattern."""
-        return self._pattern
+        """Return the folder or the name pattern."""
+        return self._path
 
     def discard(self) -> None:
         """Keep the pictures written so far."""
@@ -316,10 +321,8 @@ def write_picture(path: Path, image: UInt8) -> None:
 
     Raises ``UserError`` if the file cannot be written.
     """
-    try:
-        path.write_bytes(picture.encode(image))
-    except OSError as error:
-        raise write_error(path, error) from error
+    with open_output(path) as file:
+        file.write(picture.encode(image))
 
 
 def remove_unfinished(folder: Path) -> None:
