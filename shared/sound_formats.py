@@ -65,6 +65,7 @@ _OTHER = {
     b"\x89PNG": "a picture, not sound",
     b"\xff\xd8\xff": "a picture, not sound",
     b"GIF8": "a picture, not sound",
+    b"glTF": "an avatar, not sound; show it with --head of kouxing run or render",
     **dict.fromkeys((b"#!SILK", b"\2#!SILK"), "a SILK voice message; convert it to wav first"),
     b"MThd": "a MIDI file: notes without sound; render it to wav with a synthesizer",
 }

@@ -11,6 +11,7 @@ const CHINESE = {
   "a rar archive; unpack it first": "rar 压缩包，请先解压",
   "a PDF document, not sound": "PDF 文档，不是声音",
   "a picture, not sound": "图片，不是声音",
+  "an avatar, not sound; show it with --head of kouxing run or render": "虚拟形象，不是声音；请用 kouxing run --head 显示它",
   "a SILK voice message; convert it to wav first": "SILK 语音消息，请先转成 wav",
   "a MIDI file: notes without sound; render it to wav with a synthesizer": "MIDI 文件，只有音符没有声音；请先用合成器转成 wav",
   "cannot read audio: the file has only zeros; copy or record it again": "无法读取声音：文件里全是零，请重新复制或录制",
