@@ -4,6 +4,7 @@ from array import array
 
 import numpy as np
 import pytest
+from kouxing_client import KouxingError
 from kouxing_client.audio import RESEND_S, AudioStream, to_pcm
 
 CHUNK = 1600  # samples: 100 ms
@@ -73,3 +74,20 @@ INTEGERS = array("h", [0, 16384, -32767, 32767])
 def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
     assert to_pcm(audio, "s16le") == INTEGERS.tobytes()
     assert to_pcm(FLOATS, "f32le") == array("f", FLOATS).tobytes()
+
+
+@pytest.mark.parametrize("encoding", ["s16le", "f32le"])
+@pytest.mark.parametrize(
+    "audio",
+    [
+        [0, -16384, 32767],
+        np.array([0, 16384], np.int32),
+        np.array([0.0, -900.0], np.float32),
+        np.array([np.nan, 0.5], np.float32),
+        [0.5, np.nan],
+    ],
+)
+def test_rejects_numbers_far_beyond_1(audio: object, encoding: str) -> None:
+    """They are usually 16-bit samples in a list or in an array of another type."""
+    with pytest.raises(KouxingError, match=r"16-bit integers .*, or floats within ±1, not "):
+        to_pcm(audio, encoding)

@@ -6,13 +6,16 @@ import sys
 from array import array
 from collections import deque
 from collections.abc import Iterable, Iterator
+from math import isfinite
 from typing import Any
 
+from kouxing_client.errors import KouxingError
 from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 _CODES = {"s16le": "h", "f32le": "f"}
 _FULL_SCALE = 32767
+_MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
 # Audio before the newest acknowledgement that is kept in case another recognizer needs it
 RESEND_S = 10.0
 MAX_KEPT = 5000  # messages
@@ -29,6 +32,8 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
 
     The audio is PCM bytes in that encoding, or numbers (16-bit integers, or floats within ±1) in an
     iterable or a buffer, of shape ``(n,)`` or ``(n, channels)``.
+
+    Raises ``KouxingError`` if floats are not finite or far beyond ±1.
     """
     try:
         view = memoryview(audio)
@@ -42,6 +47,14 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
 
 def _pack(numbers: memoryview[Any] | array[float], encoding: str) -> bytes:
     is_integer = isinstance(numbers, memoryview) and numbers.format == "h"
+    if len(numbers) and not is_integer:
+        lowest, highest = min(numbers), max(numbers)
+        is_small = -_MAX_FLOAT <= lowest and highest <= _MAX_FLOAT
+        if not (is_small and isfinite(sum(numbers))):  # the sum finds every NaN
+            raise KouxingError(
+                "audio must be 16-bit integers (array type int16), or floats within ±1, not"
+                f" {lowest:g} to {highest:g}"
+            )
     scaled: Iterable[float] = numbers
     if encoding == "s16le" and not is_integer:
         scaled = (round(_FULL_SCALE * max(-1.0, min(1.0, value))) for value in numbers)
