@@ -49,7 +49,7 @@ def _pack(numbers: memoryview[Any] | array[float], encoding: str) -> bytes:
     is_integer = isinstance(numbers, memoryview) and numbers.format == "h"
     if len(numbers) and not is_integer:
         lowest, highest = min(numbers), max(numbers)
-        is_small = -_MAX_FLOAT <= lowest and highest <= _MAX_FLOAT
+        is_small = -_MAX_FLOAT <= lowest <= highest <= _MAX_FLOAT
         if not (is_small and isfinite(sum(numbers))):  # the sum finds every NaN
             raise KouxingError(
                 "audio must be 16-bit integers (array type int16), or floats within ±1, not"
