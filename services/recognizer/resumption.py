@@ -1,8 +1,8 @@
 """How a recognizer continues the session of a lost one.
 
 It processes some audio again from before the time at which it continues, because the networks look
-back 2.5 s. It does not emit the results of that audio. Everything that the lost recognizer emitted
-for later audio is void.
+back 2.5 s. It does not emit the results of that audio. It replaces all results of the lost
+recognizer for later audio.
 """
 
 from collections import deque

@@ -169,7 +169,7 @@ class FaceAnimator:
             self._goal, self._is_resuming = None, True
 
     def change_recognizer(self) -> None:
-        """Continue with the events of another recognizer; phones that were not final are void.
+        """Continue with the events of another recognizer; discard phones that were not final.
 
         The new recognizer numbers phones from 0 and may repeat known events.
         """

@@ -29,7 +29,7 @@ class LatenessMeter:
         self._drop_old(now_s)
 
     def pause(self) -> None:
-        """Record that the client sends no audio, so that media time stands still."""
+        """Record that the client sends no audio, so that media time does not advance."""
         self._sent.clear()
 
     def measure(self, now_s: float) -> Lateness | None:

@@ -248,7 +248,7 @@ class SynthesizerService(Service):
         num_frames = int((now_s - session.relax_at_s) * self.frame_rate_hz)
         if num_frames > 0:
             session.relax_at_s += num_frames / self.frame_rate_hz
-            # media time stands still with the audio; the sequence number continues
+            # media time stops with the audio; the sequence number continues
             self._publish(session, session.face.relax(num_frames))
             session.lateness.pause()
             session.receiver.acknowledge()

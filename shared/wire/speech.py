@@ -26,7 +26,7 @@ class AudioState(StrEnum):
     """The states of the audio in ``progress``."""
 
     RUNNING = "running"
-    STALLED = "stalled"  # the client sends no audio: media time stands still
+    STALLED = "stalled"  # the client sends no audio, so media time does not advance
     RESUMED = "resumed"  # it sends audio again; that audio is not processed yet
     SKIPPED = "skipped"  # the audio before was too old: the face continues here
     ENDED = "ended"  # no more results follow

@@ -189,7 +189,7 @@ def test_playout_delay_is_unchanged_after_a_pause() -> None:
     for number in range(100):
         playout.earliest_s(number / 50, number / 50)
     stalled_s = 99 / 50
-    for number in range(100, 150):  # the face fades to rest while media time stands still
+    for number in range(100, 150):  # the face fades to rest while media time does not advance
         playout.earliest_s(stalled_s, number / 50)
     resumed_s = [playout.earliest_s(stalled_s + n / 50, 3.0 + n / 50) for n in range(1, 50)]
     assert resumed_s == pytest.approx([3.0 + n / 50 for n in range(1, 50)], abs=0.021)

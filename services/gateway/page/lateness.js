@@ -27,7 +27,7 @@ export class Lateness {
   #agreedMs = null; // when the frames last agreed with isBehind
 
   /**
-   * Record the arrival of a frame. Media time stands still while the client sends no audio. Media time
+   * Record the arrival of a frame. Media time does not advance while the client sends no audio. Media time
    * leaps if a busy machine skips frames to stay live.
    */
   frameArrived(nowMs, mediaTime) {

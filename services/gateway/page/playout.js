@@ -183,7 +183,7 @@ export class FapTrack {
   push(mediaTime, values) {
     const last = this.#frames.at(-1);
     if (last !== undefined && mediaTime <= last[0]) {
-      // Media time stands still while the sound pauses, but the face still moves to rest.
+      // Media time does not advance while the sound pauses, but the face still moves to rest.
       if (mediaTime === last[0]) last[1] = values;
       return false;
     }

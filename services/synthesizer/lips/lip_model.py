@@ -42,7 +42,7 @@ class LipStream(Protocol):
         """Return the mouth at a media time, given all events up to the delay after it."""
 
     def relax(self, step_s: float) -> MouthFrame:
-        """Return the mouth one step closer to rest while media time stands still."""
+        """Return the mouth one step closer to rest while media time does not advance."""
 
     def flush(self) -> None:
         """Drop the known events (an interruption); the next frames lead to rest."""

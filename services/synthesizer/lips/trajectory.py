@@ -76,7 +76,7 @@ NO_TRANSITION = Transition(still(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FA
 
 
 class RestTransition:
-    """Leads the mouth to rest while media time stands still."""
+    """Leads the mouth to rest while media time does not advance."""
 
     def __init__(self, mouth: FapState, neutral: Array, duration_s: float) -> None:
         self._neutral = still(neutral)

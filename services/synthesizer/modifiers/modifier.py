@@ -15,7 +15,7 @@ class FrameContext(Record, frozen=True, kw_only=True):
 
     time_s: float  # media time of the frame
     known_s: float  # media time up to which the audio is known
-    elapsed_s: float  # since the first frame; continues while media time stands still
+    elapsed_s: float  # since the first frame; continues while media time does not advance
     step_s: float  # since the previous frame
     is_speaking: bool  # speech is active or known to start very soon
     levels: Sequence[tuple[float, float]]  # new levels: media time s, level dB

@@ -114,7 +114,7 @@ class VisemeStream:
         self._sequence = sequence_parameters(parameters, self._timeline)
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
-        self._rest: RestTransition | None = None  # set while media time stands still
+        self._rest: RestTransition | None = None  # set while media time does not advance
         self._time_s = start_s  # time of the last frame
         self._mouth: Callable[[], FapState] = lambda: still(parameters.neutral)
 

@@ -115,7 +115,7 @@ class LearntStream:
         self._track = LipTrack(self._neutral)
         self._on_track = still(self._neutral)  # the track at the last frame
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
-        self._rest: RestTransition | None = None  # set while media time stands still
+        self._rest: RestTransition | None = None  # set while media time does not advance
         self._resting = RestingLips()
         self._ajar = 0.0  # fraction of the ajar mouth at the last frame
         self._late_s = 0.0  # lateness of the newest lip frame

@@ -142,7 +142,7 @@ class RestingLips:
         return self._share()
 
     def relax(self, step_s: float) -> float:
-        """Return the share one step closer to rest while media time stands still."""
+        """Return the share one step closer to rest while media time does not advance."""
         self._set_goal(0.0, _RELAX_S)
         self._elapsed_s += step_s
         return self._share()
