@@ -5,11 +5,12 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 """
 
 import base64
-import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmFormat, check_text
 from kouxing.shared.errors import UserError
@@ -44,7 +45,7 @@ def binary(message_type: int, epoch: int, media_time: int, payload: bytes) -> by
 
 def text(message_type: str, **fields: object) -> str:
     """Return a JSON message."""
-    return json.dumps({"type": message_type, **fields}, ensure_ascii=False)
+    return msgspec.json.encode({"type": message_type, **fields}).decode()
 
 
 def error_text(reason: str, code: str = "refused", retry_after_s: float = 0.0) -> str:

@@ -142,9 +142,9 @@ class IdleMotion:
         faps[EYES_PITCH] += pitch - head[0]
         faps[EYES_YAW] += yaw - head[1]
         faps[_LIDS_UPPER] += _LID_PER_GAZE * (pitch - head[0])
-        # start from the lid position that an expression has set
-        faps[_LIDS_UPPER] += lid * (UPPER_LID - faps[_LIDS_UPPER])
-        faps[_LIDS_LOWER] += lid * (LOWER_LID - faps[_LIDS_LOWER])
+        if lid:  # start from the lid position that an expression has set
+            faps[_LIDS_UPPER] += lid * (UPPER_LID - faps[_LIDS_UPPER])
+            faps[_LIDS_LOWER] += lid * (LOWER_LID - faps[_LIDS_LOWER])
 
     def blink_slowly(self, time_s: float) -> None:
         """Start a slow blink, unless the lids are moving."""
