@@ -13,11 +13,11 @@ from rich.progress import Progress
 
 from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
-from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.spoken_text import read_text, report_mismatch
 from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch
 from kouxing.services.live_chain import LiveChain
+from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.alignment import align_syllables

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.cli.captions import write_syllables
-from kouxing.services.cli.inputs import read_mono_16k
 from kouxing.services.cli.options import DrawnLips, Timing
 from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
+from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.alignment import align_syllables, spoken
 from kouxing.services.recognizer.front_end.pcm import measure_slices

@@ -227,7 +227,7 @@ def phones(
     force: Force = False,
 ) -> None:
     """Recognize the phones of audio files, with their times."""
-    from kouxing.services.cli.inputs import read_mono_16k
+    from kouxing.services.mono_audio import read_mono_16k
     from kouxing.services.recognizer.acoustic.languages import model_of_language
     from kouxing.services.recognizer.offline import recognize
     from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -274,8 +274,8 @@ def align(
     force: Force = False,
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
-    from kouxing.services.cli.inputs import read_mono_16k
     from kouxing.services.cli.spoken_text import read_text, report_mismatch
+    from kouxing.services.mono_audio import read_mono_16k
     from kouxing.services.recognizer.acoustic.languages import model_of_language
     from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
     from kouxing.shared.clock import MEDIA_RATE_HZ

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from kouxing.services.cli.inputs import read_mono_16k
+from kouxing.services.mono_audio import read_mono_16k
 from kouxing.shared.audio_file import open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE

@@ -1,4 +1,4 @@
-"""Reads the sound files of commands."""
+"""Reads sound files as the recognizer needs them: 16 kHz, mono."""
 
 import math
 from collections.abc import Iterable
