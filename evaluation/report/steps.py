@@ -129,8 +129,9 @@ STEPS: Mapping[str, Step] = {
     ),
     "faults": Step(("evaluate faults",), ("evaluation/system/faults.py", *_SERVICES), ()),
     "browser": Step(
-        (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
+        (f"bench lips-page {SAMPLE.relative_to(ROOT)} --clips {{lips}}",),
         ("clients/kouxing-lips", "evaluation/system/lips_page.py"),
+        (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
     ),
     "sizes": Step(
         ("bench sizes",),

@@ -114,6 +114,27 @@ def _browser(results: Results) -> Iterator[list[str]]:
             f"{format_number(needed, '.1f')} / -" if is_ours and needed else "",
             "weights of its models" if is_ours and needed else "",
         ]
+        if package["num_clips"]:
+            yield [
+                f"{package['name']} in the browser: lag, ms / correlation of the opening"
+                " / F1 of closures",
+                join_values(
+                    [
+                        format_number(package["lag_ms"], ".0f"),
+                        format_number(package["opening_correlation"], ".2f"),
+                        format_number(package["closure_f1"], ".2f"),
+                    ]
+                ),
+                "",
+                "",
+            ]
+    if "page_share" in browser:
+        yield [
+            "the page itself, included in these shares: share of a core, %",
+            percent(browser["page_share"], ".0f"),
+            "",
+            "",
+        ]
 
 
 def better_packages(results: Results) -> list[str]:

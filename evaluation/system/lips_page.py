@@ -1,7 +1,8 @@
 """Compares lip sync in headless Chromium: ``kouxing-lips`` and three packages of npm.
 
 No head is drawn. The microphone plays a recording in a loop. The processor time is that of the
-page's process: page, worker and audio thread. All packages have their default settings.
+page's process: page, worker and audio thread. It is also measured without lip sync, with the same
+audio context, microphone and animation frames. All packages have their default settings.
 
 With clips, one page plays each held-out clip to all packages at the same time, and samples their
 faces. The lag of a package is the one with the highest correlation of the opening. Correlation and
@@ -44,6 +45,7 @@ from kouxing.shared.terminal import print_table
 Array = NDArray[np.float64]
 
 OURS = "kouxing-lips"
+_NONE = "none"  # a page without lip sync
 _ROOT = Path(__file__).resolve().parents[2]  # root of the source tree, behind its links
 _OURS_FOLDER = _ROOT / "clients" / OURS
 MEASURE_S = 20.0
@@ -69,10 +71,13 @@ _PAGE = """<!doctype html><link rel="icon" href="data:,"><button id="start">Star
 <script type="module">
 import { LipSync } from "./index.js";
 import { headAudio, wLipSync, wawa } from "./rivals.js";
-const STARTS = { "kouxing-lips": ours, HeadAudio: headAudio, wLipSync, "wawa-lipsync": wawa };
+const STARTS = { "kouxing-lips": ours, HeadAudio: headAudio, wLipSync, "wawa-lipsync": wawa, none };
 const names = new URL(location).searchParams.getAll("name");
 const openingOf = ({ faps }) => { const now = faps(); return now ? -now[3] - now[4] : 0; };
 window.delays = [];
+function none(context) {
+  return { node: new GainNode(context), faps: () => null };
+}
 async function ours(context) {
   const lips = await LipSync.create({ context });
   lips.addEventListener("frames", ({ detail: { frames, startS } }) => {
@@ -134,7 +139,8 @@ class LipsPage:
     loaded_ms: float  # from a local server
     first_movement_ms: float  # from loading to the first motion of the mouth; the microphone speaks
     delay_ms: dict[str, float] | None  # from the sound to its weights: p50, p95; only kouxing-lips
-    processor_share: float  # fraction of one core
+    processor_share: float  # fraction of one core, including that of the page itself
+    page_share: float  # fraction of one core that the page needs without lip sync
     num_clips: int = 0
     lag_ms: float | None = None  # lag of the opening behind the real lips, with the page's delay
     opening_correlation: float | None = None
@@ -159,8 +165,10 @@ def measure(audio: Path, clips: Path | None = None) -> list[LipsPage]:
         write_microphone(audio, voice)
         try:
             with serve_folder(folder) as origin:
+                with _page(folder, voice, origin, [_NONE]) as browser:
+                    page_share = _processor_share(browser)
                 pages = [
-                    _measure_page(folder, voice, origin, name)
+                    _measure_page(folder, voice, origin, name, page_share)
                     for name in track(names, description="packages", transient=True)
                 ]
                 return _with_accuracy(pages, folder, voice, origin, held_out)
@@ -228,13 +236,18 @@ def _page(folder: Path, voice: Path, origin: str, names: Sequence[str]) -> Itera
             browser.close()
 
 
-def _measure_page(folder: Path, voice: Path, origin: str, name: str) -> LipsPage:
+def _processor_share(browser: Chromium) -> float:
+    """Measure the processor time of the page, as a fraction of one core."""
+    start_s, start_cpu_s = time.monotonic(), browser.cpu_s("renderer")
+    time.sleep(MEASURE_S)
+    return (browser.cpu_s("renderer") - start_cpu_s) / (time.monotonic() - start_s)
+
+
+def _measure_page(folder: Path, voice: Path, origin: str, name: str, page_share: float) -> LipsPage:
     with _page(folder, voice, origin, [name]) as browser:
         browser.wait_for("window.movedMs")
         browser.evaluate("window.delays.length = 0")
-        start_s, start_cpu_s = time.monotonic(), browser.cpu_s("renderer")
-        time.sleep(MEASURE_S)
-        duration_s, cpu_s = time.monotonic() - start_s, browser.cpu_s("renderer") - start_cpu_s
+        processor_share = _processor_share(browser)
         delays_ms = 1e3 * np.array(browser.evaluate("window.delays"))
         files = {path for pattern in _DOWNLOADS[name] for path in folder.glob(pattern)}
         return LipsPage(
@@ -245,7 +258,8 @@ def _measure_page(folder: Path, voice: Path, origin: str, name: str) -> LipsPage
             delay_ms={f"p{p}": float(np.percentile(delays_ms, p)) for p in (50, 95)}
             if name == OURS
             else None,
-            processor_share=cpu_s / duration_s,
+            processor_share=processor_share,
+            page_share=page_share,
         )
 
 
@@ -294,7 +308,7 @@ def _shown_mouth(rows: Array, column: int, lag_s: float) -> Mouth:
 
 def show(pages: Sequence[LipsPage], console: Console) -> None:
     """Print the figures as a table."""
-    columns = "package", "download kB", "loaded ms", "first movement ms", "core %"
+    columns = "package", "download kB", "loaded ms", "first movement ms", "core %", "of it page"
     accuracy = "lag ms", "opening r", "closures F1"
     rows = [
         [
@@ -303,6 +317,7 @@ def show(pages: Sequence[LipsPage], console: Console) -> None:
             f"{page.loaded_ms:.0f}",
             f"{page.first_movement_ms:.0f}",
             f"{100 * page.processor_share:.1f}",
+            f"{100 * page.page_share:.1f}",
             *(
                 format_number(value, form)
                 for value, form in (

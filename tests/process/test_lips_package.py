@@ -22,10 +22,10 @@ from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent
 from tests.system import DEMO, NODE, ROOT, VOWELS_FILE, samples_of_file
 
-SCRIPT = ROOT / "clients" / "kouxing-lips" / "tests" / "frames.mjs"
+SCRIPTS = ROOT / "clients" / "kouxing-lips" / "tests"
 RATE_HZ = 16_000
 DELAY_S, FRAME_RATE_HZ, EXPRESSIVENESS, FEELING = 0.06, 50.0, 1.4, 0.5
 HEAD_TURN = slice(47, 50)  # FAPs 48 to 50
@@ -53,7 +53,10 @@ def package_output(models: Path, samples: Frames, **options: Any) -> dict[str, A
     samples.astype("<f4").tofile(file)
     arguments = json.dumps({"chunk": 441, "shapes": [*SHAPE_SETS], **options})
     printed = subprocess.run(
-        [NODE, SCRIPT, models, file, arguments], capture_output=True, check=True, timeout=120
+        [NODE, SCRIPTS / "frames.mjs", models, file, arguments],
+        capture_output=True,
+        check=True,
+        timeout=120,
     )
     output: dict[str, Any] = json.loads(printed.stdout)
     return output
@@ -171,6 +174,37 @@ def test_weights_equal_the_servers(models: Path) -> None:
         for frame in output["frames"]:
             expected = shapes.weights(np.array(frame["faps"], np.float32))
             np.testing.assert_allclose(frame[name], expected, atol=1e-4)
+
+
+def test_laughter_follows_its_notes_as_on_the_server(models: Path) -> None:
+    levels_db = [-50.0] * 10 + [-20.0, -15.0, -25.0, -45.0, -50.0] * 5 + [-60.0] * 30
+    events = [
+        Progress(
+            time_s=(number + 1) / FRAME_RATE_HZ, level_db=level_db, is_laughter=10 <= number < 35
+        )
+        for number, level_db in enumerate(levels_db)
+    ]
+    face = FaceAnimator(load_lip_model(), frame_rate_hz=FRAME_RATE_HZ, delay_s=DELAY_S)
+    theirs = np.array([frame for event in events for _, frame in face.process(event)])
+    plain = [
+        {
+            "type": "progress",
+            "timeS": event.time_s,
+            "levelDb": event.level_db,
+            "isLaughter": event.is_laughter,
+        }
+        for event in events
+    ]
+    printed = subprocess.run(
+        [NODE, SCRIPTS / "face.mjs", models, str(DELAY_S)],
+        input=json.dumps(plain).encode(),
+        capture_output=True,
+        check=True,
+        timeout=120,
+    )
+    ours = np.array(json.loads(printed.stdout), np.float32)
+    assert np.ptp(opening(theirs)) > 300  # the mouth opens at the notes
+    np.testing.assert_allclose(ours, theirs, atol=0.1)
 
 
 def test_voice_state_follows_the_speech(models: Path) -> None:

@@ -221,6 +221,11 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
         first_movement_ms=1300.0,
         delay_ms={"p50": 79.0, "p95": 90.0},
         processor_share=0.08,
+        page_share=0.05,
+        num_clips=57,
+        lag_ms=110.0,
+        opening_correlation=0.6,
+        closure_f1=0.65,
     )
     other = replace(page, name="HeadAudio", download_bytes=100_000, delay_ms=None)
     values: dict[str, Any] = dict.fromkeys((field.name for field in fields(Drawing)), 1.0)
@@ -258,6 +263,9 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
         "2.4 / -",
     ]
     assert "HeadAudio in the browser: download, MB / share of a core, %" in rows
+    accuracy = "kouxing-lips in the browser: lag, ms / correlation of the opening / F1 of closures"
+    assert rows[accuracy][0] == "110 / 0.60 / 0.65"
+    assert rows["the page itself, included in these shares: share of a core, %"][0] == "5"
     assert system_tables.better_packages(results) == [
         "browser, download: HeadAudio (0.1 MB); kouxing-lips (4.6 MB)"
     ]
