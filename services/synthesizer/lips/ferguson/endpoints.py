@@ -12,7 +12,7 @@ thresholds each. The states, for slices of 20 ms:
 symbol   meaning                                                          here
 ======== ================================================================ =====================
 Q_n      short-time energy, as the level in dB of full scale              ``level_db``
-Z_n      zero crossings as a fraction of the samples, 0 to 1                 ``zero_crossing_rate``
+Z_n      zero crossings as a fraction of the samples, 0 to 1              ``zero_crossing_rate``
 ======== ================================================================ =====================
 
 Deviations: The paper detects short gaps between words. Real syllables seldom have gaps, so a

@@ -1,20 +1,20 @@
-"""Lips in pauses: they stay ajar (slightly open), close slowly, and part before the next sound.
+"""Lips in pauses: they stay slightly open (*ajar*), close slowly, and part before the next sound.
 
 Filmed speakers hold 0.4 to 0.6 of their range in a pause within a turn. They close in 0.4 s if it
 lasts, and part 0.3 s before the next sound. The lip predictor shows little of this, because half of
 its training data rests closed.
 
-======  =========================================================  ====
-symbol  meaning                                                    unit
-======  =========================================================  ====
-s       fraction of the way from the predicted mouth to an ajar one   1
-======  =========================================================  ====
+======  =======================================================  ====
+symbol  meaning                                                  unit
+======  =======================================================  ====
+s       0 for the predicted mouth, 1 for a slightly open mouth   1
+======  =======================================================  ====
 
     goal of s = 1  from the start of a pause for at most HOLD_S,
                    and from LEAD_S before voice activity to its first sound
                 0  otherwise
 
-The share follows cubics, so the mouth moves without corners. A sound is a level at most
+``s`` follows cubics, so the mouth moves smoothly. A sound is a level at most
 ``_RANGE_DB`` below the loudest recent one. Silence is a pause once ``_MIN_PAUSE_S`` of it are
 known, because the closure of a stop is shorter. In a pause, lips close for a phone and for a likely
 closure shortly before a sound. If the lip predictor is nearly certain that they are closed, they
