@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from textwrap import fill
@@ -41,6 +41,14 @@ def open_progress() -> Progress:
     from rich.progress import Progress  # noqa: PLC0415 (few commands need it)
 
     return Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive)
+
+
+@contextlib.contextmanager
+def show_loading() -> Iterator[None]:
+    """Show a progress bar while slow modules and models are loaded."""
+    with open_progress() as progress:
+        progress.add_task("loading", total=None)
+        yield
 
 
 def plural(count: int, noun: str) -> str:

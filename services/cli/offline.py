@@ -32,6 +32,7 @@ from kouxing.shared.terminal import (
     open_progress,
     plural,
     print_message,
+    show_loading,
     write_output,
 )
 
@@ -150,7 +151,8 @@ def render(
     force: Force = False,
 ) -> None:
     """Make a video, pictures or curves from sound, or from curves."""
-    from kouxing.services.cli.exporters import existing_output, is_output
+    with show_loading():
+        from kouxing.services.cli.exporters import existing_output, is_output
 
     if live and text is not None:
         raise UserError("a live stream has no text in advance; use either --live or --text")
@@ -227,12 +229,13 @@ def phones(
     force: Force = False,
 ) -> None:
     """Recognize the phones of audio files, with their times."""
-    from kouxing.services.mono_audio import read_mono_16k
-    from kouxing.services.recognizer.acoustic.languages import model_of_language
-    from kouxing.services.recognizer.offline import recognize
-    from kouxing.shared.clock import MEDIA_RATE_HZ
-    from kouxing.shared.phones.alphabets import respell
-    from kouxing.shared.phones.phone_files import format_phones
+    with show_loading():
+        from kouxing.services.mono_audio import read_mono_16k
+        from kouxing.services.recognizer.acoustic.languages import model_of_language
+        from kouxing.services.recognizer.offline import recognize
+        from kouxing.shared.clock import MEDIA_RATE_HZ
+        from kouxing.shared.phones.alphabets import respell
+        from kouxing.shared.phones.phone_files import format_phones
 
     if len(audio) > 1 and output is None:
         raise UserError(f"{len(audio)} files need a folder for their phones; add -o FOLDER")
@@ -242,8 +245,7 @@ def phones(
     if is_folder:
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
     check_output(*(target for _, target in pairs), inputs=audio, force=force)
-    with open_progress() as progress:
-        progress.add_task("loading", total=None)
+    with show_loading():
         model = model_of_language(language, acoustic)
 
     def recognize_file(source: Path, target: Path | None) -> None:
@@ -274,22 +276,22 @@ def align(
     force: Force = False,
 ) -> None:
     """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
-    from kouxing.services.cli.spoken_text import read_text, report_mismatch
-    from kouxing.services.mono_audio import read_mono_16k
-    from kouxing.services.recognizer.acoustic.languages import model_of_language
-    from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
-    from kouxing.shared.clock import MEDIA_RATE_HZ
-    from kouxing.shared.phones.alphabets import respell
-    from kouxing.shared.phones.inventory import load_inventory
-    from kouxing.shared.phones.phone_files import format_phones
+    with show_loading():
+        from kouxing.services.cli.spoken_text import read_text, report_mismatch
+        from kouxing.services.mono_audio import read_mono_16k
+        from kouxing.services.recognizer.acoustic.languages import model_of_language
+        from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
+        from kouxing.shared.clock import MEDIA_RATE_HZ
+        from kouxing.shared.phones.alphabets import respell
+        from kouxing.shared.phones.inventory import load_inventory
+        from kouxing.shared.phones.phone_files import format_phones
 
     style = _format(form, output)
     check_output(output, inputs=[audio, Path(text)], force=force)
-    with open_progress() as progress:
-        loading = progress.add_task("loading", total=None)
+    with show_loading():
         model = model_of_language(language, acoustic)
         transcript = read_text(text, load_inventory(language or model.inventory.language))
-        progress.remove_task(loading)
+    with open_progress() as progress:
         samples = read_mono_16k(audio, track, progress)
         with_progress = partial(progress.track, description="aligning")
         alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
@@ -343,7 +345,8 @@ def lips(
     force: Force = False,
 ) -> None:
     """Draw the mouth in two dimensions, for cartoons, teaching and papers."""
-    from kouxing.services.cli.mouth_drawing import draw_mouth
+    with show_loading():
+        from kouxing.services.cli.mouth_drawing import draw_mouth
 
     *text, output = text_and_output
     if len(text) > 1:

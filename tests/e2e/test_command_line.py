@@ -253,6 +253,23 @@ command_line.main()
     assert done.stdout == "step 1\n"
 
 
+LOADING = """
+import sys
+from kouxing.services.cli import main, offline
+SLOW = {"av", "numba", "onnxruntime", "scipy"}
+offline.show_loading = lambda: sys.exit(f"loading {sorted(SLOW & sys.modules.keys())}")
+main.main()
+"""
+
+
+@pytest.mark.parametrize(
+    "command", ["render a.wav a.mp4", "phones a.wav", "align a.wav da", "lips a.wav a.svg"]
+)
+def test_progress_appears_before_slow_modules_are_imported(command: str) -> None:
+    started = start_python("-c", LOADING, *command.split())
+    assert started.communicate(timeout=LIMIT_S)[1] == "loading []\n"
+
+
 def test_standard_output_may_be_closed() -> None:
     command = shlex.join((sys.executable, "-m", "kouxing", "phones", str(VOWELS_FILE)))
     done = subprocess.run(
