@@ -50,7 +50,7 @@ from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
-FORMAT = "kouxing-lips 2"
+FORMAT = "kouxing-lips 3"
 
 _ALIGNMENT_BYTES = 8
 # the constants that kouxing-lips and ovrlipsync use, by module
@@ -64,7 +64,10 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_WIDE_APART _ROUNDED _INNER_UPPER _INNER_LOWER _LEFT_CORNER _RIGHT_CORNER _UPPER "
         "_LOWER _LOWER_OUTER _INNER _OUTER _BOTH",
     ),
-    "decoder": (decoder, "IMPOSSIBLE _BEAM _MAX_TOKENS"),
+    "decoder": (
+        decoder,
+        "IMPOSSIBLE _BEAM _MAX_TOKENS _SLOW_RATE _RATE_FRAMES _MAX_PENALTY_CHANGE",
+    ),
     "ear": (ear, "PHONES_LAG_FRAMES"),
     "expression": (
         expression_motion,
@@ -207,6 +210,7 @@ def _phones_header(topology: Topology) -> dict[str, Any]:
         },
         "lmScale": topology.lm_scale,
         "phonePenalty": topology.phone_penalty,
+        "rateWeight": topology.rate_weight,
         "rules": {
             name: {"numStableFrames": rule.num_stable_frames, "minConfidence": rule.min_confidence}
             for name, rule in rules.items()

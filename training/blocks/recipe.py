@@ -51,7 +51,7 @@ from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_examp
 # than the first ones of a long block, so R is longer than in training.
 BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
-_PHONE_PENALTY = 2.0  # most of the network's errors are deletions
+_PHONE_PENALTY, _RATE_WEIGHT = 3.2, 120.0  # chosen on speech of many rates, for `light` too
 _MIX = Mix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
 _SUNG_SHARE, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
@@ -153,7 +153,7 @@ def train_blocks(
         checkpoint=checkpoint,
     ).cpu()
     model = BlockModel(
-        topology=replace(labeled.topology, phone_penalty=_PHONE_PENALTY),
+        topology=replace(labeled.topology, phone_penalty=_PHONE_PENALTY, rate_weight=_RATE_WEIGHT),
         network=onnx_of(network.encoder, network.readout, BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST),
         log_prior=labeled.log_prior,
         acoustic_scale=_ACOUSTIC_SCALE,

@@ -6,7 +6,9 @@ const NO_TOKEN = -1;
 export class Decoder {
   #c; // constants
   #lm;
-  #hmms; // firstState, logStay, logLeave, lmScale, penalty, silence
+  #hmms; // firstState, logStay, logLeave, lmScale, penalty, rateWeight, silence
+  #rate; // rate of change of the scores
+  #roots; // square roots of the phones' probabilities at the last frame
   #maxStates;
   #context;
   #top;
@@ -32,6 +34,7 @@ export class Decoder {
     this.#tokenOf = new Int16Array(lm.phone.length).fill(NO_TOKEN);
     this.#entry = new Float32Array(maxTokens);
     this.#entryLink = new Int32Array(maxTokens);
+    this.#roots = new Float32Array(numPhones);
     this.#logProbs = new Float32Array(numPhones);
     this.#nextContexts = new Int32Array(numPhones);
     this.reset();
@@ -47,6 +50,7 @@ export class Decoder {
     this.lastShared = NO_RECORD;
     this.best = [0, 0]; // token, and state of its phone
     this.confidence = 0;
+    this.#rate = this.#c.SLOW_RATE;
   }
 
   /** Continue from the state of another search. */
@@ -54,6 +58,8 @@ export class Decoder {
     for (let token = 0; token < this.numTokens; token++) this.#tokenOf[this.#context[token]] = NO_TOKEN;
     const { numFrames, numTokens, lastShared, best, confidence } = other;
     Object.assign(this, { numFrames, numTokens, lastShared, best, confidence, records: other.records.slice(), shared: other.shared.slice() });
+    this.#rate = other.#rate;
+    this.#roots.set(other.#roots);
     const numStates = numTokens * this.#maxStates;
     this.#context.set(other.#context.subarray(0, numTokens));
     this.#top.set(other.#top.subarray(0, numTokens));
@@ -65,7 +71,7 @@ export class Decoder {
   /** Search the next frame with the scores of its states; return the confidence in the last phone. */
   advance(scores) {
     this.#prune();
-    this.#startPhones();
+    this.#startPhones(this.#phonePenalty(scores));
     this.best = this.#advanceStates(scores);
     this.confidence = this.#normalize();
     this.numFrames++;
@@ -172,12 +178,31 @@ export class Decoder {
     }
   }
 
+  /** Update the rate of change by a frame's scores; return the penalty of phones that start. */
+  #phonePenalty(scores) {
+    const { SLOW_RATE, RATE_FRAMES, MAX_PENALTY_CHANGE } = this.#c;
+    const { firstState, penalty, rateWeight } = this.#hmms;
+    const highest = scores.reduce((one, other) => Math.max(one, other));
+    const probabilities = scores.map((score) => Math.exp(score - highest));
+    const total = probabilities.reduce((one, other) => one + other);
+    let overlap = 0;
+    for (let phone = 0; phone < this.#roots.length; phone++) {
+      const states = probabilities.subarray(firstState[phone], firstState[phone + 1]);
+      const root = Math.sqrt(states.reduce((one, other) => one + other) / total);
+      overlap += root * this.#roots[phone];
+      this.#roots[phone] = root;
+    }
+    if (this.numFrames) this.#rate += (1 - overlap - this.#rate) / RATE_FRAMES;
+    const change = rateWeight * (this.#rate - SLOW_RATE);
+    return Math.fround(penalty + Math.min(Math.max(change, -MAX_PENALTY_CHANGE), MAX_PENALTY_CHANGE));
+  }
+
   /** Record the phones that may end before the frame, and start the phones that may follow. */
-  #startPhones() {
+  #startPhones(penalty) {
     const { BEAM, IMPOSSIBLE } = this.#c;
     this.#entry.fill(IMPOSSIBLE);
     if (this.numFrames === 0) {
-      this.#continueFrom(this.#hmms.silence + 1, 0, NO_RECORD); // speech starts after a pause
+      this.#continueFrom(this.#hmms.silence + 1, 0, NO_RECORD, penalty); // speech starts after a pause
       return;
     }
     const numTokens = this.numTokens;
@@ -187,14 +212,14 @@ export class Decoder {
       const leaving = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
       if (leaving < -BEAM) continue;
       this.records.push({ end: this.numFrames, phone, before: this.#linkAt(token, last) });
-      this.#continueFrom(this.#context[token], leaving, this.records.length - 1);
+      this.#continueFrom(this.#context[token], leaving, this.records.length - 1, penalty);
     }
   }
 
   /** Enter all phones that may follow a context. */
-  #continueFrom(context, leaving, record) {
+  #continueFrom(context, leaving, record, penalty) {
     const { BEAM, IMPOSSIBLE, MAX_TOKENS } = this.#c;
-    const { lmScale, penalty, silence } = this.#hmms;
+    const { lmScale, silence } = this.#hmms;
     this.#lm.lookUp(context, this.#logProbs, this.#nextContexts);
     if (this.numFrames === 0) this.#logProbs[silence] = 0;
     for (let phone = 0; phone < this.#logProbs.length; phone++) {

@@ -4,7 +4,7 @@ import { halfToFloat } from "./math.js";
 import { Network } from "./network.js";
 import { PhoneLm } from "./phone-lm.js";
 
-const FORMAT = "kouxing-lips 2";
+const FORMAT = "kouxing-lips 3";
 const FINAL = "final"; // value of the option phones
 const FILES = ["ear.onnx", "model.bin", "model.json"];
 const PHONES_FILE = "phones.bin";

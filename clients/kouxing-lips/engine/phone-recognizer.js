@@ -43,6 +43,7 @@ export class PhoneRecognizer {
       logLeave: values("log_leave"),
       lmScale: Math.fround(phones.lmScale),
       penalty: Math.fround(phones.phonePenalty),
+      rateWeight: phones.rateWeight,
     };
     this.#settled = new Decoder(phoneLm, hmms, model);
     this.#ahead = new Decoder(phoneLm, hmms, model);
