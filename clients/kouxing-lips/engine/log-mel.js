@@ -8,10 +8,12 @@ export class LogMel {
   #floor;
   #bands; // weights of the bins from the first edge of each band
   #edges;
-  #cosines; // (half / 2 + 1, half): of 2 pi k n / size
-  #sines;
-  #even; // sums of samples n and size - n, whose cosines are equal
-  #odd; // differences, for the sines
+  #root; // the size is its square
+  #columns; // { cosines, sines } of 2 pi k n / root, (root, root)
+  #rotations; // { cosines, sines } of 2 pi k n / size, (root, root)
+  #windowed; // samples, (root, root)
+  #real; // transforms of the columns, (root / 2 + 1, root)
+  #imaginary;
   #power; // the spectrum
   #samples = new Float32Array(0);
 
@@ -25,13 +27,15 @@ export class LogMel {
     this.#bands = mel.EDGES.map(([first, end], band) =>
       Float64Array.from({ length: end - first }, (_, i) => values[(first + i) * shape[1] + band]),
     );
-    const half = this.#size / 2;
-    const table = (wave) =>
-      Float64Array.from({ length: (half / 2 + 1) * half }, (_, i) =>
-        wave((2 * Math.PI * ((Math.floor(i / half) * (i % half)) % this.#size)) / this.#size),
-      );
-    [this.#cosines, this.#sines] = [table(Math.cos), table(Math.sin)];
-    [this.#even, this.#odd, this.#power] = [half, half, half + 1].map((size) => new Float64Array(size));
+    const root = Math.sqrt(this.#size);
+    const wave = (compute, size) =>
+      Float64Array.from({ length: root * root }, (_, i) => compute((2 * Math.PI * Math.floor(i / root) * (i % root)) / size));
+    const waves = (size) => ({ cosines: wave(Math.cos, size), sines: wave(Math.sin, size) });
+    this.#root = root;
+    [this.#columns, this.#rotations] = [waves(root), waves(this.#size)];
+    [this.#real, this.#imaginary] = [0, 0].map(() => new Float64Array((root / 2 + 1) * root));
+    this.#windowed = new Float64Array(this.#size);
+    this.#power = new Float64Array(this.#size / 2 + 1);
   }
 
   /** Take samples at 16 kHz, in [-1, 1]; return the new feature frames. */
@@ -59,33 +63,48 @@ export class LogMel {
     return bands;
   }
 
-  /** Return the power spectrum, a discrete Fourier transform that uses three symmetries. */
+  /**
+   * Return the power spectrum. The samples are the rows of a square, whose columns and then rows are
+   * transformed (Cooley & Tukey 1965). The columns are real, so half of their transform is enough.
+   */
   #powers(samples) {
-    const half = this.#size / 2;
-    const [even, odd, powers, cosines, sines] = [this.#even, this.#odd, this.#power, this.#cosines, this.#sines];
-    const at = (n) => this.#window[n] * samples[n];
-    even[0] = at(0);
-    const middle = at(half);
-    for (let n = 1; n < half; n++) {
-      const one = at(n);
-      const other = at(this.#size - n);
-      even[n] = one + other;
-      odd[n] = one - other;
-    }
-    for (let k = 0; k <= half / 2; k++) {
-      // terms with even and odd n; bin half - k has the same with other signs
-      let realEven = k % 2 ? -middle : middle;
-      let [realOdd, imaginaryEven, imaginaryOdd] = [0, 0, 0];
-      const row = k * half;
-      for (let n = 0; n < half; n += 2) {
-        realEven += even[n] * cosines[row + n];
-        realOdd += even[n + 1] * cosines[row + n + 1];
-        imaginaryEven += odd[n] * sines[row + n];
-        imaginaryOdd += odd[n + 1] * sines[row + n + 1];
+    const [root, windowed, real, imaginary] = [this.#root, this.#windowed, this.#real, this.#imaginary];
+    const { cosines, sines } = this.#columns;
+    const { cosines: rotationCosines, sines: rotationSines } = this.#rotations;
+    const half = root / 2;
+    for (let i = 0; i < windowed.length; i++) windowed[i] = this.#window[i] * samples[i];
+    for (let column = 0; column < root; column++) {
+      for (let k = 0; k <= half; k++) {
+        let [re, im] = [0, 0];
+        for (let n = 0, at = column, wave = k * root; n < root; n++, at += root, wave++) {
+          re += windowed[at] * cosines[wave];
+          im -= windowed[at] * sines[wave];
+        }
+        const place = k * root + column;
+        real[place] = re * rotationCosines[place] + im * rotationSines[place];
+        imaginary[place] = im * rotationCosines[place] - re * rotationSines[place];
       }
-      powers[k] = (realEven + realOdd) ** 2 + (imaginaryEven + imaginaryOdd) ** 2;
-      powers[half - k] = (realEven - realOdd) ** 2 + (imaginaryOdd - imaginaryEven) ** 2;
     }
-    return powers;
+    for (let k = 0; k <= half; k++) {
+      for (let row = 0; row < half; row++) {
+        // even and odd terms; the bin half of the rows later has the odd ones with the other sign
+        let [evenReal, evenImaginary, oddReal, oddImaginary] = [0, 0, 0, 0];
+        for (let n = 0, at = k * root, wave = row * root; n < half; n++, at += 2, wave += 2) {
+          evenReal += real[at] * cosines[wave] + imaginary[at] * sines[wave];
+          evenImaginary += imaginary[at] * cosines[wave] - real[at] * sines[wave];
+          oddReal += real[at + 1] * cosines[wave + 1] + imaginary[at + 1] * sines[wave + 1];
+          oddImaginary += imaginary[at + 1] * cosines[wave + 1] - real[at + 1] * sines[wave + 1];
+        }
+        const bin = k + root * row;
+        this.#setPower(bin, (evenReal + oddReal) ** 2 + (evenImaginary + oddImaginary) ** 2);
+        this.#setPower(bin + this.#size / 2, (evenReal - oddReal) ** 2 + (evenImaginary - oddImaginary) ** 2);
+      }
+    }
+    return this.#power;
+  }
+
+  /** Set the power of a bin; the upper half of the spectrum mirrors the lower half. */
+  #setPower(bin, power) {
+    this.#power[Math.min(bin, this.#size - bin)] = power;
   }
 }
