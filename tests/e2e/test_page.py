@@ -512,6 +512,17 @@ def test_a_file_without_sound_is_explained_in_both_languages(
         assert page.evaluate(f"{notice}.scrollWidth <= {notice}.clientWidth")  # long names wrap
 
 
+def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: Path) -> None:
+    write_tone(tmp_path / "tone.wav")
+    page.evaluate("window.realFetch = fetch; void (window.fetch = () => new Promise(() => {}))")
+    choose_file(page, tmp_path / "tone.wav")
+    busy = "[...document.querySelectorAll('[aria-busy=true]')].map(({ id }) => id).join()"
+    page.wait_for(f"{busy} === 'open-file'")
+    page.click("open-file")
+    page.wait_for(f"{busy} === ''")
+    page.evaluate("void (window.fetch = window.realFetch)")
+
+
 def test_a_dropped_file_is_streamed(
     control: PageControl, session: Session, page: Browser, tmp_path: Path
 ) -> None:

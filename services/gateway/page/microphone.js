@@ -34,9 +34,9 @@ export class Microphone {
     return this.#run !== null;
   }
 
-  /** Whether it streams a file. */
+  /** Whether it streams or opens a file. */
   get isFile() {
-    return this.#fileSpeech !== null;
+    return this.#run?.isFile ?? false;
   }
 
   /** Return how long ago a media time of its session was spoken, ms; null if it does not stream. */
@@ -70,13 +70,13 @@ export class Microphone {
       source.stream = source.fileSpeech.stream;
       const { remarks } = source.fileSpeech;
       if (remarks !== "") this.#handlers.error({ code: "file", text: remarks });
-    });
+    }, true);
   }
 
   /** Open a source with open(source) and stream it, unless it is stopped in the meantime. */
-  async #startFrom(open) {
+  async #startFrom(open, isFile = false) {
     this.stop();
-    const run = {};
+    const run = { isFile };
     this.#run = run;
     this.#handlers.state("starting");
     const source = { stream: null, context: null, fileSpeech: null };

@@ -96,9 +96,11 @@ export class SpeechControls {
     this.state = state;
     const isOn = state === "on" || state === "interrupted";
     const isBusy = state === "starting" || state === "interrupted";
-    element("microphone").setAttribute("aria-pressed", isOn && !this.microphone.isFile);
-    element("open-file").setAttribute("aria-pressed", isOn && this.microphone.isFile);
-    element("microphone").setAttribute("aria-busy", isBusy);
+    for (const id of ["microphone", "open-file"]) {
+      const isSource = this.microphone.isFile === (id === "open-file");
+      element(id).setAttribute("aria-pressed", isOn && isSource);
+      element(id).setAttribute("aria-busy", isBusy && isSource);
+    }
     if (state === "off" && this.session !== null) {
       this.session = null;
       this.#handlers.session(null);
