@@ -88,17 +88,17 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
         tracked.append(None if landmarks is None else landmarks[list(LANDMARKS)])
 
     samples = read_video(video, track_image, audio_track)
-    seen = np.array([landmarks is not None for landmarks in tracked])
-    if seen.sum() < MIN_FRAMES:
+    has_face = np.array([landmarks is not None for landmarks in tracked])
+    if has_face.sum() < MIN_FRAMES:
         raise UserError(
-            f"{video}: a face was found in only {plural(seen.sum(), 'image')}; film the face "
+            f"{video}: a face was found in only {plural(has_face.sum(), 'image')}; film the face "
             "from the front in good light, for 20 s or more"
         )
     time_s = np.array(times)
-    faps = np.full((len(seen), len(MOUTH_FAPS)), np.nan)
+    faps = np.full((len(has_face), len(MOUTH_FAPS)), np.nan)
     levels = np.array(level_track(samples))
     landmarks = np.stack([one for one in tracked if one is not None])
-    faps[seen] = mouth_faps(landmarks, np.interp(time_s[seen], levels[:, 0], levels[:, 1]))
+    faps[has_face] = mouth_faps(landmarks, np.interp(time_s[has_face], levels[:, 0], levels[:, 1]))
     soundfile.write(clip.with_suffix(".flac"), samples, SAMPLE_RATE_HZ)
     _write_tracks(clip.with_suffix(".csv"), time_s, faps)
     about = {
@@ -108,11 +108,11 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
         "speaker": clip.stem,
         "language": "",
         "transcript": "",
-        "frames": len(seen),
-        "frames_ok": int(seen.sum()),
+        "frames": len(has_face),
+        "frames_ok": int(has_face.sum()),
     }
     clip.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    return int(seen.sum()), len(seen)
+    return int(has_face.sum()), len(has_face)
 
 
 def _write_tracks(path: Path, time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> None:

@@ -181,7 +181,7 @@ def _animate(
 def _correlations(
     sessions: Sequence[_Session], labels: Sequence[NDArray[np.float64]], rate_hz: float
 ) -> dict[str, float]:
-    found: dict[str, list[float]] = {}
+    correlations: dict[str, list[float]] = {}
     for session, label in zip(sessions, labels, strict=True):
         parts = [
             session.faps[round(start * rate_hz) : round(end * rate_hz)]
@@ -199,8 +199,8 @@ def _correlations(
             ("height of the brows, with arousal", brows, 0),
         ):
             statistic = spearmanr(values, label[:, column]).statistic
-            found.setdefault(name, []).append(float(statistic))
-    return {name: float(np.nanmean(values)) for name, values in found.items()}
+            correlations.setdefault(name, []).append(float(statistic))
+    return {name: float(np.nanmean(values)) for name, values in correlations.items()}
 
 
 def _peaks(session: _Session, fap: int, prominence: float, rate_hz: float) -> Times:

@@ -49,8 +49,8 @@ def is_local(host: str) -> bool:
     if host in WILDCARDS:
         return True
     try:
-        found = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_DGRAM)
-        for family, kind, _, _, address in found:
+        addresses = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_DGRAM)
+        for family, kind, _, _, address in addresses:
             with socket.socket(family, kind) as probe:
                 probe.bind(address)
     except (socket.gaierror, UnicodeError):  # UnicodeError: a label of the name is too long

@@ -332,8 +332,8 @@ def _parse_grants(path: Path) -> dict[str, Grant]:
         return {}
     grants = {}
     for line in _read(path).splitlines():
-        public, *named = line.split() or [""]
-        name, *roles = named or [""]
+        public, *name_and_roles = line.split() or [""]
+        name, *roles = name_and_roles or [""]
         is_whole = _PUBLIC.fullmatch(public) and is_name(name)
         if not (is_whole and all(map(_ROLE.fullmatch, roles))):
             raise UserError(

@@ -56,25 +56,27 @@ class ShippedMouth:
 
 
 def read_tables(
-    folder: Path, held: Sequence[LipClip], training: Sequence[LipClip]
+    folder: Path, held_out: Sequence[LipClip], training: Sequence[LipClip]
 ) -> dict[str, CurveTable]:
     """Read ``CLIP.csv`` of all held-out clips, and of those training clips that have one.
 
     Raises UserError if a held-out clip has no table, a table cannot be read, or its columns differ
     from those of the first one.
     """
-    paths = {clip.name: folder / f"{clip.name}.csv" for clip in (*held, *training)}
-    missing = [paths[clip.name] for clip in held if not paths[clip.name].is_file()]
+    paths = {clip.name: folder / f"{clip.name}.csv" for clip in (*held_out, *training)}
+    missing = [paths[clip.name] for clip in held_out if not paths[clip.name].is_file()]
     if missing:
         raise UserError(
-            f"{folder}: {len(missing)} of {len(held)} held-out clips have no table; add"
+            f"{folder}: {len(missing)} of {len(held_out)} held-out clips have no table; add"
             f" {missing[0].name}"
         )
     tables = {name: read_table(path) for name, path in paths.items() if path.is_file()}
-    names = tables[held[0].name].names
+    names = tables[held_out[0].name].names
     for name, table in tables.items():
         if table.names != names:
-            raise UserError(f"{paths[name]}: its columns differ from those of {held[0].name}.csv")
+            raise UserError(
+                f"{paths[name]}: its columns differ from those of {held_out[0].name}.csv"
+            )
     return tables
 
 

@@ -107,8 +107,8 @@ def _best_constant(
         shift = np.zeros(NUM_FAPS)
         shift[_LOWER_LIP] = -constant
         pairs = zip(predicted, reals, strict=True)
-        found = (closures(predicted_mouth(faps + shift), real) for faps, real in pairs)
-        return sum(found, Detections()).f1 or 0.0
+        detections = (closures(predicted_mouth(faps + shift), real) for faps, real in pairs)
+        return sum(detections, Detections()).f1 or 0.0
 
     openings = np.concatenate([CURVES["opening"](faps) for faps in predicted])
     return max((float(c) for c in -np.percentile(openings, _SHUT_SHARES)), key=f1)

@@ -28,7 +28,7 @@ _TAIL_S = 0.5  # frames after the end of a clip's audio
 
 
 def load_programs(
-    folders: Sequence[Path], held: Sequence[LipClip], training: Sequence[LipClip]
+    folders: Sequence[Path], held_out: Sequence[LipClip], training: Sequence[LipClip]
 ) -> dict[str, MouthOf]:
     """Load the mouths of other programs from folders of tables; return them by title.
 
@@ -36,7 +36,7 @@ def load_programs(
     """
     mouths: dict[str, MouthOf] = {}
     for folder in folders:
-        tables = read_tables(folder, held, training)
+        tables = read_tables(folder, held_out, training)
         fitting = [clip for clip in training if clip.name in tables and clip.is_in_sync]
         mouths |= _mouths_of(folder, tables, fitting)
     return mouths

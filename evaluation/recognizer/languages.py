@@ -96,16 +96,16 @@ def _recognitions(
     samples, universal = reference.read_audio(), model_of_language(UNIVERSAL)
     scored = score_live(universal, samples)
     yield AUTO, recognize_live(universal, scored, rule)
-    own = model_of_language(find_language(_code_of(reference)))
-    if own.inventory.language == UNIVERSAL:
-        yield OWN, recognize_live(own, scored, rule)
+    own_model = model_of_language(find_language(_code_of(reference)))
+    if own_model.inventory.language == UNIVERSAL:
+        yield OWN, recognize_live(own_model, scored, rule)
         return
-    found = recognize_live(own, score_live(own, samples), rule)
-    in_universal = own.inventory.universal
-    first = [[replace(p, symbol=s) for s in in_universal[p.symbol]] for p in found.first]
-    final = [[replace(p, symbol=s) for s in in_universal[p.symbol]] for p in found.final]
+    recognition = recognize_live(own_model, score_live(own_model, samples), rule)
+    in_universal = own_model.inventory.universal
+    first = [[replace(p, symbol=s) for s in in_universal[p.symbol]] for p in recognition.first]
+    final = [[replace(p, symbol=s) for s in in_universal[p.symbol]] for p in recognition.final]
     emitted_s = [
-        time_s for time_s, phones in zip(found.emitted_s, first, strict=True) for _ in phones
+        time_s for time_s, phones in zip(recognition.emitted_s, first, strict=True) for _ in phones
     ]
     yield OWN, Recognition([*chain(*first)], emitted_s, [*chain(*final)])
 

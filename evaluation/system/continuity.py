@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.scoring import count_errors
-from kouxing.evaluation.system.live import Seen
+from kouxing.evaluation.system.live import ReceivedResults
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.faps import FAPS
 
@@ -35,24 +35,28 @@ class Continuity:
     late_p95_ms: float
 
 
-def compare(seen: Seen, undisturbed: Seen, delay_s: float, *, fault_s: float) -> Continuity:
+def compare(
+    received: ReceivedResults, undisturbed: ReceivedResults, delay_s: float, *, fault_s: float
+) -> Continuity:
     """Compare results with a fault at ``fault_s`` with those without; ``delay_s`` is the face's."""
-    arrived_s = np.array([arrival_s for arrival_s, _ in seen.frames])
-    times = np.array([frame.media_time for _, frame in seen.frames], np.int64)
+    arrived_s = np.array([arrival_s for arrival_s, _ in received.frames])
+    times = np.array([frame.media_time for _, frame in received.frames], np.int64)
     newest = np.maximum.accumulate(np.concatenate([[-1], times]))[:-1]  # before each frame
     is_new = times > newest
     is_rest = np.diff(times, prepend=-1) == 0
     reference, recognized = (
-        [phone.symbol for phone in record.spoken_phones()] for record in (undisturbed, seen)
+        [phone.symbol for phone in record.spoken_phones()] for record in (undisturbed, received)
     )
     errors = count_errors(reference, recognized)
-    due_s = seen.start_s + delay_s + times / MEDIA_RATE_HZ
-    is_live = is_new & (arrived_s < seen.live_until_s)
+    due_s = received.start_s + delay_s + times / MEDIA_RATE_HZ
+    is_live = is_new & (arrived_s < received.live_until_s)
     late_s = (arrived_s - due_s)[is_live]
-    steps = largest_steps(seen.faps)
+    steps = largest_steps(received.faps)
     ratios = steps / np.maximum(largest_steps(undisturbed.faps), MIN_STEP)
     return Continuity(
-        stood_s=float(np.diff([seen.start_s, *arrived_s[is_live], seen.live_until_s]).max()),
+        stood_s=float(
+            np.diff([received.start_s, *arrived_s[is_live], received.live_until_s]).max()
+        ),
         late_s=_late_until_s(due_s[is_live], late_s, fault_s) - fault_s,
         phones=errors.reference,
         phones_lost=errors.deletions,
@@ -60,7 +64,7 @@ def compare(seen: Seen, undisturbed: Seen, delay_s: float, *, fault_s: float) ->
         phones_changed=errors.substitutions,
         frames_lost=len({frame.media_time for _, frame in undisturbed.frames} - {*times.tolist()}),
         frames_doubled=int((~is_new & ~is_rest).sum()),
-        rest_frames=int((is_rest & (arrived_s < seen.live_until_s)).sum()),
+        rest_frames=int((is_rest & (arrived_s < received.live_until_s)).sum()),
         largest_step=float(ratios.max()),
         largest_step_fap=FAPS[int(ratios.argmax())].name,
         late_p50_ms=float(np.percentile(late_s, 50)) * 1e3,

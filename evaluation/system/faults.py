@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.continuity import Continuity, compare, worst
-from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
+from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link, Network
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -203,7 +203,7 @@ def measure(
     if unknown:
         raise UserError(f"no fault is named {unknown[0]!r}; choose from {', '.join(FAULTS)}")
     sentence = to_16_khz(*read_audio(path))
-    undisturbed: list[Seen] = []  # once it was measured
+    undisturbed: list[ReceivedResults] = []  # once it was measured
     for name in names or FAULTS:
         also_at_s = timing.also_at_s if FAULTS[name].is_sudden else ()
         outcomes = []
@@ -285,7 +285,7 @@ def _outcome(
     name: str,
     folder: Path,
     sentence: NDArray[np.float32],
-    undisturbed: list[Seen],
+    undisturbed: list[ReceivedResults],
     timing: Timing,
     console: Console,
 ) -> Outcome:
@@ -307,15 +307,19 @@ def _outcome(
             while actions and time.monotonic() > start_s + actions[0][0]:
                 actions.pop(0)[1]()
 
-        all_seen = speak(sessions, sound, on_step=on_step)
+        all_received = speak(sessions, sound, on_step=on_step)
         load = os.getloadavg()[0]
         for session in sessions:
             with contextlib.suppress(KouxingError):  # already closed
                 session.close()
-    failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
+    failures = [
+        received.error or "no last frame" for received in all_received if not received.ended
+    ]
     fault_s = start_s + timing.fault_at_s
     faces = [
-        compare(seen, undisturbed[0], delay_s, fault_s=fault_s) for seen in all_seen if seen.frames
+        compare(received, undisturbed[0], delay_s, fault_s=fault_s)
+        for received in all_received
+        if received.frames
     ]
     return Outcome(
         fault=name,

@@ -91,20 +91,20 @@ def stream(
     Frames after the last sample are omitted. Raises UserError if the session does not complete.
     """
     session = client.open_session(encoding="f32le", language=language)
-    (seen,) = speak([session], sound)
+    (received,) = speak([session], sound)
     session.close()
-    if seen.error or not seen.ended:
-        reason = seen.error or "the last frame did not arrive"
+    if received.error or not received.ended:
+        reason = received.error or "the last frame did not arrive"
         raise UserError(f"{reason}; close other programs and try again")
     times, to_frame, from_sound = [], [], []
-    for arrival_s, frame in seen.frames:
+    for arrival_s, frame in received.frames:
         media_s = to_seconds(frame.media_time)
         last_needed = math.ceil((media_s + delay_s) / CHUNK_S - 1e-6) - 1
         last_shown = max(0, round(media_s / CHUNK_S) - 1)
-        if arrival_s < seen.live_until_s and last_needed < len(seen.sent_s):
+        if arrival_s < received.live_until_s and last_needed < len(received.sent_s):
             times.append(media_s)
-            to_frame.append(arrival_s - seen.sent_s[max(0, last_needed)])
-            from_sound.append(arrival_s - seen.sent_s[last_shown])
+            to_frame.append(arrival_s - received.sent_s[max(0, last_needed)])
+            from_sound.append(arrival_s - received.sent_s[last_shown])
     return np.array(times), np.array(to_frame), np.array(from_sound)
 
 

@@ -19,7 +19,7 @@ NUM_TRIES = 3
 
 
 @dataclass(slots=True)
-class Seen:
+class ReceivedResults:
     """Results of a session in the order in which a subscriber received them."""
 
     frames: list[tuple[float, FapFrame]] = field(default_factory=list)  # arrival, s
@@ -59,7 +59,7 @@ def speak(
     *,
     paced: bool = True,
     on_step: Callable[[], None] = lambda: None,
-) -> list[Seen]:
+) -> list[ReceivedResults]:
     """Stream the same audio into sessions and return what each of them received.
 
     The sessions take 32-bit floats at 16 kHz, in real time if ``paced``, otherwise as fast as they
@@ -70,20 +70,20 @@ def speak(
         for speaker in speakers:
             speaker.step(0.005 if speaker is speakers[0] else 0.0)
         on_step()
-    return [speaker.seen for speaker in speakers]
+    return [speaker.received for speaker in speakers]
 
 
-def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
+def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> ReceivedResults:
     """Return what a session receives for audio without any fault; it is not paced.
 
     Raises UserError if results are missing every time, as on a machine that is too busy.
     """
     for _ in range(NUM_TRIES):
         session = client.open_session(encoding="f32le", paced=False)
-        (seen,) = speak([session], sound, paced=False)
+        (received,) = speak([session], sound, paced=False)
         session.close()
-        if seen.is_whole:
-            return seen
+        if received.is_whole:
+            return received
     raise UserError("frames are missing without any fault; close other programs and try again")
 
 
@@ -98,19 +98,19 @@ class _Speaker:
         start_s = time.monotonic()
         length_s = len(sound) / MEDIA_RATE_HZ
         self._deadline_s = start_s + length_s * (1.0 if paced else MAX_UNPACED_FACTOR) + END_LIMIT_S
-        self.seen = Seen(start_s=start_s, live_until_s=start_s + length_s)
+        self.received = ReceivedResults(start_s=start_s, live_until_s=start_s + length_s)
 
     @property
     def is_speaking(self) -> bool:
         is_late = time.monotonic() > self._deadline_s
-        return not (self.seen.ended or self.seen.error or is_late)
+        return not (self.received.ended or self.received.error or is_late)
 
     def step(self, wait_s: float) -> None:
         """Send due audio and receive results."""
         try:
             for error in self._session.take_errors():
-                self.seen.error = str(error)
-            sent_s = self.seen.sent_s
+                self.received.error = str(error)
+            sent_s = self.received.sent_s
             while len(sent_s) < self._num_due():
                 if not self._session.try_push(self._chunks[len(sent_s)]):
                     break
@@ -121,15 +121,15 @@ class _Speaker:
             for result in self._output.available(wait_s):
                 match result:
                     case FapFrame():
-                        self.seen.frames.append((time.monotonic(), result))
+                        self.received.frames.append((time.monotonic(), result))
                     case Phone():
-                        self.seen.phones.append(result)
+                        self.received.phones.append(result)
         except KouxingError as error:
-            self.seen.error = str(error)
-        self.seen.ended = self._output.has_ended
+            self.received.error = str(error)
+        self.received.ended = self._output.has_ended
 
     def _num_due(self) -> int:
         if not self._paced:
             return len(self._chunks)
-        due = int((time.monotonic() - self.seen.start_s) * MEDIA_RATE_HZ) // CHUNK
+        due = int((time.monotonic() - self.received.start_s) * MEDIA_RATE_HZ) // CHUNK
         return min(due, len(self._chunks))

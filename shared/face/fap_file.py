@@ -148,8 +148,8 @@ def _lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
 
 def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
     if not words or words[0] != _VERSION:
-        found = f"version '{words[0]}'" if words else "nothing"
-        raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES', found {found}")
+        actual = f"version '{words[0]}'" if words else "nothing"
+        raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES', found {actual}")
     if len(words) < 4:
         raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES'")
     try:

@@ -60,10 +60,10 @@ def choose_set(names: Iterable[str]) -> ShapeSetName:
     names = list(names)
     missing, share = {}, {}
     for set_name, needed in _NEEDED.items():
-        found = set(find_shapes(set_name, names).values())
-        missing[set_name] = [shape for shape in needed if shape not in found]
+        known = set(find_shapes(set_name, names).values())
+        missing[set_name] = [shape for shape in needed if shape not in known]
         # between equals, the number of known shapes decides
-        share[set_name] = len(missing[set_name]) / len(needed) - len(found) / 1000
+        share[set_name] = len(missing[set_name]) / len(needed) - len(known) / 1000
     speaking = [name for name in missing if _NEEDED[name][0] not in missing[name]]
     if speaking:
         complete = [name for name in speaking if not missing[name]]

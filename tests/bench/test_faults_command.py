@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.system.faults import Timing
-from tests.system import DEMO, NOTHING_SKIPPED
+from tests.system import NOTHING_SKIPPED
 
 
 def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,10 +21,9 @@ def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for name, value in NOTHING_SKIPPED.items():
         monkeypatch.setenv(name, value)
     fault, figures, logs = f"{service} killed", tmp_path / "faults.json", tmp_path / "logs"
-    arguments = [str(DEMO / "hello-female.wav"), "--fault", fault]
     result = CliRunner().invoke(
         app,
-        ["faults", *arguments, "--logs", str(logs), "--json", str(figures)],
+        ["faults", "--fault", fault, "--logs", str(logs), "--json", str(figures)],
         env={"COLUMNS": "200"},
     )
     assert result.exit_code == 0, result.output

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from kouxing_client import Client
 
-from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
+from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.keys import CLIENT
@@ -52,7 +52,7 @@ def client(system: HostsSystem) -> Iterator[Client]:
 
 
 @pytest.fixture(scope="module")
-def expected(client: Client) -> Seen:
+def expected(client: Client) -> ReceivedResults:
     return speak_undisturbed(client, SAMPLES)
 
 
@@ -61,7 +61,9 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
 
 
-def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 120.0) -> Seen:
+def live(
+    client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 120.0
+) -> ReceivedResults:
     """Stream in real time, and cut off a host: that of a service, or the client's."""
     session = client.open_session(encoding="f32le")
     begin_s = time.monotonic()
@@ -76,46 +78,46 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
         if host and steps and time.monotonic() > begin_s + steps[0][0]:
             steps.pop(0)[1]()
 
-    (seen,) = speak([session], SAMPLES, on_step=on_step)
+    (received,) = speak([session], SAMPLES, on_step=on_step)
     session.close()
-    assert seen.ended, seen.error
-    return seen
+    assert received.ended, received.error
+    return received
 
 
-def symbols(seen: Seen, since: int = 0) -> list[str]:
-    return [item.symbol for item in seen.spoken_phones() if item.media_time >= since]
+def symbols(received: ReceivedResults, since: int = 0) -> list[str]:
+    return [item.symbol for item in received.spoken_phones() if item.media_time >= since]
 
 
-def assert_same(seen: Seen, expected: Seen, since: int = 0) -> None:
+def assert_same(received: ReceivedResults, expected: ReceivedResults, since: int = 0) -> None:
     """Compare phones and frames from some media time on."""
-    assert symbols(seen, since) == symbols(expected, since)
-    assert len(symbols(seen, since)) > 10
-    times = [{frame.media_time for _, frame in one.frames} for one in (seen, expected)]
+    assert symbols(received, since) == symbols(expected, since)
+    assert len(symbols(received, since)) > 10
+    times = [{frame.media_time for _, frame in one.frames} for one in (received, expected)]
     assert {time for time in times[1] if time >= since} <= times[0]
 
 
 def test_shows_the_same_over_a_bad_network(
-    system: HostsSystem, client: Client, expected: Seen
+    system: HostsSystem, client: Client, expected: ReceivedResults
 ) -> None:
     assert_same(live(client, system), expected)
 
 
 def test_a_client_that_was_cut_off_catches_up(
-    system: HostsSystem, client: Client, expected: Seen
+    system: HostsSystem, client: Client, expected: ReceivedResults
 ) -> None:
     """Frames from before the cut may be lost, but none of the client's audio is."""
-    seen = live(client, system, CLIENT, cut_s=2.0)
-    assert_same(seen, expected, since=round(CUT_AT_S * 16000))
-    assert {frame.epoch for _, frame in seen.frames} == {1}
+    received = live(client, system, CLIENT, cut_s=2.0)
+    assert_same(received, expected, since=round(CUT_AT_S * 16000))
+    assert {frame.epoch for _, frame in received.frames} == {1}
 
 
 def test_a_session_continues_when_a_host_falls_silent(
-    system: HostsSystem, client: Client, expected: Seen
+    system: HostsSystem, client: Client, expected: ReceivedResults
 ) -> None:
     """No service is notified that the connections are gone."""
-    seen = live(client, system, "recognizer")
-    epoch = max(frame.epoch for _, frame in seen.frames)
+    received = live(client, system, "recognizer")
+    epoch = max(frame.epoch for _, frame in received.frames)
     assert epoch > 1
-    alike = difflib.SequenceMatcher(None, symbols(seen), symbols(expected)).ratio()
+    alike = difflib.SequenceMatcher(None, symbols(received), symbols(expected)).ratio()
     # On a busy machine, the session may move again, to a worker with only the last seconds.
     assert alike == 1.0 or (epoch > 2 and alike > 0.7)

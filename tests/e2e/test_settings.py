@@ -12,7 +12,7 @@ from aiortc import RTCConfiguration, RTCPeerConnection
 from kouxing_client import Client, KouxingError, Refused
 from numpy.typing import NDArray
 
-from kouxing.evaluation.system.live import Seen, speak
+from kouxing.evaluation.system.live import ReceivedResults, speak
 from kouxing.services.control.load import MIN_SESSIONS, RETRY_AFTER_S
 from kouxing.services.kinds import KINDS
 from kouxing.services.live_chain import LiveChain
@@ -81,7 +81,7 @@ def test_refuses_one_session_too_many_and_the_others_continue(
         sessions = [client.open_session(encoding="f32le") for _ in range(MIN_SESSIONS)]
         with pytest.raises(Refused, match="every recognizer is busy") as caught:
             client.open_session(encoding="f32le")
-        all_seen = speak(sessions, samples)
+        all_received = speak(sessions, samples)
         message, answer = asyncio.run(_refused(system.page))
         for session in sessions:
             session.close()
@@ -89,11 +89,11 @@ def test_refuses_one_session_too_many_and_the_others_continue(
     assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
     assert (message["code"], message["retry_after_s"]) == ("busy", RETRY_AFTER_S)
     assert (answer.status, answer.headers["Retry-After"]) == (503, f"{RETRY_AFTER_S:.0f}")
-    expected = Seen(phones=alone.phones).spoken_phones()
-    for seen in all_seen:
-        assert (seen.ended, seen.error) == (True, "")
-        assert {*alone.times} <= {frame.media_time for _, frame in seen.frames}
-        phones = seen.spoken_phones()
+    expected = ReceivedResults(phones=alone.phones).spoken_phones()
+    for received in all_received:
+        assert (received.ended, received.error) == (True, "")
+        assert {*alone.times} <= {frame.media_time for _, frame in received.frames}
+        phones = received.spoken_phones()
         assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
 
 

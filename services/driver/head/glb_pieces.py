@@ -103,11 +103,11 @@ def _turn_shares(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
 def find_bones(glb: Glb) -> dict[int, str]:
     """Return the bones by their nodes: those of a VRM, otherwise head, neck and jaw by name."""
     extensions = glb.json.get("extensions", {})
-    listed = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
-    named = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
-    if listed or named:
-        return {entry["node"]: entry["bone"] for entry in listed} | {
-            entry["node"]: bone for bone, entry in named.items()
+    old_bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
+    new_bones = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
+    if old_bones or new_bones:
+        return {entry["node"]: entry["bone"] for entry in old_bones} | {
+            entry["node"]: bone for bone, entry in new_bones.items()
         }
     words = [
         re.split(r"[.:|_ ]", str(node.get("name", "")).lower())[-1]
@@ -130,7 +130,7 @@ Binds = list[tuple[str, int, float]]  # name of an expression, target, weight
 
 def _expressions(glb: Glb) -> defaultdict[str, Binds]:
     """Return the name, target and weight of a VRM's expressions, by "node N" or "mesh N"."""
-    found: defaultdict[str, Binds] = defaultdict(list)
+    binds: defaultdict[str, Binds] = defaultdict(list)
     extensions = glb.json.get("extensions", {})
     groups = extensions.get("VRM", {}).get("blendShapeMaster", {}).get("blendShapeGroups", [])
     for group in groups:
@@ -138,13 +138,13 @@ def _expressions(glb: Glb) -> defaultdict[str, Binds]:
         name = group["name"] if preset == "unknown" else preset
         for bind in group.get("binds") or []:
             weight = float(bind.get("weight", 100)) / 100
-            found[f"mesh {bind['mesh']}"].append((str(name), int(bind["index"]), weight))
+            binds[f"mesh {bind['mesh']}"].append((str(name), int(bind["index"]), weight))
     kinds = extensions.get("VRMC_vrm", {}).get("expressions", {})
     for name, expression in (kinds.get("custom", {}) | kinds.get("preset", {})).items():
         for bind in expression.get("morphTargetBinds") or []:
             key = f"node {bind['node']}"
-            found[key].append((name, int(bind["index"]), float(bind.get("weight", 1))))
-    return found
+            binds[key].append((name, int(bind["index"]), float(bind.get("weight", 1))))
+    return binds
 
 
 def _piece(

@@ -216,11 +216,13 @@ class _Import:
         apart = [name for name, vertex in lips.items() if local[vertex] < 0]
         if apart:
             raise self._fail(f"{', '.join(apart)} and 8.1 are on separate meshes; join the meshes")
-        seen: dict[int, str] = {}
+        name_of_vertex: dict[int, str] = {}
         for name, vertex in lips.items():
-            if vertex in seen:
-                raise self._fail(f"{seen[vertex]} and {name} have the same vertex; separate them")
-            seen[vertex] = name
+            if vertex in name_of_vertex:
+                raise self._fail(
+                    f"{name_of_vertex[vertex]} and {name} have the same vertex; separate them"
+                )
+            name_of_vertex[vertex] = name
 
     def _part_lips(self, positions: dict[str, Float64]) -> None:
         """Move inner points of closed lips to the correct lip."""
