@@ -6,7 +6,7 @@ import sys
 
 from kouxing.shared.waker import Waker
 
-_REPORTS_ARRIVALS = sys.platform == "linux"  # elsewhere, every wait returns at once
+_REPORTS_ARRIVALS = sys.platform == "linux"  # elsewhere, every wait returns immediately
 
 
 class Arrivals:

@@ -363,7 +363,7 @@ class ConnectionLimiter:
                 connections.append(connection)
         hold = partial(self._tarpit.add, now_s=now_s)
         for connection, reason in self._quota.excess(connections):
-            # An older peer may be idle. It must reconnect at once, or its next messages are lost.
+            # An older peer may be idle. If it does not reconnect now, its next messages are lost.
             connection.disconnect(reason, end=hold if connection.num_checks < NEW_CHECKS else None)
         for connection in connections:
             connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)

@@ -1,4 +1,4 @@
-"""Holds connections open after libzmq has closed them, so that peers do not reconnect at once.
+"""Holds connections open after libzmq has closed them, so that peers do not reconnect immediately.
 
 A ZeroMQ peer reconnects 0.1 s after its connection has ended. Each handshake costs this process
 0.5 ms, so a thousand extra peers would delay the messages of all other peers.

@@ -87,7 +87,7 @@ export class Speaker {
     await this.#closed;
   }
 
-  /** Close the session at once. */
+  /** Close the session immediately. */
   close() {
     this.#socket.close();
   }

@@ -4,7 +4,7 @@ usage: assistant.py [GATEWAY]    (default: ws://127.0.0.1:8080; with a token: ws
 
 Type what the user says, one line at a time. The face of the assistant's session speaks the answer,
 on the page and in other programs. A line that is typed during an answer interrupts the answer: the
-face stops at once and continues with the new one. Replace `answer` by your language model and
+face stops immediately and continues with the new one. Replace `answer` by your language model and
 `synthesize` by your text-to-speech.
 """
 

@@ -1,4 +1,4 @@
-"""One client's audio on its way into a session, passed on at once or in real time."""
+"""One client's audio on its way into a session, passed on immediately or in real time."""
 
 import asyncio
 import contextlib

@@ -60,7 +60,7 @@ class AudioIntake:
             is_next = session.take_next(message, now_s)
         if is_next:
             self._accept(session, message, sender)
-        if message.acknowledge:  # at once if the client resends or must fill a gap
+        if message.acknowledge:  # immediately if the client resends or must fill a gap
             at_once = not is_next or session.is_finished
             session.request_acknowledgement(now_s, at_once=at_once)
 

@@ -19,7 +19,7 @@ const JUMP_MS = 300; // restart if the stream is late or early by more than this
 const LATE_MS = 100; // and late for this long; less than the delay, so that no sound is lost
 const EARLY_MS = 300; // or if the stream is early for this long
 const START_MS = 300; // in which the earliest arrival sets the offset
-const MAX_BEHIND_MS = 3000; // restart at once if media time leaps ahead by more than this
+const MAX_BEHIND_MS = 3000; // restart immediately if media time leaps ahead by more than this
 const MAX_FRAMES = 1000;
 
 /** Measures how long a condition has held. Time is injected. */
@@ -40,7 +40,7 @@ class Streak {
 /**
  * The playout clock.
  *
- * Media time m is shown and audible at m + offset on the page's clock. Sound arrives at once, its FAP
+ * Media time m is shown and audible at m + offset on the page's clock. Sound arrives immediately, its FAP
  * frame some 60 to 100 ms later, so the sound must wait. The target of the offset is the 95th
  * percentile of (frame arrival - media time), plus one FAP frame, plus the time until an image is
  * visible. A constant difference between the page's clock and the sender's cancels out. Without
@@ -48,7 +48,7 @@ class Streak {
  *
  * The drift of the network and of the clocks moves the target. The offset glides towards the target
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
- * half of it is corrected at once, every half second. So one bad second does not cause a leap. After a
+ * half of it is corrected immediately, every half second. So one bad second does not cause a leap. After a
  * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
  */
 export class Playout {

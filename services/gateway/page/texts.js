@@ -124,7 +124,7 @@ export const TEXTS = {
   settings: { en: "Settings", zh: "设置" },
   head: { en: "Head", zh: "头像" },
   drawnInSoftware: {
-    en: "No graphics card was found, so the head has fewer triangles and pixels: {size}",
+    en: "No graphics card was found, so the head is drawn with fewer triangles and pixels: {size}",
     zh: "没有显卡，画面已简化：{size} 像素",
   },
   allPictures: { en: "Restore the full frame rate", zh: "恢复全部画面" },
@@ -133,7 +133,7 @@ export const TEXTS = {
   lips: { en: "Lips", zh: "口型" },
   speechLanguage: { en: "Speech language", zh: "说话的语言" },
   speechErrors: {
-    en: "Lips follow any language. Phonetic feature errors: Mandarin 2 %, German 6 %, English 7 to 13 %, Italian 9 %, Korean 24 %. Other languages were not measured.",
+    en: "The lips follow any language. Phonetic feature errors: Mandarin 2 %, German 6 %, English 7 to 13 %, Italian 9 %, Korean 24 %. Other languages were not measured.",
     zh: "口型适用于任何语言。音素特征错误率：普通话 2%，德语 6%，英语 7% 至 13%，意大利语 9%，韩语 24%；其他语言未测。",
   },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
@@ -143,7 +143,7 @@ export const TEXTS = {
   feeling: { en: "Emotion from the voice", zh: "随声音流露的情绪" },
   expression: { en: "Expression", zh: "表情" },
   senders: { en: "Other programs", zh: "其他程序" },
-  senderAddress: { en: "Address of a program that shows the face", zh: "显示这张脸的程序的地址" },
+  senderAddress: { en: "Address of the program that shows the face", zh: "显示这张脸的程序的地址" },
   send: { en: "Send", zh: "发送" },
   stop: { en: "Stop", zh: "停止" },
   start: { en: "Start", zh: "开始" },

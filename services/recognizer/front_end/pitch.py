@@ -37,7 +37,7 @@ class PitchTracker:
         self._options.frame_shift_ms = _SLICE_MS
         self._options.delta_pitch = _PITCH_STEP
         self._options.nccf_ballast_online = True
-        self._options.simulate_first_pass_online = True  # the newest frame is ready at once
+        self._options.simulate_first_pass_online = True  # the newest frame is ready immediately
         self._options.frames_per_chunk = 1
         self._outputs = kaldi_native_fbank.ProcessPitchOptions()
         self._outputs.add_raw_log_pitch = True
