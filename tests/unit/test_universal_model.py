@@ -83,7 +83,7 @@ def test_the_first_readout_and_the_caches_do_not_change() -> None:
             np.testing.assert_array_equal(outputs[2], both_outputs[2])
             assert not np.array_equal(outputs[0], both_outputs[0])
             for scored, arrays in ((stream, outputs), (other, both_outputs)):
-                scored.append_outputs(*(array[0] for array in arrays))
+                scored.append_outputs(scored.block(), *(array[0] for array in arrays))
 
 
 def test_training_uses_the_features_of_the_network() -> None:

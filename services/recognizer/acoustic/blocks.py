@@ -108,16 +108,17 @@ class BlockModel(NetworkModel):
         streams = [cast(BlockStream, stream) for stream, _ in requests]
         for stream, (_, frames) in zip(streams, requests, strict=True):
             stream.append_frames(frames)
-        while ready := [stream for stream in streams if stream.is_due]:
-            num_kept = ready[0].block().num_kept
-            self._run([one for one in ready if one.block().num_kept == num_kept][:_MAX_BATCH])
+        while ready := [(stream, stream.block()) for stream in streams if stream.is_due]:
+            num_kept = ready[0][1].num_kept
+            self._run([one for one in ready if one[1].num_kept == num_kept][:_MAX_BATCH])
         return [stream.take_final_scores() for stream in streams]
 
-    def _run(self, streams: Sequence[BlockStream]) -> None:
-        log_posteriors, states, new = self.session.run([stream.block() for stream in streams])
+    def _run(self, blocks: Sequence[tuple[BlockStream, Block]]) -> None:
+        log_posteriors, states, new = self.session.run([block for _, block in blocks])
         scores = self.scores_of(log_posteriors)
-        for row, stream in enumerate(streams):  # copies: a view would keep the whole batch
-            stream.append_outputs(scores[row].copy(), states[row].copy(), new[row])
+        # copies: a view would keep the whole batch
+        for row, (stream, block) in enumerate(blocks):
+            stream.append_outputs(block, scores[row].copy(), states[row].copy(), new[row])
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
@@ -210,9 +211,10 @@ class BlockRunner:
             _NUM_KEPT: np.array([num_kept]),
             **dict.fromkeys(self._last_kept, np.array(num_kept - 1)),
         }
-        for ring, name in enumerate(self._names):
-            of_sessions = [block.past.rings[ring] for block in blocks]
-            inputs[name] = of_sessions[0][np.newaxis] if len(blocks) == 1 else np.stack(of_sessions)
+        rings = blocks[0].past.rings[:, np.newaxis]
+        if len(blocks) > 1:
+            rings = np.stack([block.past.rings for block in blocks], axis=1)
+        inputs |= zip(self._names, rings, strict=True)
         if self._first_state:  # the readout that is not used has a state
             inputs["state"] = np.zeros((len(blocks), self._first_state), np.float32)
         start_s = time.thread_time()
@@ -308,9 +310,9 @@ class BlockStream(AcousticStream):
             past=self._past,
         )
 
-    def append_outputs(self, scores: Floats, state: Floats, new: Float16) -> None:
-        """Append the scores, new state, and keys and values of ``block()``; shapes as of a run."""
-        block, past = self.block(), self._sizes.past
+    def append_outputs(self, block: Block, scores: Floats, state: Floats, new: Float16) -> None:
+        """Append the scores, new state, and keys and values of a block; shapes as of a run."""
+        past = self._sizes.past
         end = FRAMES_PER_POSITION * block.num_settled
         self._settled.append(scores[:end])
         self.provisional = scores[end : FRAMES_PER_POSITION * block.num_positions]

@@ -39,7 +39,8 @@ class NetworkModel(AcousticModel):
 
     def scores_of(self, log_posteriors: Floats) -> Floats:
         """Divide posteriors by priors (Bourlard and Morgan 1994), and weight the log scores."""
-        scores: Floats = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
+        scores: Floats = log_posteriors - self.log_prior
+        scores *= np.float32(self.acoustic_scale)
         return scores
 
 
