@@ -35,11 +35,7 @@ from scipy.optimize import minimize
 
 from kouxing.corpora.lip_clips import MIRROR, LipClip
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import softmax
-from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
-    log_left_silence,
-    log_pause,
-    log_right_silence,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import log_pause, log_silence
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import (
     CONSONANTS,
     initial_parameters,
@@ -241,8 +237,8 @@ class _FapFit:
         theta_left, theta_right = np.exp(silences[:2])
         start, end = self._silence
         return log_pause(
-            log_right_silence(start + silences[3], 0.0, theta_right, self.c),
-            log_left_silence(end + silences[2], 0.0, theta_left, self.c),
+            log_silence(start + silences[3], 0.0, theta_right, self.c),
+            log_silence(-(end + silences[2]), 0.0, theta_left, self.c),
             end - start,
         )
 

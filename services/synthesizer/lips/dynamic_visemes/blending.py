@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
     log_closure,
     log_dominance,
-    log_left_silence,
     log_pause,
-    log_right_silence,
+    log_silence,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
@@ -92,14 +91,12 @@ def log_weights(
         sequence.theta_plus,
         c,
     )
-    start_s = timeline.silence_start_s[:, None, None]  # (S, 1, 1)
-    end_s = timeline.silence_end_s[:, None, None]
+    edges_s = np.array([timeline.silence_start_s, timeline.silence_end_s])[..., None, None]
+    inside_s = edges_s + p.silence_offset_s - time  # (2, S, F, P)
+    inside_s[1] *= -1.0  # its speech follows
     # before and after all speech, one of the two is infinite and only the other remains
-    silent = log_pause(
-        log_right_silence(start_s + p.offset_right_s - time, p.log_alpha_right, p.theta_right, c),
-        log_left_silence(end_s + p.offset_left_s - time, p.log_alpha_left, p.theta_left, c),
-        end_s - start_s,
-    )
+    right, left = log_silence(inside_s, p.silence_log_alpha, p.silence_theta, c)
+    silent = log_pause(right, left, edges_s[1] - edges_s[0])
     weights = np.concatenate([spoken, silent])
     return _close_lips(parameters, sequence, tau, weights) if sequence.closing else weights
 

@@ -35,14 +35,12 @@ def log_dominance(
     return log_alpha - theta * np.abs(tau_s) ** c  # Li 2011, eq. 5
 
 
-def log_left_silence(sigma_s: Array, log_alpha: Array | float, theta: Array, c: float) -> Array:
-    """Return the log dominance of the silence before speech (Li 2011, eq. 6)."""
-    return log_alpha + np.copysign(theta * np.abs(sigma_s) ** c, sigma_s)  # Li 2011, eq. 6
+def log_silence(inside_s: Array, log_alpha: Array | float, theta: Array, c: float) -> Array:
+    """Return the log dominance of the silence before or after speech (Li 2011, eq. 6 and 7).
 
-
-def log_right_silence(nu_s: Array, log_alpha: Array | float, theta: Array, c: float) -> Array:
-    """Return the log dominance of the silence after speech (Li 2011, eq. 7)."""
-    weights: Array = log_alpha - np.copysign(theta * np.abs(nu_s) ** c, nu_s)  # Li 2011, eq. 7
+    ``inside_s`` is how far a time is inside the speech: -sigma before it, nu after it.
+    """
+    weights: Array = log_alpha - np.copysign(theta * np.abs(inside_s) ** c, inside_s)
     return weights
 
 

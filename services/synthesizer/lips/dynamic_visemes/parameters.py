@@ -75,8 +75,10 @@ class VisemeParameters:
     dominance: NDArray[np.float64] = dataclasses.field(
         init=False
     )  # (num_visemes, 4, num_mouth_faps)
-    log_alpha_left: NDArray[np.float64] = dataclasses.field(init=False)
-    log_alpha_right: NDArray[np.float64] = dataclasses.field(init=False)
+    # of the silence after speech, then before it, (2, 1, 1, num_mouth_faps)
+    silence_log_alpha: NDArray[np.float64] = dataclasses.field(init=False)
+    silence_theta: NDArray[np.float64] = dataclasses.field(init=False)
+    silence_offset_s: NDArray[np.float64] = dataclasses.field(init=False)
     any_closes: NDArray[np.bool_] = dataclasses.field(
         init=False
     )  # (num_visemes,) whether any FAP closes
@@ -104,8 +106,13 @@ class VisemeParameters:
                 )
         of_visemes = (self.offset_s, np.log(self.alpha), self.theta_minus, self.theta_plus)
         object.__setattr__(self, "dominance", np.stack(of_visemes, axis=1))
-        object.__setattr__(self, "log_alpha_left", np.log(self.alpha_left))
-        object.__setattr__(self, "log_alpha_right", np.log(self.alpha_right))
+        of_silences = {
+            "silence_log_alpha": np.log([self.alpha_right, self.alpha_left]),
+            "silence_theta": np.array([self.theta_right, self.theta_left]),
+            "silence_offset_s": np.array([self.offset_right_s, self.offset_left_s]),
+        }
+        for name, values in of_silences.items():
+            object.__setattr__(self, name, values[:, None, None])
         object.__setattr__(self, "any_closes", (self.closes > 0.0).any(axis=1))
 
 
