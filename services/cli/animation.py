@@ -31,7 +31,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.phones.events import Phone, SoundEvent
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
 from kouxing.shared.records import replace
 from kouxing.shared.terminal import print_message
@@ -52,6 +52,7 @@ class Motion:
     phones: list[Phone] | None = None  # spoken phones in order; None if the source has no sound
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
     source: Path | None = None
+    language: str = DEFAULT_LANGUAGE  # of the phones
 
 
 def slow_down(motion: Motion, speed: float) -> Motion:
@@ -172,6 +173,7 @@ def animate(
         spoken,
         write_syllables(spoken, transcript, model.inventory),
         source,
+        language,
     )
 
 

@@ -56,7 +56,7 @@ def make_captions(
         return None
     captions: list[Caption] = []
     if kind is CaptionKind.PHONES:
-        captions = _captions_of_phones(motion.phones or [], load_inventory())
+        captions = _captions_of_phones(motion.phones or [], load_inventory(motion.language))
     else:
         is_text = kind is CaptionKind.CHARACTERS
         if is_text and all(syllable.text == syllable.spelling for syllable in motion.syllables):

@@ -57,6 +57,14 @@ def test_highlights_only_the_current_caption_below_the_picture() -> None:
     assert clear[-1, :, 3].max() == 0, "the band of a transparent picture is transparent"
 
 
+def test_phones_of_other_languages_are_ipa() -> None:
+    phones = [lips.phone(number, symbol, 0.2 * number, 0.2) for number, symbol in enumerate("vi")]
+    motion = Motion(motion_of().frames, 50.0, 25.0, None, phones, language="german")
+    german = make_captions(CaptionKind.PHONES, motion, SIZE)
+    assert german is not None
+    assert [caption.text for line in german._lines for caption in line] == ["v", "i"]
+
+
 def test_long_texts_and_pauses_start_a_new_line() -> None:
     words = [Caption(0.1 * number, 0.1 * number + 0.1, "zhuang") for number in range(40)]
     captions = Captions([*words, Caption(9.0, 9.2, "a")], SIZE)
