@@ -13,7 +13,9 @@ from kouxing.services.cli.offline import lips
 from kouxing.services.cli.options import DrawnLips, Timing
 from kouxing.services.driver import picture
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
+from kouxing.services.synthesizer.lips.ferguson.drawing import LabeledMouth, draw_strip
 from kouxing.shared.errors import UserError
+from kouxing.shared.fonts import text_runs
 from tests.system import VOWELS_FILE
 
 SOUND = Path(__file__).parents[2] / "shared" / "demo" / "fast-female.wav"
@@ -49,6 +51,22 @@ def test_picture_and_svg_show_every_key_frame(tmp_path: Path) -> None:
     assert texts.count("i") == 16
     pixels = picture.decode((tmp_path / "mouth.png").read_bytes(), "mouth.png")
     assert pixels.shape[:2] == (int(root.attrib["height"]), int(root.attrib["width"]))
+
+
+def test_long_words_stay_in_the_picture_and_apart() -> None:
+    words = ["vermittelt fɛʁmɪtəlt", "", "a ə", "Fußgängerübergänge fʊsɡɛŋeʁybɐɡɛŋə"]
+    strip = draw_strip([LabeledMouth(0.0, 0.1, "a", word) for word in words], 4, 100.0)
+    spans = [
+        (label.x if label.anchor == "start" else label.x - 0.5 * width, width)
+        for label in strip.labels
+        if label.text in words
+        for width in [
+            sum(font.getlength(text) for text, font in text_runs(label.text, label.size_px))
+        ]
+    ]
+    ends = [left + width for left, width in spans]
+    assert all(left >= end for (left, _), end in zip(spans, [0.0, *ends[:-1]], strict=True))
+    assert ends[-1] <= strip.width_px
 
 
 def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:

@@ -5,8 +5,9 @@ convert it to the text of a file and to a picture.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -27,6 +28,7 @@ _INK, _FAINT_INK, PAPER = "#222222", "#777777", "#ffffff"
 _TEETH_EDGE, _TEETH_HALF_WIDTH, _TEETH_ROUNDNESS = -0.085, 0.30, 0.05
 _TONGUE_BELOW_TEETH, _TONGUE_HALF_WIDTH = 0.045, 0.27
 _LINE_PX_PER_WIDTH = 0.006
+_PX_PER_CHARACTER = 0.6  # width of a letter, relative to the size of the text
 # bounding box of a mouth at any opening, mouth widths
 WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
 _ANCHORS = {"start": 0.0, "middle": 0.5, "end": 1.0}  # fraction of a label left of its x
@@ -139,13 +141,16 @@ def draw_strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float
     mouth_height_px = (HIGHEST - LOWEST) * mouth_px
     row_px = mouth_height_px + 5.0 * text_px
     drawing = Drawing(round(columns * cell_px), round(rows * row_px + text_px))
+    spoken = [number for number, labeled in enumerate(mouths) if labeled.syllable]
+    next_of = dict(pairwise([*spoken, len(mouths)]))
     for number, labeled in enumerate(mouths):
         left, top = number % columns * cell_px, number // columns * row_px
         middle = left + 0.5 * cell_px
         mouth_top = top + 1.9 * text_px
         if labeled.syllable:
             label = Label(labeled.syllable, middle, top + 1.4 * text_px, 1.2 * text_px)
-            drawing.labels.append(label)
+            num_cells = min(next_of[number] - number, columns - number % columns)
+            drawing.labels.append(_fit(label, left, cell_px, num_cells * cell_px))
         center = (middle, mouth_top + HIGHEST * mouth_px)
         drawing.outlines.extend(draw_mouth(labeled.opening, center, mouth_px, labeled.width))
         below = mouth_top + mouth_height_px
@@ -155,6 +160,15 @@ def draw_strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float
             Label(time, middle, below + 2.3 * text_px, 0.85 * text_px, _FAINT_INK)
         )
     return drawing
+
+
+def _fit(label: Label, left: float, cell_px: float, room_px: float) -> Label:
+    """Return a label that is wider than its cell, from ``left`` on and within ``room_px``."""
+    width_px = _PX_PER_CHARACTER * label.size_px * len(label.text)
+    if width_px <= cell_px:
+        return label
+    size_px = label.size_px * min(1.0, room_px / width_px)
+    return replace(label, x=left, size_px=size_px, anchor="start")
 
 
 def draw_image(labeled: LabeledMouth, width_px: int, height_px: int) -> Drawing:
