@@ -191,8 +191,9 @@ class ClientCore:
         if self._refused_s == math.inf:
             return f"control at {address} does not answer. Start it with 'kouxing run'"
         return f"control at {address} " + (
-            "does not accept this key. If it runs on this machine, restart it; otherwise run there"
-            " 'kouxing keys add NAME --role client' and copy the file here"
+            "does not accept this key. If it belongs to another user, start yours with 'kouxing"
+            " run'. If it is yours, restart it. If it runs on another machine, run there 'kouxing"
+            " keys add NAME --role client' and copy the file here"
             if key
             else "refuses this client: insecure = true is set here, but not there; or see its log"
         )

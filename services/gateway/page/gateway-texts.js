@@ -50,7 +50,7 @@ const CHINESE = {
   // Sessions
   "control at {address} does not answer. Start it with 'kouxing run'": "控制服务（{address}）没有应答，请运行 kouxing run",
   "control at {address} does not answer: {reason}": "控制服务（{address}）没有应答，请在网关的机器上运行 kouxing doctor",
-  "control at {address} does not accept this key. If it runs on this machine, restart it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here": "控制服务（{address}）不接受网关的密钥，请在两台机器上运行 kouxing doctor",
+  "control at {address} does not accept this key. If it belongs to another user, start yours with 'kouxing run'. If it is yours, restart it. If it runs on another machine, run there 'kouxing keys add NAME --role client' and copy the file here": "控制服务（{address}）不接受网关的密钥，请在两台机器上运行 kouxing doctor",
   "control has closed the session: {reason}": "控制服务关闭了会话（{reason}）",
   "the session is closed": "会话已关闭",
   "another program opened this session; only that program can send audio": "另一个程序在使用此会话",
