@@ -62,7 +62,10 @@ class ListeningTest:
         return web.json_response({"judge": token})
 
     async def _show_state(self, request: web.Request) -> web.Response:
-        state: dict[str, object] = {"title": self._study.title, "videos": len(self._study.files)}
+        state: dict[str, object] = {
+            "title": self._study.folder.name,
+            "videos": len(self._study.files),
+        }
         if "judge" in request.query:
             state["place"] = self._next_place(self._judge(request))
         return web.json_response(state)

@@ -32,7 +32,6 @@ class Study:
     """Contents of ``study.json``."""
 
     folder: Path
-    title: str
     sentences: tuple[str, ...]
     conditions: tuple[str, ...]
     reference: str  # condition that is the hidden reference; may be empty
@@ -55,7 +54,6 @@ def new_study(folder: Path, *, reference: str = "", anchor: str = "") -> Study:
     check_no_study(folder)
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
     content = {
-        "title": folder.resolve().name,
         "reference": reference,
         "anchor": anchor,
         "videos": [f"{path.parent.name}/{path.name}" for path in videos],
@@ -92,11 +90,11 @@ def _parse(folder: Path, content: Any) -> Study:
     for sentence, condition in product(sentences, conditions):
         if (sentence, condition) not in files:
             raise UserError(f"sentence {sentence!r} has no video in condition {condition!r}")
-    title, reference, anchor = (str(content[key]) for key in ("title", "reference", "anchor"))
+    reference, anchor = str(content["reference"]), str(content["anchor"])
     if unknown := {reference, anchor} - {"", *conditions}:
         known = ", ".join(sorted(conditions))
         raise UserError(f"no condition is named {min(unknown)!r}; choose from {known}")
-    return Study(root, title, sentences, conditions, reference, anchor, files)
+    return Study(root, sentences, conditions, reference, anchor, files)
 
 
 def williams_design(num_conditions: int) -> NDArray[np.int64]:

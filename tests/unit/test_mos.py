@@ -80,7 +80,7 @@ def test_rejects_videos_outside_the_study(tmp_path: Path, file: str) -> None:
     folder = tmp_path / "study"
     (folder / "live").mkdir(parents=True)
     (folder / "live" / "link.mp4").symlink_to(tmp_path / "secret.mp4")
-    content = {"title": "", "reference": "", "anchor": "", "videos": [file]}
+    content = {"reference": "", "anchor": "", "videos": [file]}
     (folder / FILE_NAME).write_text(json.dumps(content))
     with pytest.raises(UserError, match="not a video inside"):
         load_study(folder)
