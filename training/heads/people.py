@@ -85,11 +85,11 @@ PEOPLE = {
             *_both("cheek/cheek-volume-decr", 0.35),
             *_both("eyes/eye-scale-incr", 0.40)),
         face_units=_FRIENDLY,
-        look=Look(),
+        look=Look(brow_strength=1.1),
         skin="young_lightskinned_female_diffuse",
         hair="bob02",
         crown=0.15,
-        brows="eyebrow008",
+        brows="eyebrow001",
         tucked=0.0075,
     ),
     "man": Person(
