@@ -100,7 +100,7 @@ def text_of(text: str) -> str:
         print_message(f"{name} was read as {' in '.join(forms)}")
     elif time := _CLOCK_TIME.match(spoken.text):
         print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
-    elif len(labels := _LABEL.findall(spoken.text)) > 1:
+    if len(labels := _LABEL.findall(spoken.text)) > 1:
         print_message(
             f"{labels[0]!r} is read as spoken text; delete such labels if nobody says them"
         )

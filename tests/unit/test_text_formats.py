@@ -291,6 +291,11 @@ def test_warns_about_labels_that_may_not_be_spoken(
     assert message.startswith(f"{label} is read as spoken text") if label else not message
 
 
+def test_warns_about_speakers_in_subtitles(capsys: pytest.CaptureFixture[str]) -> None:
+    text_of("1\n0:01 --> 0:02\n张三：大家好\n\n2\n0:02 --> 0:03\n李四：你好\n")
+    assert "'张三：' is read as spoken text" in capsys.readouterr().err
+
+
 def test_decodes_an_argument_in_another_encoding(capsys: pytest.CaptureFixture[str]) -> None:
     assert text_of(os.fsdecode("你好".encode("gb18030"))) == "你好"
     assert "read as GB18030" in capsys.readouterr().err
