@@ -107,6 +107,7 @@ def test_two_numbers_in_a_row_stay_apart() -> None:
 def test_a_unit_is_not_a_part_of_a_word() -> None:
     assert [word for word, _ in words_of("german", "5 mal um")] == ["5", "mal", "um"]
     assert [word for word, _ in words_of("english", "1/2/2026")] == ["1", "2", "2026"]
+    assert words_of("english", "No.")[0] == ("No", "noʊ")
 
 
 def test_latin_words_of_other_scripts_are_english() -> None:
