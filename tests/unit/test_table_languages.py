@@ -157,6 +157,14 @@ def test_reads_mixed_sentences() -> None:
         UNIVERSAL.pronounce("我 ไทย")
 
 
+def test_units_of_mixed_sentences_belong_to_their_number() -> None:
+    chinese = "".join(word for word, _ in words_of("universal", "USB线长1.5m，-5℃，I ran 5km"))
+    assert chinese == "USB线长一点五米负五摄氏度Iran5km"
+    korean = dict(words_of("universal", "약 5km 5G"))
+    assert korean["5km"].endswith("kʰilomitʰʌ")
+    assert korean["G"] == "d͡ʒi"
+
+
 def test_reads_chinese_characters_in_japanese(monkeypatch: pytest.MonkeyPatch) -> None:
     words = words_of("japanese", "私は学生。キャンプ")
     assert [word for word, _ in words] == ["私", "は", "学生", "キャンプ"]

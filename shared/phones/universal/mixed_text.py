@@ -1,10 +1,11 @@
 """Texts of several languages: Mandarin with English words, as people speak.
 
 Each script is read in one language. For other languages, the user must choose one.
-Numbers are read in the language of the words before them. In a text with kana, Chinese characters
-are Japanese.
+Numbers and their units are read in the language of the words before them. In a text with kana,
+Chinese characters are Japanese.
 """
 
+import re
 import unicodedata
 
 from kouxing.shared.phones.inventory import load_inventory
@@ -19,6 +20,7 @@ _LANGUAGES = {
     "KATAKANA": "japanese",
     "LATIN": "english",
 }
+_UNIT = re.compile(r"(?<=[0-9°])(?:km/h|[kcm]?m|[km]?g|m?l|[CF])(?![A-Za-z])")
 
 
 def read_mixed_text(text: str) -> Transcript:
@@ -45,6 +47,8 @@ def _parts_of(text: str) -> list[tuple[str, str]]:
     """Split a text where its language changes. Returns the language and the text of each part."""
     parts: list[tuple[str, str]] = []
     scripts = [unicodedata.name(c, "").split(" ")[0] if c.isalpha() else "" for c in text]
+    for unit in _UNIT.finditer(text):
+        scripts[unit.start() : unit.end()] = [""] * len(unit[0])
     of_characters = "japanese" if {"HIRAGANA", "KATAKANA"} & {*scripts} else "mandarin"
     languages = _LANGUAGES | dict.fromkeys(("CJK", "IDEOGRAPHIC"), of_characters)
     for letter, script in zip(text, scripts, strict=True):
