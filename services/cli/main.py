@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib.metadata import entry_points, version
@@ -25,17 +26,8 @@ from kouxing.shared.terminal import CONSOLE
 
 SERVICES = "A single service (run starts all of them)"
 ENTRY_POINTS = "kouxing.commands"  # such as those of training and evaluation
-_VALUE_NAMES = {
-    "<bool>": "",
-    "<str>": "TEXT",
-    "<list[str]>": "TEXT",
-    "<path>": "PATH",
-    "<list[Path]>": "PATH",
-    "<int>": "NUMBER",
-    "<float>": "NUMBER",
-    "<int range>": "NUMBER",
-    "<float range>": "NUMBER",
-}
+_VALUE_NAMES = {"bool": "", "str": "TEXT", "path": "PATH", "int": "NUMBER", "float": "NUMBER"}
+_PYTHON_TYPE = re.compile(r"<(?:list\[)?(\w+)(?: range)?\]?>")
 
 
 class CommandGroup(TyperGroup):
@@ -82,8 +74,10 @@ def _name_values(parameters: Any, ctx: Any) -> None:
     for parameter in parameters:
         if not isinstance(parameter, TyperOption):
             parameter.display_type = lambda ctx: ""
-        elif parameter.metavar is None:
-            parameter.metavar = _VALUE_NAMES.get(parameter.display_type(ctx))
+        elif parameter.metavar is None and (
+            python_type := _PYTHON_TYPE.fullmatch(parameter.display_type(ctx))
+        ):
+            parameter.metavar = _VALUE_NAMES.get(python_type[1].lower())
 
 
 app = typer.Typer(

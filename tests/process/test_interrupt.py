@@ -115,6 +115,8 @@ RECIPES = (
     "evaluate recognizer --manifest {data} --json {out}/a.json",
     "evaluate lips --clips {data} --json {out}/a.json",
     "evaluate schemes --clips {data} --json {out}/a.json",
+    *("bench load --json {out}/a.json", "bench busy --json {out}/a.json"),
+    "evaluate attacks --json {out}/a.json",
 )
 COMMAND = """
 import signal

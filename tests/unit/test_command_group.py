@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint, version
+from typing import Any
 
 import pytest
 import typer
@@ -82,3 +84,21 @@ def test_reports_how_to_install_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = CliRunner().invoke(command_line.app, ["cluster"])
     assert isinstance(ended.exception, UserError)
     assert "pip install 'kouxing[cluster]'" in str(ended.exception)
+
+
+def test_help_shows_no_python_types() -> None:
+    def texts(command: Any, context: Any) -> Iterator[str]:
+        for parameter in command.get_params(context):
+            form = parameter.metavar
+            form = parameter.display_type(context) if form is None else form
+            yield f"{parameter.name}: {form}"
+        for name in getattr(command, "commands", ()):
+            yield from texts(command.get_command(context, name), context)
+
+    group: Any = typer.main.get_command(command_line.app)
+    context = group.context_class(group)
+    group.list_commands(context)
+    shown = [*texts(group, context)]
+    assert "programs: NUMBER" in shown
+    types = ("bool", "int", "float", "str", "path", "list")
+    assert not [text for text in shown if text.partition("<")[2].startswith(types)]
