@@ -117,11 +117,11 @@ function morphAvatar(scene, meshes) {
     const shapes = findShapes(set, names);
     return names.map((name, index) => ({ mesh, index, shape: shapes.get(name) })).filter(({ shape }) => shape);
   });
-  const turnJaw = findJaw(scene, targets);
   const region = new FaceRegion(targets);
   const upright = new THREE.Group().add(scene);
   upright.applyMatrix4(region.upright);
   upright.updateMatrixWorld(true);
+  const turnJaw = findJaw(scene, targets);
   const { center, height } = new FaceRegion(targets).bounds;
   return {
     scene: upright,

@@ -21,6 +21,7 @@ TURNS: dict[str, dict[str, list[float]]] = {
     "upside down": {"rotation": [0, 0, 1, 0]},
     "oblique": {"rotation": [0, np.sin(0.3), 0, np.cos(0.3)]},
     "mirrored": {"scale": [1, 1, -1]},
+    "turned": {"rotation": [0, 1, 0, 0]},
 }
 DAMAGED = "it is not a GLB or VRM file, or it is damaged; export it again"
 CANNOT = "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit; use an avatar"
@@ -35,7 +36,14 @@ for (const file of process.argv.slice(2)) {
   try {
     const url = "data:;base64," + readFileSync(file).toString("base64");
     const { scene, set, view, pose } = await loadPuppet(url);
+    const teeth = scene.getObjectByName("Teeth");
+    const depth = () => {
+      scene.updateMatrixWorld(true);
+      return teeth?.getVertexPosition(0, new THREE.Vector3()).applyMatrix4(teeth.matrixWorld).z;
+    };
+    const before = depth();
     pose([1], [set === "arkit" ? "jawOpen" : "aa"]);
+    const forward = depth() - before;
     const jaw = 2 * Math.acos(scene.getObjectByName("CC_Base_JawRoot")?.quaternion.w ?? 1);
     const eyes = new THREE.Box3();
     for (const side of ["EyeL", "EyeR"]) eyes.expandByObject(scene.getObjectByName(side) ?? scene);
@@ -44,8 +52,8 @@ for (const file of process.argv.slice(2)) {
     scene.traverse((node) => {
       opening = Math.max(opening, ...(node.morphTargetInfluences ?? []));
     });
-    const target = view.target.toArray();
-    console.log(JSON.stringify({ set, target, height: view.height, jaw, eyes: center, opening }));
+    const [target, height] = [view.target.toArray(), view.height];
+    console.log(JSON.stringify({ set, target, height, jaw, forward, eyes: center, opening }));
   } catch (error) {
     console.log(JSON.stringify({ error: error.message.replace(/^data:[^:]*: /, "") }));
   }
@@ -86,10 +94,12 @@ def column(shapes: list[str]) -> Mesh:
 
 
 def change(path: Path, kind: str) -> None:
-    if kind == "jaw bone":
+    if kind.startswith("jaw bone"):
         bones = [{"name": "CC_Base_Head"}, {"name": "CC_Base_JawRoot"}]
         add_skeleton(path, bones, lambda name: int(name in ("Teeth", "Chin")))
-        return
+        if kind == "jaw bone":
+            return
+        kind = "turned"
     document, binary = read_chunks(path)
     nodes = document["scenes"][0]["nodes"]
     if kind in TURNS:
@@ -159,6 +169,7 @@ FILES: dict[str, tuple[list[Mesh], str]] = {
     "cut off": (face(ARKIT), "cut off"),
     "texture": (face(ARKIT), "texture"),
     "twice": (face(ARKIT), "twice"),
+    "turned teeth": ([*face(ARKIT), box("Teeth", (0, 1.6, 0.05), 0.04, [])], "jaw bone, turned"),
     "teeth": ([*face(ARKIT), box("Teeth", (0, 1.6, 0.05), 0.04, [])], "jaw bone"),
     "chin": ([*face(ARKIT), box("Chin", (0, 1.6, 0.05), 0.04, ["jawOpen"])], "jaw bone"),
     "unnamed": (face(ARKIT), "unnamed"),
@@ -211,6 +222,8 @@ def test_the_jaw_bone_turns_only_for_parts_without_shapes(
 ) -> None:
     assert found["teeth"]["jaw"] == pytest.approx(0.3, abs=0.01)
     assert found["chin"]["jaw"] == 0
+    for name in ("teeth", "turned teeth"):  # far above the bone, so they move forward
+        assert found[name]["forward"] > 0.1
 
 
 def test_frames_the_head_if_only_the_mouth_of_a_body_moves(
@@ -241,9 +254,9 @@ def test_a_vrm_speaks_by_morph_targets_if_its_expressions_move_nothing(
         ("blink", CANNOT),
         ("no effect", CANNOT),
         ("cut off", DAMAGED),
-        ("texture", "it needs KHR_texture_basisu, which kouxing cannot read"),
+        ("texture", "it needs KHR_texture_basisu, which kouxing does not support"),
         ("twice", "it has several faces; export only one avatar"),
-        ("draco", "it needs KHR_draco_mesh_compression, which kouxing cannot read"),
+        ("draco", "it needs KHR_draco_mesh_compression, which kouxing does not support"),
     ],
 )
 def test_says_why_an_avatar_cannot_be_shown(

@@ -150,6 +150,7 @@ def test_reads_files_of_other_programs(
 ) -> None:
     head = read_glb(edit(write_glb(tmp_path / "my.glb", meshes(SHAPES)), change))
     assert shape_error(head, JAW) < 0.25
+    assert shape_error(head, SHAPES["eyeBlinkLeft"]) < 0.04
     assert np.abs(head.eye_centers - ORIGINAL.eye_centers).max() < 0.01
     for part in ("skin", "eye_right"):  # the triangles face outwards
         normals, wanted = (model.normals[model.part(part).vertices] for model in (head, ORIGINAL))

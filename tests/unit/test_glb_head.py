@@ -103,7 +103,8 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(tmp_path: Path) -> None
     assert moved[head.part("hair").vertices].max() > 0.02
 
 
-def test_a_jaw_bone_moves_teeth_without_shapes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rotation", [(0, 0, 0, 1), (0, 1, 0, 0)], ids=["z", "-z"])
+def test_a_jaw_bone_moves_teeth_without_shapes(tmp_path: Path, rotation: tuple[int, ...]) -> None:
     whole = meshes(SHAPES)
     for mesh in whole:
         if mesh.name.startswith("teeth"):
@@ -111,6 +112,11 @@ def test_a_jaw_bone_moves_teeth_without_shapes(tmp_path: Path) -> None:
     path = write_glb(tmp_path / "cc4.glb", whole)
     bones = [{"name": f"CC_Base_{name}"} for name in ("Head", "JawRoot", "Teeth02")]
     add_skeleton(path, bones, lambda name: 2 if name == "teeth_lower" else 0)
+    document, binary = read_chunks(path)
+    roots = document["scenes"][0]["nodes"]
+    document["nodes"].append({"children": roots, "rotation": rotation})
+    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+    write_chunks(path, document, binary)
     head = read_glb(path)
     moved = head.deform(neutral_faps(open_jaw=400)) - head.vertices
     assert moved[head.part("teeth_lower").vertices, 1].mean() < -0.003

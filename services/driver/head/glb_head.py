@@ -57,6 +57,7 @@ _MAX_FACES_APART = 2.0  # distance of the parts of one face, in sizes of a part
 _MAX_TILT_RAD = 0.17  # angle between the eyes and the x axis that is not corrected
 _STEEPER = 1.5  # how much farther the mouth is below the eyes along an axis that replaces y
 
+_JAW_RAD = 0.3  # rotation of a jaw bone at full weight of ARKit's jawOpen
 _JAW = FAP_NUMBER["open_jaw"] - 1
 _OPEN_JAW = float(ARKIT.basis[ARKIT.names.index("jawOpen"), _JAW])
 _FAP_BY_NAME = {fap.name: fap for fap in FAPS[2:]}
@@ -103,17 +104,12 @@ def _recognize(pieces: list[Primitive]) -> Names:
     for piece in pieces:
         shape_of = faps or {
             name: shape
-            for kind in {set_name: 0, **_SETS}
+            for kind in (*(other for other in reversed(_SETS) if other != set_name), set_name)
             for name, shape in find_shapes(kind, piece.shapes).items()
+            if shape in table
         }
-        _keep_known(piece, {name: shape for name, shape in shape_of.items() if shape in table})
+        _keep_known(piece, shape_of)
     known = {name for piece in pieces for name in piece.shapes}
-    opening = {
-        name: share for name in known & table.keys() if (share := table[name][_JAW] / _OPEN_JAW) > 0
-    }
-    for piece in pieces:
-        if piece.jaw is not None and not opening.keys() & piece.shapes.keys():  # teeth and tongue
-            piece.shapes |= {name: share * piece.jaw for name, share in opening.items()}
     return {name: row for name, row in table.items() if name in known}
 
 
@@ -126,6 +122,14 @@ def _keep_known(piece: Primitive, shape_of: Mapping[str, str]) -> None:
             piece.shapes[shape] = piece.shapes.get(shape, 0.0) + shift
         elif name in piece.rest:
             piece.vertices = piece.vertices + piece.rest[name] * shift
+
+
+def _turn_jaw(piece: Primitive, arm: Float64, known: Names) -> None:
+    """Let a jaw bone move a piece without shapes that open the mouth: teeth and tongue."""
+    opening = {name: row[_JAW] / _OPEN_JAW for name, row in known.items() if row[_JAW] > 0}
+    if not opening.keys() & piece.shapes.keys():
+        shift = _JAW_RAD * np.cross([1, 0, 0], arm)
+        piece.shapes |= {name: share * shift for name, share in opening.items()}
 
 
 # --- the head -------------------------------------------------------------------------------------
@@ -148,6 +152,8 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
             piece.triangles = piece.triangles[:, ::-1]
         piece.vertices = piece.vertices @ turn.T
         piece.shapes = {name: shift @ turn.T for name, shift in piece.shapes.items()}
+        if piece.jaw_arm is not None:
+            _turn_jaw(piece, piece.jaw_arm @ turn.T, known)
     eyes = eyes @ turn.T
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
     pivot = _pivot(glb, turn, middle, unit)

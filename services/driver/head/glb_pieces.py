@@ -23,7 +23,6 @@ MAX_PIECES = 2_000
 MAX_SHIFTS = 20_000_000  # displacements of all morph targets
 MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
-_JAW_RAD = 0.3  # rotation of a jaw bone at full weight of ARKit's jawOpen
 _JAW_BONES = ("jaw", "jawroot", "lowerjaw")
 _LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes at full weight of ARKit's shapes
 
@@ -184,9 +183,9 @@ def _piece(
         raise ValueError("the attributes of a mesh have different lengths")
     shapes, rest = _shapes(glb, node, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
-    weight = jaw = None
+    weight = jaw_arm = None
     if skin and turn_shares:
-        weight, jaw = skin.mean(turn_shares), skin.jaw_shift(vertices)
+        weight, jaw_arm = skin.mean(turn_shares), skin.jaw_arm(vertices)
         if _uses_eye_bones(glb):
             shapes = skin.eye_look_shapes(vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
@@ -204,7 +203,7 @@ def _piece(
         shapes=shapes,
         rest=rest,
         is_mirrored=count > 0 and bool(np.linalg.det(placed[0, :3, :3]) < 0),
-        jaw=jaw,
+        jaw_arm=jaw_arm,
     )
 
 
@@ -312,8 +311,8 @@ class _Skin:
         mean: Float64 = (self._weights * of_joint[self._index]).sum(axis=1)
         return mean
 
-    def jaw_shift(self, vertices: Float64) -> Float64 | None:
-        """Return the displacements (V, 3) by a jaw bone, if it moves vertices.
+    def jaw_arm(self, vertices: Float64) -> Float64 | None:
+        """Return the weighted positions (V, 3) relative to a jaw bone, if it moves vertices.
 
         A VRM's jaw bone is ignored, because programs often choose a wrong one.
         """
@@ -328,9 +327,8 @@ class _Skin:
         share = self.mean(dict.fromkeys(below, 1.0))[:, None]
         if not share.any():
             return None
-        arm = vertices - self._nodes[jaw][:3, 3]
-        shift: Float64 = share * _JAW_RAD * np.cross([1, 0, 0], arm)
-        return shift
+        arm: Float64 = share * (vertices - self._nodes[jaw][:3, 3])
+        return arm
 
     def eye_look_shapes(self, vertices: Float64) -> dict[str, Float64]:
         """Return ARKit's eye shapes: the displacements (V, 3) by rotations of the eye bones."""

@@ -34,7 +34,7 @@ class Primitive:
     shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by name
     rest: dict[str, float] = field(default_factory=dict)  # weights of shapes in the mesh at rest
     is_mirrored: bool = False  # by a negative scale: its triangles face inwards
-    jaw: Float64 | None = None  # displacements by a jaw bone
+    jaw_arm: Float64 | None = None  # positions relative to a jaw bone, times its weights
 
 
 def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
