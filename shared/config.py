@@ -342,17 +342,18 @@ def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
     }
 
 
-def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
+def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str, str]:
     """Split the values of ``--set`` into keys and values.
 
-    Raises ``UserError`` if one is not ``KEY=VALUE``.
+    The name of ``service`` before a key is left out. Raises ``UserError`` if one is not
+    ``KEY=VALUE``.
     """
     values = {}
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
         if not equals:
             raise UserError(f"--set {assignment}: write --set KEY=VALUE")
-        values[key] = value
+        values[key.removeprefix(f"{service}.")] = value
     return values
 
 

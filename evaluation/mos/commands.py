@@ -82,8 +82,7 @@ def serve(
     from kouxing.services.kinds import read_settings
     from kouxing.shared.config import parse_assignments
 
-    assigned = parse_assignments(assignments or [])
-    overrides = {key.removeprefix("gateway."): value for key, value in assigned.items()}
+    overrides = parse_assignments(assignments or [], "gateway")
     gateway = read_settings(config).load(GatewayConfig, overrides)
     study, store = load_study(folder), Store(folder)
     try:

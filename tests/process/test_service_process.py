@@ -65,9 +65,11 @@ def test_reports_a_port_in_use(service: str, key: str) -> None:
     assert "Traceback" not in log
 
 
-def test_reports_a_wrong_setting_before_it_binds_anything() -> None:
-    status, log = ended(*SERVICE, "driver", "--set", "log_level=loud")
+@pytest.mark.parametrize("key", ["log_level", "driver.log_level"])
+def test_reports_a_wrong_setting_before_it_binds_anything(key: str) -> None:
+    status, log = ended(*SERVICE, "driver", "--set", f"{key}=loud")
     assert status == 2
+    assert "'loud' (from --set) is not one of" in log
     assert "driver.log_level" in log
     assert "Traceback" not in log
 
