@@ -1,6 +1,6 @@
 // The files of `kouxing export web`.
 
-import { halfToFloat } from "./math.js";
+import { floats, halfToFloat } from "./math.js";
 import { Network } from "./network.js";
 import { PhoneLm } from "./phone-lm.js";
 
@@ -51,7 +51,7 @@ function unpack(blob, places) {
     Object.entries(places).map(([name, { type, shape, begin }]) => {
       const size = shape.reduce((a, b) => a * b, 1);
       const stored = new ARRAYS[type](blob.buffer, blob.byteOffset + begin, size);
-      return [name, { shape, values: type === "float16" ? Float32Array.from(stored, halfToFloat) : stored }];
+      return [name, { shape, values: type === "float16" ? floats(stored, halfToFloat) : stored }];
     }),
   );
 }

@@ -1,6 +1,8 @@
 // The phone language model; services/recognizer/search/phone_lm.py explains it. A context is the
 // node of its last phone.
 
+import { floats } from "./math.js";
+
 export class PhoneLm {
   /** Node whose n-grams continue a node's. */
   contextOf;
@@ -19,8 +21,8 @@ export class PhoneLm {
     );
     const step = Math.fround(constants.modelFile.LOG_STEP);
     this.phone = phone;
-    this.#logProb = Float32Array.from(probs, (value) => -step * value);
-    this.logBackoff = Float32Array.from(backoffs, (value) => step * value);
+    this.#logProb = floats(probs, (value) => -step * value);
+    this.logBackoff = floats(backoffs, (value) => step * value);
     this.#firstChild = new Int32Array(children.length + 1);
     this.#firstChild[0] = 1;
     for (let node = 0; node < children.length; node++) this.#firstChild[node + 1] = this.#firstChild[node] + children[node];
