@@ -86,7 +86,7 @@ function targetNames(mesh, { json, associations }) {
   const { meshes, primitives = 0 } = associations.get(mesh);
   const { targets, extras } = json.meshes[meshes].primitives[primitives];
   const names = [extras, json.meshes[meshes].extras].map((found) => found?.targetNames).find(Array.isArray);
-  return targets.map(({ POSITION }, i) => (moves(mesh, i) ? String(names?.[i] ?? json.accessors[POSITION].name ?? i) : ""));
+  return targets.map(({ POSITION }, i) => (moves(mesh, i) ? String(names?.[i] ?? json.accessors[POSITION]?.name ?? i) : ""));
 }
 
 /** Return whether a morph target moves vertices. */

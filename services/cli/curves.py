@@ -10,6 +10,7 @@ import json
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -50,6 +51,7 @@ class Curves:
     phones: Sequence[Phone] | None = None  # spoken phones by onset; tables get a column for them
     source: Path | None = None  # recording
     duration_s: float | None = None  # duration of the recording; None: until the last frame
+    is_live: bool = False
 
 
 class CurveExporter(ABC):
@@ -82,10 +84,9 @@ class CurveExporter(ABC):
         """Write all frames of a motion and return their number."""
         rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
         duration_s = None if motion.samples is None else len(motion.samples) / MEDIA_RATE_HZ
-        with delete_on_error(self._output):
-            return self.write(
-                Curves(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
-            )
+        return self.write(
+            Curves(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
+        )
 
     @abstractmethod
     def write(self, curves: Curves) -> int:
@@ -109,7 +110,7 @@ class CsvExporter(CurveExporter):
             columns = ["time_s", *_value_names(self._form)]
             columns += [] if curves.phones is None else ["phone"]
             cells = (_cells(row, self._form, curves.phones) for row in curves.rows)
-        return _write_lines(self._output, map(",".join, chain([columns], cells))) - 1
+        return _write_lines(self._output, map(",".join, chain([columns], cells)), curves) - 1
 
 
 class JsonLinesExporter(CurveExporter):
@@ -120,7 +121,7 @@ class JsonLinesExporter(CurveExporter):
     def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
         lines = (json_line(row, self._form, curves.phones) for row in curves.rows)
-        return _write_lines(self._output, lines)
+        return _write_lines(self._output, lines, curves)
 
 
 class FapExporter(CurveExporter):
@@ -232,11 +233,12 @@ _LIVE_LINK_COLUMNS = [
 ]
 
 
-def _write_lines(output: Path, lines: Iterable[str]) -> int:
-    """Write each line when it arrives; return their number."""
+def _write_lines(output: Path, lines: Iterable[str], curves: Curves) -> int:
+    """Write each line when it arrives; return their number. An error leaves only live frames."""
     count = 0
+    guard = nullcontext() if curves.is_live else delete_on_error(output)
     try:
-        with output.open("w", encoding="utf-8", newline="") as file:
+        with output.open("w", encoding="utf-8", newline="") as file, guard:
             for count, line in enumerate(lines, start=1):  # noqa: B007
                 file.write(line + "\n")
                 file.flush()

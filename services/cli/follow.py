@@ -65,7 +65,8 @@ def follow(
                 count = _print(_phone_lines(respell(phones, inventory, alphabet)))
         else:
             rows = map(_row, arriving)
-            count = _print_frames(rows, form) if exporter is None else exporter.write(Curves(rows))
+            live = Curves(rows, is_live=True)
+            count = _print_frames(rows, form) if exporter is None else exporter.write(live)
     unit = "frame" if shows_faps else shown.value.removesuffix("s")
     if form is CurveForm.RHUBARB and output is None:
         unit = "mouth shape"

@@ -153,7 +153,7 @@ def main() -> None:
 
 def _run_command() -> None:
     try:
-        if "" in sys.argv:
+        if "" in sys.argv[1:]:
             raise UserError("an argument is empty; check the variables in your command")
         typer.main.get_command(app)(prog_name="kouxing")  # app() would replace sys.excepthook
     except UserError as error:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from kouxing.evaluation.commands import plot_heads
 from kouxing.services.cli.animation import Motion
 from kouxing.services.cli.batch import pair_outputs, process_all
-from kouxing.services.cli.curves import CURVE_EXPORTERS
+from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.driver.video.film import Frame
@@ -172,15 +172,37 @@ def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def test_an_interrupted_table_is_deleted(tmp_path: Path) -> None:
-    def frames() -> Iterator[Frame]:
-        yield 0.0, np.zeros(68, np.float32)
-        raise KeyboardInterrupt
+def interrupted_frames() -> Iterator[Frame]:
+    yield 0.0, np.zeros(68, np.float32)
+    raise KeyboardInterrupt
 
-    exporter = CURVE_EXPORTERS[".csv"](tmp_path / "face.csv", ExportOptions())
+
+def interrupt_export(output: Path) -> None:
+    exporter = CURVE_EXPORTERS[output.suffix](output, ExportOptions())
     with pytest.raises(KeyboardInterrupt):
-        exporter.export(Motion(cast(list[Frame], frames()), 50.0, 25.0, None), Progress())
+        exporter.export(
+            Motion(cast(list[Frame], interrupted_frames()), 50.0, 25.0, None), Progress()
+        )
+
+
+def test_an_interrupted_table_is_deleted(tmp_path: Path) -> None:
+    interrupt_export(tmp_path / "face.csv")
     assert not [*tmp_path.iterdir()]
+
+
+def test_an_old_output_is_kept_if_writing_has_not_begun(tmp_path: Path) -> None:
+    output = tmp_path / "face.fap"
+    output.write_text("old")
+    interrupt_export(output)
+    assert output.read_text() == "old"
+
+
+def test_an_interrupted_live_table_keeps_its_frames(tmp_path: Path) -> None:
+    output = tmp_path / "face.csv"
+    rows = ((time_s, 0, faps) for time_s, faps in interrupted_frames())
+    with pytest.raises(KeyboardInterrupt):
+        CURVE_EXPORTERS[".csv"](output, ExportOptions()).write(Curves(rows, is_live=True))
+    assert len(output.read_text().splitlines()) == 2
 
 
 @pytest.mark.parametrize("output", ["pictures", "face%03d.png"])

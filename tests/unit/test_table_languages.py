@@ -160,6 +160,7 @@ def test_reads_mixed_sentences() -> None:
 def test_units_of_mixed_sentences_belong_to_their_number() -> None:
     chinese = "".join(word for word, _ in words_of("universal", "USB线长1.5m，-5℃，I ran 5km"))
     assert chinese == "USB线长一点五米负五摄氏度Iran5km"
+    assert {"C", "F"} <= dict(words_of("universal", "3C产品在4F")).keys()
     korean = dict(words_of("universal", "약 5km 5G"))
     assert korean["5km"].endswith("kʰilomitʰʌ")
     assert korean["G"] == "d͡ʒi"

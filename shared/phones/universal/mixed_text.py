@@ -20,7 +20,7 @@ _LANGUAGES = {
     "KATAKANA": "japanese",
     "LATIN": "english",
 }
-_UNIT = re.compile(r"(?<=[0-9°])(?:km/h|[kcm]?m|[km]?g|m?l|[CF])(?![A-Za-z])")
+_UNIT = re.compile(r"(?:(?<=[0-9])(?:km/h|[kcm]?m|[km]?g|m?l)|(?<=°)[CF])(?![A-Za-z])")
 
 
 def read_mixed_text(text: str) -> Transcript:
