@@ -37,8 +37,10 @@ class FakeSockets:
         self.connect_ms = 300
         self.connections: list[FakeConnection] = []
         self.reach_error = ""
+        self.num_explained = 0
 
     def explain(self, endpoint: str, on_reason: Callable[[str], None]) -> None:
+        self.num_explained += 1
         on_reason(self.reach_error)
 
     def at(self, endpoint: str) -> list[FakeConnection]:

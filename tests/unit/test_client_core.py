@@ -117,6 +117,8 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     answer = scene.core.request("flush-session", "s")
     scene.pass_time(10.1)
     assert "control does not answer: another program" in str(answer.exception(0))
+    scene.pass_time(10.0)
+    assert scene.sockets.num_explained == 3  # an idle client does not connect again and again
 
 
 def test_status_collects_all_pages() -> None:

@@ -127,7 +127,7 @@ class ClientCore:
     def tick(self) -> None:
         """Repeat requests and ask about silent sessions; call this regularly."""
         now_s = self._sockets.now_s
-        has_failed = self._is_refused()
+        has_failed = bool(self.sessions) and self._is_refused()
         for request in self._requests.values():
             if now_s > request.end_s:
                 has_failed = True
