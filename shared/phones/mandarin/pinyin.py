@@ -69,7 +69,7 @@ _CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
 _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
 _LETTER = "[A-Za-z\u00c0-\u024f\u0300-\u036f]"
 _MARKED = "[āáǎàēéěèīíǐìōóǒòūúǔùǖǘǚǜńňǹḿĀÁǍÀĒÉĚÈŌÓǑÒ\u0300\u0301\u0304\u030c]"
-_TONED_WORD = f"(?:[a-zü:]+[1-5]|(?={_LETTER}*{_MARKED}){_LETTER}++)"
+_TONED_WORD = f"(?:[a-zü][a-zü:]*[1-5]|(?={_LETTER}*{_MARKED}){_LETTER}++)"
 _TONELESS = (
     "(?:de|le|ma|ba|ne|zi|men|tou|zhe|guo|a|ya|me|er|r|ge|li|shang)"  # after other syllables
 )
