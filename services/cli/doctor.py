@@ -36,7 +36,7 @@ class CheckResult(NamedTuple):
 
 
 def examine(address: str) -> Iterator[CheckResult]:
-    """Yield the result of each check; ``address`` of control is empty by default."""
+    """Yield the result of each check; if ``address`` is empty, control is the configured one."""
     control, config = find_system(address)
     control = control or config.control
     endpoint_address = control.partition(" ")[0]

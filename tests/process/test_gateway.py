@@ -445,5 +445,5 @@ async def test_without_control_browsers_are_told_to_start_it() -> None:
         await microphone.send_json({"sample_rate_hz": 16000})
         text = (await receive_json(microphone, "error"))["text"]
     assert "does not answer" in text
-    assert "start kouxing" in text
+    assert "kouxing run" in text
     assert gateway.stop() == 0
