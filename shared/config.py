@@ -345,8 +345,8 @@ def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
 def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str, str]:
     """Split the values of ``--set`` into keys and values.
 
-    The name of ``service`` before a key is left out. Raises ``UserError`` if one is not
-    ``KEY=VALUE``.
+    The name of ``service`` before a key is left out. Raises ``UserError`` if an assignment is
+    not ``KEY=VALUE``.
     """
     values = {}
     for assignment in assignments:

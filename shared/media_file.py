@@ -64,9 +64,10 @@ class WavPcm(NamedTuple):
 class MediaSound:
     """One audio track of a media file, with one or two channels.
 
-    ``track`` counts from 1. If it is None, the default track is read, or else the first, of those
-    that can be decoded. ``name`` is the file's, for messages. ``blocks`` yields the sample rate and
-    samples, (n, channels); the rate may change. ``warnings`` is complete after the last block.
+    ``track`` counts from 1. Without a number, the default track is read, or the first one if
+    no track is the default; tracks that cannot be decoded are ignored. ``name`` is the file's, for
+    messages. ``blocks`` yields the sample rate and samples, (n, channels); the rate may change.
+    ``warnings`` is complete after the last block.
 
     Raises ``UserError`` if FFmpeg cannot read the file, or it has no such track; while reading, if
     nothing can be decoded.

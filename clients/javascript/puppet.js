@@ -81,7 +81,7 @@ function checkTextures({ textures = [] }) {
   }
 }
 
-/** Return the names of a mesh's morph targets, "" without effect. Programs write them in different places. */
+/** Return the names of a mesh's morph targets, "" for targets without effect. Programs write them in different places. */
 function targetNames(mesh, { json, associations }) {
   const { meshes, primitives = 0 } = associations.get(mesh);
   const { targets, extras } = json.meshes[meshes].primitives[primitives];

@@ -203,7 +203,7 @@ def measure(
     if unknown:
         raise UserError(f"no fault is named {unknown[0]!r}; choose from {', '.join(FAULTS)}")
     sentence = to_16_khz(*read_audio(path))
-    undisturbed: list[ReceivedResults] = []  # once it was measured
+    undisturbed: list[ReceivedResults] = []  # empty until it is measured
     for name in names or FAULTS:
         also_at_s = timing.also_at_s if FAULTS[name].is_sudden else ()
         outcomes = []

@@ -1,4 +1,4 @@
-"""One client's audio on its way into a session, passed on immediately or in real time."""
+"""Forwards one client's audio to a session, immediately or in real time."""
 
 import asyncio
 import contextlib

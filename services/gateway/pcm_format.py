@@ -91,7 +91,7 @@ class PcmFormat:
 
 
 class NoiseCheck:
-    """Recognizes data that is not PCM of the announced format, until it has seen sound.
+    """Detects data that is not PCM of the announced format. Checks only up to the first sound.
 
     Compressed data, 24-bit, float or big-endian samples sound like loud white noise if they are
     read as 16-bit samples.
@@ -104,7 +104,7 @@ class NoiseCheck:
         self._num_noisy = 0
 
     def check(self, pcm: bytes) -> None:
-        """Judge whole samples.
+        """Check complete samples.
 
         Raises ``UserError`` if they are noise.
         """

@@ -57,7 +57,7 @@ CONTROL_MISSING_S = 8.0  # delay of reporting that control is missing; a restart
 
 @dataclass(slots=True)
 class _FollowedSession:
-    """A session. The gateway subscribes to it when someone first needs it, until it ends."""
+    """A session to which the gateway subscribes, from its first use until it ends."""
 
     follower: ServiceFollower
     syllables: SyllableTrack

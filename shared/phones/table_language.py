@@ -166,7 +166,7 @@ class TableLanguage:
         return [[(piece, piece) for piece in some] for some in pieces]
 
     def _is_split(self, token: re.Match[str]) -> bool:
-        """Return whether a token is words of a phrase; other readable words are phrases."""
+        """Return whether a token is part of a phrase; other readable words are whole phrases."""
         word = token["word"]
         return bool(word) and self._is_readable(word) and not _CAMEL_CASE.search(word)
 
@@ -174,7 +174,7 @@ class TableLanguage:
         return word in _SIGNS or all(map(self._has_letter, filter(str.isalpha, word)))
 
     def _is_foreign(self, word: str) -> bool:
-        """Return whether a word is Latin and the language is not; it is read as English."""
+        """Return whether a word is read as English: it is Latin, and the language is not."""
         return _LATIN not in self.scripts and word.isascii() and word[0].isalpha()
 
     def _has_letter(self, letter: str) -> bool:
@@ -190,7 +190,7 @@ class TableLanguage:
 
 
 def _any_of(forms: Sequence[str]) -> str:
-    """Return a pattern for any of some forms, which are not parts of Latin words or numbers."""
+    """Return a pattern that finds any of the forms, except inside Latin words and numbers."""
     either = "|".join(map(re.escape, sorted(forms, key=len, reverse=True))) or "(?!)"
     after = r"(?<![A-Za-z](?=[A-Za-z]))(?<![0-9/.](?=[0-9]))"
     return rf"{after}(?:{either})(?!(?<=[A-Za-z])[^\W\d_]|(?<=[0-9])[0-9/])"

@@ -198,7 +198,7 @@ def test_reads_a_gltf_with_its_buffer_in_its_folder_only(tmp_path: Path) -> None
             load_head(str(gltf))
     document["buffers"][0]["uri"] = "other.bin"
     gltf.write_text(json.dumps(document), encoding="utf-8")
-    with pytest.raises(UserError, match=r"my\.gltf: it lacks its file 'other.bin'; copy it"):
+    with pytest.raises(UserError, match=r"my\.gltf: its file 'other.bin' is missing; copy it"):
         load_head(str(gltf))
 
 

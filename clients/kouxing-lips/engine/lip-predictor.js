@@ -25,7 +25,7 @@ export class LipPredictor {
     const inTime = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
     this.#delayS = inTime.at(-1) ?? delaysS[0];
     const { projection, entry_weights, input_weights, state_weights, output_bias } = this.#weights;
-    const entry = product(projection, entry_weights); // nothing is between these two
+    const entry = product(projection, entry_weights); // no activation separates these two layers
     const [numFeatures, width] = entry.shape;
     const gates = input_weights.shape[1];
     const stateAt = Math.ceil(numFeatures / LANES) * LANES;

@@ -8,7 +8,7 @@ export class LogMel {
   #floor;
   #bands; // weights of the bins from the first edge of each band
   #edges;
-  #root; // the size is its square
+  #root; // square root of the size
   #columns; // { cosines, sines } of 2 pi k n / root, (root, root)
   #rotations; // { cosines, sines } of 2 pi k n / size, (root, root)
   #windowed; // samples, (root, root)
@@ -87,7 +87,7 @@ export class LogMel {
     }
     for (let k = 0; k <= half; k++) {
       for (let row = 0; row < half; row++) {
-        // even and odd terms; the bin half of the rows later has the odd ones with the other sign
+        // even and odd terms; in the bin half of the rows later, the odd terms have the opposite sign
         let [evenReal, evenImaginary, oddReal, oddImaginary] = [0, 0, 0, 0];
         for (let n = 0, at = k * root, wave = row * root; n < half; n++, at += 2, wave += 2) {
           evenReal += real[at] * cosines[wave] + imaginary[at] * sines[wave];

@@ -19,14 +19,14 @@ export function smoothingShare(elapsedS, timeConstantS) {
   return -Math.expm1(-elapsedS / timeConstantS);
 }
 
-/** Return a function of each value of an array. Float32Array.from() takes ten times longer. */
+/** Apply a function to each value of an array. Float32Array.from() takes ten times longer. */
 export function floats(values, compute) {
   const out = new Float32Array(values.length);
   for (let i = 0; i < out.length; i++) out[i] = compute(values[i]);
   return out;
 }
 
-/** Return the values of some arrays, one after the other. */
+/** Concatenate arrays. */
 export function join(parts) {
   const joined = new Float32Array(parts.reduce((sum, { length }) => sum + length, 0));
   let at = 0;

@@ -89,7 +89,7 @@ export class Resampler {
     return out.slice(0, numReady);
   }
 
-  /** Return the place of the first known sample that a sample of the result depends on. */
+  /** Return the index, among the known samples, of the first one that an output sample depends on. */
   #neededFrom(number) {
     return Math.floor((number * this.#down) / this.#up) - this.#half + 1 - this.#first;
   }

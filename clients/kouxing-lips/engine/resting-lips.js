@@ -2,7 +2,7 @@
 
 import { Transition } from "./trajectory.js";
 
-/** The fraction of the ajar mouth in one session. */
+/** Tracks how far the mouth is ajar in one session. */
 export class RestingLips {
   #c; // constants
   #levels = []; // levels of future frames: [time s, dB]

@@ -58,7 +58,7 @@ class Client(BaseClient):
         self.close()
 
     def close(self) -> None:
-        """Close all connections. Control closes sessions that are still open after a minute."""
+        """Close all connections. After a minute, control closes sessions that are still open."""
         self._thread.close()
 
     def open_session(

@@ -61,7 +61,7 @@ class ClientCore:
         self._make_signal = make_signal
         self._requests: dict[str, _Request] = {}
         self._refused_s = math.inf  # when control started to reject this key
-        self._is_explaining = False  # why control does not answer
+        self._is_explaining = False  # finding out why control does not answer
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
         self._asked_s: dict[str, float] = {}  # when control was asked about a silent session
         self._events: Connection | None = None
@@ -169,7 +169,7 @@ class ClientCore:
             self._sockets.send(self._commands, request.parts)
 
     def _is_refused(self) -> bool:
-        """Return whether control rejects this key, longer than a temporary penalty."""
+        """Return whether control has rejected this key for longer than a temporary penalty."""
         return self._sockets.now_s > self._refused_s + self._timeout_s
 
     def _give_up(self, reason: str) -> None:

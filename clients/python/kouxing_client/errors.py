@@ -1,4 +1,4 @@
-"""Errors, whose messages are meant for the user."""
+"""Errors whose messages are written for the user."""
 
 
 class KouxingError(Exception):

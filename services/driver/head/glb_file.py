@@ -119,7 +119,7 @@ class Glb:
                 f"it refers to {uri!r}, which is not in its folder; export it as .glb"
             )
         if not (self._folder / path).exists():
-            raise BadGlbError(f"it lacks its file {uri!r}; copy it there too, or export as .glb")
+            raise BadGlbError(f"its file {uri!r} is missing; copy it too, or export as .glb")
         return self._read(self._folder / path)
 
     def _load_buffer(self, index: int) -> bytes:

@@ -206,8 +206,8 @@ def _check_single_face(pieces: list[Primitive], known: Names) -> None:
 def _upright(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Float64:
     """Return the rotation (3, 3) after which y is up and the face looks along z.
 
-    It is by right angles, and then by the remaining angle of the eyes if that is large. For a
-    mirrored face, the result is also a reflection, which undoes the mirroring.
+    It turns by right angles, and then by the remaining angle of the eyes if that is large. For a
+    mirrored face, the result also contains a reflection, which undoes the mirroring.
     """
     side = eyes[0] - eyes[1]
     x = int(np.abs(side).argmax())

@@ -306,7 +306,7 @@ class _Skin:
         return matrices
 
     def mean(self, values: Mapping[int, float]) -> Float64:
-        """Return the weighted mean (V,) of the values of each vertex's joints; others have 0."""
+        """Return each vertex's weighted mean (V,) of joint values. Missing values count as 0."""
         of_joint = np.array([values.get(joint, 0.0) for joint in self._joints])
         mean: Float64 = (self._weights * of_joint[self._index]).sum(axis=1)
         return mean

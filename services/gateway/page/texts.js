@@ -212,7 +212,7 @@ export const TEXTS = {
   sendAgain: { en: "Send again", zh: "重发" },
   lessonStarting: { en: "Starting camera and microphone …", zh: "正在启动摄像头和麦克风…" },
   lessonSlowStart: {
-    en: "Starting takes longer: this computer or its connection is slow. Please close other programs.",
+    en: "Starting is taking longer than usual: this computer or its connection is slow. Please close other programs.",
     zh: "启动较慢：这台电脑或网络较慢，请关闭其他程序。",
   },
   lessonShowFace: { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" },

@@ -27,7 +27,7 @@ from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _BREATH_OPENING = 0.3  # share of an open vowel's opening
-_LAUGH_OPENING = (0.12, 0.58)  # of silence, and additionally of the loudest notes
+_LAUGH_OPENING = (0.12, 0.58)  # the same, in silence and added by the loudest notes
 _LAUGH_DEG, _BREATH_DEG = (-2.5, -2.0), -1.2  # the head's pitch; upwards
 _LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
 _LAUGH_EASE_S = 0.045  # time constant of each filter pole; notes remain visible

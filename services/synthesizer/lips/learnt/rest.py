@@ -60,7 +60,7 @@ AJAR = np.array([_AJAR_FAPS.get(fap, 0.0) for fap in MOUTH_FAPS])  # (num_mouth_
 
 
 class RestingLips:
-    """The fraction of the ajar mouth in one session."""
+    """Tracks how far the mouth is ajar in one session."""
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
