@@ -182,12 +182,12 @@ def test_rejects_nan_and_accepts_empty_chunks_silence_and_clipping(
 ) -> None:
     with client.open_session(encoding="f32le", paced=False) as session:
         sent = Stream(session)
-        session.push(np.array([0.0, np.nan, 0.0], np.float32))
+        session.push(np.array([0.0, np.nan, 0.0], np.float32).tobytes())
         errors: list[Refused] = []
         wait_until(lambda: errors, step=lambda: errors.extend(session.take_errors()))
         assert [error.code for error in errors] == ["bad-audio"]
         for samples in (np.zeros(0), np.zeros(8000), np.full(8000, 1e9)):
-            session.push(samples.astype(np.float32))
+            session.push(samples.astype(np.float32).tobytes())
         sent.finish()
     assert sent.times[-1] >= 16000
     assert np.isfinite(sent.faps).all()

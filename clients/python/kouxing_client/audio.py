@@ -49,11 +49,11 @@ def _pack(numbers: memoryview[Any] | array[float], encoding: str) -> bytes:
     is_integer = isinstance(numbers, memoryview) and numbers.format == "h"
     if len(numbers) and not is_integer:
         lowest, highest = min(numbers), max(numbers)
-        is_small = -_MAX_FLOAT <= lowest <= highest <= _MAX_FLOAT
-        if not (is_small and isfinite(sum(numbers))):  # the sum finds every NaN
+        is_finite = isfinite(sum(numbers))  # the sum finds every NaN
+        if not (is_finite and -_MAX_FLOAT <= lowest <= highest <= _MAX_FLOAT):
             raise KouxingError(
-                "audio must be 16-bit integers (array type int16), or floats within ±1, not"
-                f" {lowest:g} to {highest:g}"
+                "audio must be 16-bit integers (array type int16), or floats within ±1, not "
+                + (f"{lowest:g} to {highest:g}" if is_finite else "NaN or infinity")
             )
     scaled: Iterable[float] = numbers
     if encoding == "s16le" and not is_integer:
