@@ -173,7 +173,7 @@ def universal(
     seed: Seed = 0,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of steps, each with 19 s of audio.")
-    ] = 4000,
+    ] = 2000,
     force: Force = False,
 ) -> None:
     """Train the universal phones, a readout of the shipped block model, and write its model card.

@@ -44,7 +44,7 @@ def train_universal(
     languages: Sequence[Path] = (),
     clips: Path | None = None,
     seed: int = 0,
-    num_steps: int = 4000,
+    num_steps: int = 2000,
 ) -> None:
     """Train the universal readout of the shipped block model, and write it with its card.
 
