@@ -133,8 +133,8 @@ export const TEXTS = {
   lips: { en: "Lips", zh: "口型" },
   speechLanguage: { en: "Speech language", zh: "说话的语言" },
   speechErrors: {
-    en: "The lips follow any language. Phonetic feature errors: Mandarin 2 %, German 6 %, English 7 to 13 %, Italian 9 %, Korean 24 %. Other languages were not measured.",
-    zh: "口型适用于任何语言。音素特征错误率：普通话 2%，德语 6%，英语 7% 至 13%，意大利语 9%，韩语 24%；其他语言未测。",
+    en: "The lips follow any language. Phonetic feature errors: Mandarin 2 %, German 6 %, English 7 to 13 %, Italian 8 %, Korean 26 %. Other languages were not measured.",
+    zh: "口型适用于任何语言。音素特征错误率：普通话 2%，德语 6%，英语 7% 至 13%，意大利语 8%，韩语 26%；其他语言未测。",
   },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
   captions: { en: "Captions", zh: "字幕" },
