@@ -47,12 +47,14 @@ def split_words(texts: Sequence[str]) -> list[list[tuple[str, str]]]:
     return [[(word, spoken or word) for word, _, spoken in row] for row in rows]
 
 
-def read_number(number: str) -> str:
-    """Return the kana of a number with its sign and counter, such as 3時 or -5度.
+def read_numbers(numbers: Sequence[str]) -> list[str]:
+    """Return the kana of each number with its sign and counter, such as 3時 or -5度.
 
     Raises ``UserError`` like ``split_words``.
     """
     from wetext import Normalizer  # noqa: PLC0415 (takes 0.3 s)
 
-    (words,) = split_words([Normalizer(lang="ja", operator="tn").normalize(number)])
-    return "".join(spoken for _, spoken in words)
+    normalize = Normalizer(lang="ja", operator="tn").normalize
+    return [
+        "".join(spoken for _, spoken in words) for words in split_words([*map(normalize, numbers)])
+    ]

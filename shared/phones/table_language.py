@@ -34,7 +34,7 @@ from itertools import chain
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.espeak import transcribe_phrases
-from kouxing.shared.phones.mecab import has_mecab, read_number, split_words
+from kouxing.shared.phones.mecab import has_mecab, read_numbers, split_words
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 from kouxing.shared.phones.universal.segments import (
     ipa_of,
@@ -115,11 +115,12 @@ class TableLanguage:
         if _LATIN not in self.scripts:
             plain = _LATIN_EDGE.sub(" ", plain)
         tokens = list(self._tokens.finditer(plain))
+        numbers = iter(self._say_numbers([token for token in tokens if token["number"]]))
         readings = iter(self._split([token["word"] for token in tokens if self._is_split(token)]))
         for token in tokens:
             word = token[0]
             if token["number"]:
-                phrases += [(word, self._say_number(token))], []
+                phrases += [(word, next(numbers))], []
             elif token["short"]:
                 phrases += [(word, self.short[word])], []
             elif token["other"]:
@@ -145,8 +146,15 @@ class TableLanguage:
             rf"(?P<unit>{_any_of(endings)}| ?{_any_of([*units])})?)|{_WORD}"
         )
 
+    def _say_numbers(self, tokens: Sequence[re.Match[str]]) -> list[str]:
+        """Return each number as text for espeak-ng."""
+        numbers = [*map(self._say_number, tokens)]
+        return (
+            read_numbers(numbers) if numbers and self.words == _MECAB and has_mecab() else numbers
+        )
+
     def _say_number(self, token: re.Match[str]) -> str:
-        """Return a number as text for espeak-ng: $5 is 5 dollars."""
+        """Return a number with its sign and unit in words: $5 is 5 dollars."""
         unit = (token["unit"] or "").strip()
         spoken = self.units.get(unit, unit)
         number = token["digits"].replace(" ", "")
@@ -156,7 +164,7 @@ class TableLanguage:
         number = (token["sign"] or "") + number
         for pattern, replacement in self.numbers:
             number = re.sub(pattern, replacement, number)
-        return read_number(number) if self.words == _MECAB and has_mecab() else number
+        return number
 
     def _split(self, texts: list[str]) -> list[list[tuple[str, str]]]:
         """Return the words of each text without spaces, each with the text for espeak-ng."""
