@@ -1,11 +1,11 @@
-"""A lip predictor with random weights for the shipped ear."""
+"""A lip predictor with random weights for the shipped encoder."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS, LipPredictor
 
-NUM_FEATURES, NUM_COMPONENTS, UNITS, NUM_LIPS = 160 + 307, 6, 5, 51  # log-mel, ear's features
+NUM_FEATURES, NUM_COMPONENTS, UNITS, NUM_LIPS = 160 + 307, 6, 5, 51  # log-mel, encoder's features
 DELAYS_S = (-0.005, 0.055, 0.155)
 
 

@@ -195,7 +195,7 @@ def universal(
 
 
 @app.command()
-def ear(
+def encoder(
     corpus: Corpora,
     output: Model,
     whisper: Whisper,
@@ -209,14 +209,14 @@ def ear(
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
-    """Train the small ear, a network for lips and voice, and write its model card.
+    """Train the audio encoder, a network for lips and voice, and write its model card.
 
     Repeat the command to resume an interrupted run.
     """
     with _neural_training(output, force=force):
-        from kouxing.training.ear.recipe import train_ear
+        from kouxing.training.encoder.recipe import train_encoder
 
-    train_ear(
+    train_encoder(
         corpus,
         output,
         whisper=whisper,

@@ -1,4 +1,4 @@
-"""Training of the readout of arousal, valence, laughter and breath from the small ear's state.
+"""Training of the readout of arousal, valence, laughter and breath from the audio encoder's state.
 
 Both parts are ridge regressions on standardized states. Each recording is used twice, unchanged and
 augmented (:mod:`kouxing.training.networks.augmentation`).
@@ -32,7 +32,7 @@ from kouxing.corpora.emotions import FEELINGS, read_emotions, speakers_of
 from kouxing.corpora.feature_cache import as_floats, read_audio
 from kouxing.corpora.sounds import read_sounds
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
+from kouxing.services.recognizer.encoder import EncoderOutput, Voice, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.training.model_card import write_card
@@ -59,7 +59,7 @@ def train_traits(
     means, targets, owners = [], [], []  # one entry per recording with an emotion
     rows, labels = [], []  # positions
     for recording in track(speech, description="speech"):
-        for positions in _ear_positions(read_audio(recording.path), rng):
+        for positions in _encoder_outputs(read_audio(recording.path), rng):
             states = np.stack([position.state for position in positions])
             rows.append(states[::_OTHER_STEP])
             labels.append(np.zeros((len(rows[-1]), len(_TRAITS)), np.float32))
@@ -70,7 +70,7 @@ def train_traits(
     for sound in track(read_sounds(sounds, shipping=shipping), description="sounds"):
         if not sound.is_held_out:
             is_trait = [sound.kind == trait for trait in _TRAITS]
-            for positions in _ear_positions(as_floats(sound.samples), rng):
+            for positions in _encoder_outputs(as_floats(sound.samples), rng):
                 states = np.stack([position.state for position in positions])
                 rows.append(states if any(is_trait) else states[::_OTHER_STEP])
                 labels.append(np.tile(np.array(is_trait, np.float32), (len(rows[-1]), 1)))
@@ -89,7 +89,7 @@ def train_traits(
     write_card(
         output,
         title="Voice traits",
-        details=f"a linear readout of the small ear's state, seed {seed}",
+        details=f"a linear readout of the audio encoder's state, seed {seed}",
         recordings=speech,
         notes=(
             f"{len(spoken)} recordings of {len(speakers_of(spoken))} actors name an emotion "
@@ -102,18 +102,18 @@ def train_traits(
     )
 
 
-def _ear_positions(samples: Floats, rng: np.random.Generator) -> Iterator[list[EarPosition]]:
-    """Yield the ear's positions for samples, unchanged and augmented."""
+def _encoder_outputs(samples: Floats, rng: np.random.Generator) -> Iterator[list[EncoderOutput]]:
+    """Yield the encoder's positions for samples, unchanged and augmented."""
     for sound in (samples, scale_level(disturb(samples, rng), rng)):
         frames = WhisperMel().accept_waveform(sound)
-        ear = load_ear().create_stream()
+        encoder = load_encoder().create_stream()
         yield [
-            ear.accept_position(frames[start : start + FRAMES_PER_POSITION])
+            encoder.accept_position(frames[start : start + FRAMES_PER_POSITION])
             for start in range(0, len(frames) - FRAMES_PER_POSITION + 1, FRAMES_PER_POSITION)
         ]
 
 
-def _mean_state(positions: Sequence[EarPosition], states: Floats) -> Floats:
+def _mean_state(positions: Sequence[EncoderOutput], states: Floats) -> Floats:
     voice = np.stack([position.voice for position in positions])
     is_voiced = voice[:, Voice.SPEECH] + voice[:, Voice.SUNG] > MIN_VOICE
     if is_voiced.sum() >= _MIN_VOICED:

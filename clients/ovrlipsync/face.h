@@ -4,7 +4,7 @@
 
 #include <stdbool.h>
 
-#include "ear.h"
+#include "encoder.h"
 
 enum { MAX_KNOTS = 64, MAX_QUEUE = 32, MAX_LEVELS = 64, MAX_CHANGES = 16, NUM_SHAPES = SHAPES_OCULUS_GRAM_SIZE_0 };
 

@@ -29,7 +29,7 @@ struct Lips {
   int num_sound;
   int num_mel_frames; /* of the next position */
   int num_frames;
-  Ear ear;
+  AudioEncoder encoder;
   LipPredictor predictor;
   float recent[MAX_RECENT][NUM_FEATURES]; /* the positions before speech */
   int num_recent;
@@ -145,10 +145,10 @@ static void start_speech(Lips *lips) {
 
 /* Detect speech; speech_segmenter.py and vad.py have the rules. */
 static void process_position(Lips *lips) {
-  const double probability = lips->ear.voice;
+  const double probability = lips->encoder.voice;
   if (!lips->is_speaking) {
     if (lips->num_recent == MAX_RECENT) memmove(lips->recent[0], lips->recent[1], --lips->num_recent * sizeof lips->recent[0]);
-    memcpy(lips->recent[lips->num_recent++], lips->ear.features, sizeof lips->recent[0]);
+    memcpy(lips->recent[lips->num_recent++], lips->encoder.features, sizeof lips->recent[0]);
   }
   lips->num_improbable = probability >= VAD_IMPROBABLE ? 0 : lips->num_improbable + 1;
   if (lips->is_speech) lips->is_speech = lips->num_improbable < VAD_STOP_POSITIONS;
@@ -158,22 +158,22 @@ static void process_position(Lips *lips) {
     if (lips->is_speech) lips->evidence = 0.0;
   }
   if (lips->is_speaking && !lips->is_speech) change_speech(lips, false, lips->num_frames);
-  else if (lips->is_speaking) predict(lips, lips->ear.features, lips->num_frames - 1);
+  else if (lips->is_speaking) predict(lips, lips->encoder.features, lips->num_frames - 1);
   else if (lips->is_speech) start_speech(lips);
 }
 
-/* Add the sound of the current slice to the windows of the ear. */
+/* Add the sound of the current slice to the windows of the encoder. */
 static void analyze_slice(Lips *lips) {
   for (int i = 0; i < SLICE; i++) {
     lips->sound[lips->num_sound++] = lips->slice[i];
     if (lips->num_sound < MEL_WINDOW_SAMPLES) continue;
-    log_mel(lips->sound, lips->ear.features + lips->num_mel_frames++ * MEL_NUM_MELS);
+    log_mel(lips->sound, lips->encoder.features + lips->num_mel_frames++ * MEL_NUM_MELS);
     lips->num_sound -= MEL_HOP_SAMPLES;
     memmove(lips->sound, lips->sound + MEL_HOP_SAMPLES, lips->num_sound * sizeof(float));
     if (lips->num_mel_frames < FRAMES) continue;
     lips->num_mel_frames = 0;
     lips->num_frames += FRAMES;
-    ear_process(&lips->ear);
+    encoder_process(&lips->encoder);
     process_position(lips);
   }
 }
@@ -197,7 +197,7 @@ static void take_sample(Lips *lips, float sample) {
   }
 }
 
-void lips_init(void) { ear_init_tables(); }
+void lips_init(void) { encoder_init_tables(); }
 
 Lips *lips_create(int rate_hz) {
   Lips *lips = calloc(1, sizeof *lips);
@@ -235,4 +235,4 @@ double lips_newest(const Lips *lips, float *weights) {
   return (double)lips->num_in / lips->rate_hz - fmax(newest_s, 0.0);
 }
 
-float lips_laughter(const Lips *lips) { return (float)fmin(fmax(lips->ear.laughter, 0.0), 1.0); }
+float lips_laughter(const Lips *lips) { return (float)fmin(fmax(lips->encoder.laughter, 0.0), 1.0); }

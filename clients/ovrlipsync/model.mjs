@@ -16,7 +16,7 @@ const WORD_BYTES = 8;
 
 const [models, folder] = process.argv.slice(2);
 const model = await loadModel(pathToFileURL(`${resolve(models)}/`));
-const { tensors } = readGraph(new Uint8Array(await readFile(join(models, "ear.onnx"))));
+const { tensors } = readGraph(new Uint8Array(await readFile(join(models, "encoder.onnx"))));
 const sources = (await readdir(import.meta.dirname)).filter((name) => /\.[ch]$/.test(name));
 const code = await Promise.all(sources.map((name) => readFile(join(import.meta.dirname, name), "utf8")));
 const used = new Set(code.join().match(/[A-Z]\w+/g)); // other constants are left out
@@ -28,12 +28,12 @@ for (const layer of LAYERS) {
   const { shape, values } = tensors[`${layer}.integers`];
   const [rows, columns] = shape;
   const transposed = Int8Array.from({ length: rows * columns }, (_, i) => values[(i % rows) * columns + Math.floor(i / rows)]);
-  addArray(`ear.${layer}.integers`, transposed, [columns, rows]);
-  for (const name of ["scales", "bias"]) addArray(`ear.${layer}.${name}`, tensors[`${layer}.${name}`].values);
+  addArray(`encoder.${layer}.integers`, transposed, [columns, rows]);
+  for (const name of ["scales", "bias"]) addArray(`encoder.${layer}.${name}`, tensors[`${layer}.${name}`].values);
 }
-for (const name of ["step", "min_scale"]) define(`ear.${name}`, tensors[name].values[0]);
-define("ear.num_features", tensors["features.lengths"].values[0]);
-define("ear.num_phones", tensors["features.lengths"].values[1]);
+for (const name of ["step", "min_scale"]) define(`encoder.${name}`, tensors[name].values[0]);
+define("encoder.num_features", tensors["features.lengths"].values[0]);
+define("encoder.num_phones", tensors["features.lengths"].values[1]);
 const entry = product(model.arrays["lips.projection"], model.arrays["lips.entry_weights"]);
 addArray("lips.entry", entry.values, entry.shape);
 for (const [name, { values, shape }] of Object.entries(model.arrays)) if (ARRAYS.test(name)) addArray(name, values, shape);

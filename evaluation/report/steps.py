@@ -20,7 +20,10 @@ _TABLES = " ".join(f"--from-csv {{rivals}}/{name}" for name in PROGRAMS)
 _RECOGNIZER = (
     "evaluation/recognizer/error_rates.py",
     "shared/phones/mandarin",
-    *(f"services/recognizer/models/{name}.npz" for name in ("blocks", "ear", "gmm", "phone_lm")),
+    *(
+        f"services/recognizer/models/{name}.npz"
+        for name in ("blocks", "encoder", "gmm", "phone_lm")
+    ),
 )
 _FACES = (
     "services/recognizer/models/*.npz",

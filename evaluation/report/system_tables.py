@@ -100,7 +100,7 @@ def _browser(results: Results) -> Iterator[list[str]]:
         "look-ahead + half a frame",
     ]
     models = results.get("sizes", {}).get("model_bytes", {})
-    needed = sum(models.get(name, 0) for name in ("ear", "lips", "traits", "phone_lm")) / 1e6
+    needed = sum(models.get(name, 0) for name in ("encoder", "lips", "traits", "phone_lm")) / 1e6
     for package in (browser, *browser["others"]):
         is_ours = package is browser
         yield [

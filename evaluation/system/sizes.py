@@ -3,7 +3,7 @@
 The floor is the number of multiplications and additions of the networks in a second of speech,
 divided by the rate of one core. This rate is four times that of a float32 matrix product, because
 the weights have 8 bits. The block network processes its block and its right context in each run,
-the small ear each position once.
+the audio encoder each position once.
 """
 
 import time
@@ -15,14 +15,14 @@ from rich.console import Console
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import MODELS, load_model
-from kouxing.services.recognizer.ear import EAR_PATH
+from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.terminal import print_table
 
 _SIZE, _MEASURE_S = 512, 0.5
 _POSITIONS_PER_S = 50
 _INT8_SPEED_UP = 4
-_BLOCKS, _EAR = "block network", "small ear"
+_BLOCKS, _ENCODER = "block network", "audio encoder"
 _OPERATIONS = 2  # per weight and position
 
 
@@ -40,7 +40,7 @@ class Sizes:
 
         The block network runs once in ``hop`` blocks, 4 under load.
         """
-        gflop = self.network_gflop_per_s[_BLOCKS] / hop + self.network_gflop_per_s[_EAR]
+        gflop = self.network_gflop_per_s[_BLOCKS] / hop + self.network_gflop_per_s[_ENCODER]
         return gflop / (_INT8_SPEED_UP * self.gemm_gflops)
 
 
@@ -49,10 +49,10 @@ def measure() -> Sizes:
     blocks = load_model("blocks")
     assert isinstance(blocks, BlockModel)  # noqa: S101 - the file of this name is one
     sizes = blocks.session.sizes
-    ear_bytes = len(np.load(EAR_PATH, allow_pickle=False)["network"])
+    encoder_bytes = len(np.load(ENCODER_PATH, allow_pickle=False)["network"])
     weighted_positions = {  # weights are bytes; positions per second of speech
         _BLOCKS: len(blocks.network) * sizes.length * _POSITIONS_PER_S / sizes.block,
-        _EAR: ear_bytes * _POSITIONS_PER_S,
+        _ENCODER: encoder_bytes * _POSITIONS_PER_S,
     }
     return Sizes(
         model_bytes={path.stem: path.stat().st_size for path in sorted(MODELS.glob("*.npz"))},

@@ -1,14 +1,14 @@
 """Writes the models for lip sync in a browser, which ``clients/kouxing-lips`` reads.
 
-=============== ====================================================================
-file            contents
-=============== ====================================================================
-``ear.onnx``    the network of the small ear, unchanged
-``model.bin``   arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
-``phones.bin``  arrays: HMMs and phone language model, needed only for phones
-``blocks.onnx`` the block network, unchanged, needed only for final phones
-``model.json``  types, shapes and offsets of these arrays; constants of the modules
-=============== ====================================================================
+================ ====================================================================
+file             contents
+================ ====================================================================
+``encoder.onnx`` the network of the audio encoder, unchanged
+``model.bin``    arrays: mel bands, lip predictor, readout of feeling, blendshapes, expressions
+``phones.bin``   arrays: HMMs and phone language model, needed only for phones
+``blocks.onnx``  the block network, unchanged, needed only for final phones
+``model.json``   types, shapes and offsets of these arrays; constants of the modules
+================ ====================================================================
 
 The constants come from the modules that the server runs, so a new model or threshold needs only a
 new export.
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer import (
-    ear,
+    encoder,
     lip_frames,
     lip_predictor,
     live_decoder,
@@ -68,7 +68,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         decoder,
         "IMPOSSIBLE _BEAM _MAX_TOKENS _SLOW_RATE _RATE_FRAMES _MAX_PENALTY_CHANGE",
     ),
-    "ear": (ear, "PHONES_LAG_FRAMES"),
+    "encoder": (encoder, "PHONES_LAG_FRAMES"),
     "expression": (
         expression_motion,
         "CLOSED OPEN JAW UPPER LOWER _VISIBLE _EASE_S _FADE_S _FREE_S _BIND_S _WIDEST _WIDEST_JAW",
@@ -123,7 +123,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
 
 def web_model() -> dict[str, bytes]:
     """Return the contents of the files by name."""
-    small_ear = ear.load_ear()
+    audio_encoder = encoder.load_encoder()
     readout = voice_traits.load_voice_readout()
     predictor = lip_predictor.load_lip_predictor()
     arrays: dict[str, NDArray[Any]] = {
@@ -156,8 +156,8 @@ def web_model() -> dict[str, bytes]:
     settings = SynthesizerConfig()
     header = {
         "format": FORMAT,
-        "stateWidth": small_ear.state_width,
-        "voices": {voice.name: int(voice) for voice in ear.Voice},
+        "stateWidth": audio_encoder.state_width,
+        "voices": {voice.name: int(voice) for voice in encoder.Voice},
         "numFaps": NUM_FAPS,
         "mouthFaps": MOUTH_FAPS,
         "closureRule": asdict(closures.ClosureRule()),
@@ -185,7 +185,7 @@ def web_model() -> dict[str, bytes]:
         "phoneArrays": phone_places,
     }
     return {
-        "ear.onnx": _network_in(read_archive(ear.EAR_PATH)),
+        "encoder.onnx": _network_in(read_archive(encoder.ENCODER_PATH)),
         "blocks.onnx": _network_in(block_archive),
         "model.bin": blob,
         "phones.bin": phone_blob,

@@ -30,7 +30,7 @@ class LipInputs:
     def process_position(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Store the ear's features at a position."""
+        """Store the encoder's features at a position."""
         self.known_s.append(known_s)
         self.features.append(features_at(frames, features).astype(np.float16))
         return []
@@ -41,7 +41,7 @@ class LipInputs:
 
 
 def record_positions(samples: Floats) -> LipInputs:
-    """Run the small ear over a recording, 16 kHz mono, (n,)."""
+    """Run the audio encoder over a recording, 16 kHz mono, (n,)."""
     positions = LipInputs()
     segmenter = SpeechSegmenter(WhisperMel(), positions)
     for _ in segmenter.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ)):

@@ -1,7 +1,7 @@
 """The interface of a model that predicts lip frames from the audio.
 
-It gets what the small ear computes at every position, 50 times a second during speech, and predicts
-lip frames. A model offers several delays, of which the recognizer chooses one.
+It gets what the audio encoder computes at every position, 50 times a second during speech, and
+predicts lip frames. A model offers several delays, of which the recognizer chooses one.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class LipFrameStream(Protocol):
     def process_position(
         self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
     ) -> list[LipPositions]:
-        """Return the lip frames that follow from what the ear computes at a position.
+        """Return the lip frames that follow from what the encoder computes at a position.
 
         Parameters
         ----------
@@ -32,7 +32,7 @@ class LipFrameStream(Protocol):
         frames
             Its two newest log-mel frames, shape (2, 80).
         features
-            The ear's features, shape (features,).
+            The encoder's features, shape (features,).
         """
 
     def reset(self) -> None:

@@ -1,4 +1,4 @@
-"""The lip predictor: mouth shapes from the features of the small ear.
+"""The lip predictor: mouth shapes from the features of the audio encoder.
 
 Source: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
 recurrent unit).
@@ -6,7 +6,7 @@ recurrent unit).
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
 ======== ============================================================ ==================
-f        a position: its two log-mel frames, and the ear's features    (160 + ear's,)
+f        a position: its two log-mel frames, and the encoder's features    (160 + encoder's,)
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
 h        state of the gated recurrent unit, driven by u               (units,)
@@ -16,8 +16,8 @@ y        for each delay the FAPs, and log odds of closure and of      (delays, 1
 
     y = A f + B [h, u] + c
 
-A contains the ear's own lips, the last of its features. They come from many voices, so they follow
-unseen speakers better, and contribute most to the FAPs. A also contains linear regressions
+A contains the encoder's own lips, the last of its features. They come from many voices, so they
+follow unseen speakers better, and contribute most to the FAPs. A also contains linear regressions
 to the lips of filmed speakers. B [h, u] follows these speakers more closely.
 
 There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen
@@ -40,7 +40,7 @@ import numpy as np
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.ear import load_ear
+from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.mouth_profile import MouthProfile, parse_mouth_profile
 from kouxing.shared.errors import UserError
@@ -204,7 +204,7 @@ class LipPredictorStream:
 
 
 def features_at(frames: Floats, features: Floats) -> Floats:
-    """Join a position's frames, (2, 80), with the ear's features."""
+    """Join a position's frames, (2, 80), with the encoder's features."""
     return np.concatenate([frames, features], axis=None)
 
 
@@ -238,8 +238,8 @@ def _lip_predictor_from(archive: Archive) -> LipPredictor:
     num_features, num_components = _sizes(archive, "projection", 2)
     _, units = _sizes(archive, "entry_weights", 2)
     num_lips = _sizes(archive, "lip_weights", 3)[0]
-    if num_features != FRAMES_PER_POSITION * NUM_MELS + load_ear().num_features:
-        raise ValueError("it was trained for another ear")
+    if num_features != FRAMES_PER_POSITION * NUM_MELS + load_encoder().num_features:
+        raise ValueError("it was trained for another encoder")
     if num_lips > num_features:
         raise ValueError(f"it reads {num_lips} lip values from {num_features} features")
     outputs = (len(delays), NUM_OUTPUTS)

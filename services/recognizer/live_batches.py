@@ -12,7 +12,7 @@ from kouxing.shared.overload import MAX_HOP, NetworkPace, ProcessorTime
 
 MAX_BATCH_S = 0.3  # of audio that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
-SESSIONS_TOGETHER = 4  # the ear processes these in one run
+SESSIONS_TOGETHER = 4  # the encoder processes these in one run
 NETWORK_WEIGHT = 0.25  # of the block network's time in the load of the service
 
 
@@ -95,7 +95,7 @@ class LiveBatches:
             group = sessions[begin : begin + SESSIONS_TOGETHER]
             for session in group:
                 session.accept_waveform(part_s, now_s, self._pace.hop)
-            self._recognizer.run_ear([session.stream for session in group])
+            self._recognizer.run_encoder([session.stream for session in group])
             if len(self._all) <= 1:  # no other session waits
                 network_s = BlockRunner.run_s
                 self._decode(group)

@@ -10,13 +10,13 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
 from kouxing.services.recognizer.acoustic.languages import model_of_language
-from kouxing.services.recognizer.ear import load_ear
+from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import run_ear, score_streams
+from kouxing.services.recognizer.speech_scorer import run_encoder, score_streams
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
@@ -96,9 +96,9 @@ class Recognizer:
         """Return whether a stream has audio to score."""
         return any(scorer.is_ready for scorer in stream.scorers)
 
-    def run_ear(self, streams: Sequence[SpeechStream]) -> None:
+    def run_encoder(self, streams: Sequence[SpeechStream]) -> None:
         """Find the speech in the audio that the streams have accepted, in batches."""
-        run_ear([scorer for stream in streams for scorer in stream.scorers])
+        run_encoder([scorer for stream in streams for scorer in stream.scorers])
 
     def needs_network(self, stream: SpeechStream) -> bool:
         """Return whether decoding a stream's audio needs a run of the block network."""
@@ -122,4 +122,4 @@ class Recognizer:
         decoder.advance(scores)
         decoder.drop_records()
         decoder.final_path()
-        load_ear()
+        load_encoder()

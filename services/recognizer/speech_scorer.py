@@ -16,7 +16,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     ScoreRequest,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
-from kouxing.services.recognizer.ear import EarPosition, EarStream, process_positions
+from kouxing.services.recognizer.encoder import EncoderOutput, EncoderStream, process_positions
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.speech_segmenter import (
@@ -67,7 +67,7 @@ class _Slice(Record, frozen=True):
 class SpeechScorer:
     """Scores the speech of one session.
 
-    ``accept_waveform`` queues the audio. ``run_ear`` finds the speech in it and
+    ``accept_waveform`` queues the audio. ``run_encoder`` finds the speech in it and
     ``score_streams`` scores the speech, together with other sessions' audio. ``get_events`` returns
     the results in order.
 
@@ -85,10 +85,10 @@ class SpeechScorer:
         self._blocks = self._own if isinstance(self._own, BlockStream) else None
         light = model.light if isinstance(model, BlockModel) else None
         self._light = light.create_stream() if light else None
-        front_end = WhisperMel() if self._own.uses_ear else model.create_front_end()
+        front_end = WhisperMel() if self._own.uses_encoder else model.create_front_end()
         self._segmenter = SpeechSegmenter(front_end, lip_stream, start_frame)
-        # Audio that the ear has not processed, and events, in order; None: the end of the audio
-        self._ear_queue: deque[Position | _Slice | ScoreEvent | None] = deque()
+        # Audio that the encoder has not processed, and events, in order; None: the end of the audio
+        self._encoder_queue: deque[Position | _Slice | ScoreEvent | None] = deque()
         self._needs_light = False  # whether the light model scores the next speech
         # Frames to score, and events in order. The first item is to be scored; SpeechEnd is too.
         self._queue: deque[SpeechFrames | ScoreEvent] = deque()
@@ -98,7 +98,7 @@ class SpeechScorer:
     @property
     def is_light(self) -> bool:
         """Whether the light model scores the speech."""
-        return self._stream.uses_ear
+        return self._stream.uses_encoder
 
     def set_light(self, is_light: bool) -> None:
         """Use the light model, or the session's own model from the next start of speech on."""
@@ -128,25 +128,25 @@ class SpeechScorer:
 
     def accept_waveform(self, samples: Floats, progress: Progress | None = None) -> None:
         """Queue samples, 16 kHz mono, shape (n,), and the measurement of the slice they end."""
-        self._ear_queue.extend(self._segmenter.positions(samples))
+        self._encoder_queue.extend(self._segmenter.positions(samples))
         if progress is not None:
-            self._ear_queue.append(_Slice(progress))
+            self._encoder_queue.append(_Slice(progress))
 
     def input_finished(self) -> None:
         """End the audio."""
-        self._ear_queue.append(None)
+        self._encoder_queue.append(None)
 
     def add_event(self, event: ScoreEvent) -> None:
         """Queue an event, to be returned after the results of the audio so far."""
-        self._ear_queue.append(event)
+        self._encoder_queue.append(event)
 
     def next_position(self) -> Position | None:
-        """Return the next position for the ear, or None if the queue has no position."""
-        while self._ear_queue:
-            item = self._ear_queue[0]
+        """Return the next position for the encoder, or None if the queue has no position."""
+        while self._encoder_queue:
+            item = self._encoder_queue[0]
             if isinstance(item, Position):
                 return item
-            self._ear_queue.popleft()
+            self._encoder_queue.popleft()
             if item is None:
                 self._queue.extend(self._segmenter.input_finished())
             elif isinstance(item, _Slice):
@@ -158,19 +158,19 @@ class SpeechScorer:
         return None
 
     @property
-    def ear(self) -> EarStream:
+    def encoder(self) -> EncoderStream:
         """The stream that processes the positions."""
-        return self._segmenter.ear
+        return self._segmenter.encoder
 
-    def add_ear_output(self, position: Position, ear: EarPosition) -> None:
-        """Add the output of the ear at ``next_position``."""
-        self._ear_queue.popleft()
-        self._queue.extend(self._segmenter.process(position, ear))
+    def add_encoder_output(self, position: Position, output: EncoderOutput) -> None:
+        """Add the output of the encoder at ``next_position``."""
+        self._encoder_queue.popleft()
+        self._queue.extend(self._segmenter.process(position, output))
 
     @property
     def is_ready(self) -> bool:
         """Whether there is audio to score."""
-        return bool(self._queue or self._ear_queue)
+        return bool(self._queue or self._encoder_queue)
 
     @property
     def model(self) -> AcousticModel:
@@ -209,7 +209,7 @@ class SpeechScorer:
         if not isinstance(item, SpeechFrames):
             return stream, None
         self._num_unscored += len(item.features)
-        return stream, item.phones if stream.uses_ear else item.features
+        return stream, item.phones if stream.uses_encoder else item.features
 
     def add_scores(self, settled: Floats) -> None:
         """Add the settled scores of ``next_request``, (m, states)."""
@@ -222,18 +222,18 @@ class SpeechScorer:
         self._release_events()
 
 
-def run_ear(scorers: Sequence[SpeechScorer]) -> None:
+def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
     while waiting := [(one, position) for one in scorers if (position := one.next_position())]:
-        streams = [scorer.ear for scorer, _ in waiting]
-        ear_positions = process_positions(streams, [position.mels for _, position in waiting])
-        for (scorer, position), of_scorer in zip(waiting, ear_positions, strict=True):
-            scorer.add_ear_output(position, of_scorer)
+        streams = [scorer.encoder for scorer, _ in waiting]
+        encoder_outputs = process_positions(streams, [position.mels for _, position in waiting])
+        for (scorer, position), of_scorer in zip(waiting, encoder_outputs, strict=True):
+            scorer.add_encoder_output(position, of_scorer)
 
 
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Score the queued audio of several sessions, in one batch for each model."""
-    run_ear(scorers)
+    run_encoder(scorers)
     while ready := [scorer for scorer in scorers if scorer.is_ready]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]

@@ -1,6 +1,6 @@
 """Finds the speech in one session's audio, and predicts the lips during it.
 
-    samples -> front ends -> small ear -> [speech only] frames, lip frames
+    samples -> front ends -> audio encoder -> [speech only] frames, lip frames
 
 Time is media time, counted from the first sample. Feature frame ``t`` covers the 10 ms around the
 middle of its window. Any chunking of the same audio gives the same result, because every step
@@ -15,7 +15,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.ear import EarPosition, load_ear
+from kouxing.services.recognizer.encoder import EncoderOutput, load_encoder
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
@@ -25,7 +25,7 @@ from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.records import Record
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
-_DETECTION_S = 0.06  # the ear's look-ahead, and a position
+_DETECTION_S = 0.06  # the encoder's look-ahead, and a position
 # Positions end at odd frames, POSITION_LAG_S before a multiple of 20 ms. Speech starts at one.
 _FIRST_FRAME_PARITY = 1
 _SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip frame needs
@@ -50,11 +50,11 @@ class SpeechFrames(Record, frozen=True):
     """The next frames of speech; they end with a position."""
 
     features: Floats  # (n, k), of the front end
-    phones: Floats  # (n, phones), the ear's log posteriors after each frame
+    phones: Floats  # (n, phones), the encoder's log posteriors after each frame
 
 
 class Position(Record, frozen=True):
-    """The input of the small ear at a position, and the front end's features."""
+    """The input of the audio encoder at a position, and the front end's features."""
 
     features: Floats  # (2, k)
     mels: Floats  # (2, 80)
@@ -88,13 +88,13 @@ class SpeechSegmenter:
         self._mel = None if isinstance(front_end, WhisperMel) else WhisperMel()
         self._lip_stream = lip_stream
         self._start_frame = start_frame
-        self.ear = load_ear().create_stream()
+        self.encoder = load_encoder().create_stream()
         self._detector = VoiceActivityDetector()
         self._traits = load_voice_readout().create_stream()
         self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
         self._features: Floats | None = None  # its feature frames
         # Features and positions before speech
-        self._recent: deque[tuple[Floats, EarPosition]] = deque(maxlen=_MAX_RECENT)
+        self._recent: deque[tuple[Floats, EncoderOutput]] = deque(maxlen=_MAX_RECENT)
         self._num_frames = 0
         self._is_speaking = False
 
@@ -106,7 +106,7 @@ class SpeechSegmenter:
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
         """Take samples, 16 kHz mono, shape (n,); yield what follows from them."""
         for position in self.positions(samples):
-            yield from self.process(position, self.ear.accept_position(position.mels))
+            yield from self.process(position, self.encoder.accept_position(position.mels))
 
     def positions(self, samples: Floats) -> Iterator[Position]:
         """Take samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
@@ -126,20 +126,20 @@ class SpeechSegmenter:
         if self._is_speaking:
             yield self._end_speech()
 
-    def process(self, position: Position, ear: EarPosition) -> Iterator[SpeechItem]:
-        """Start or end speech and predict lips after a position, given what the ear computed."""
+    def process(self, position: Position, output: EncoderOutput) -> Iterator[SpeechItem]:
+        """Start or end speech and predict lips after a position, given the encoder's output."""
         features = position.features
         self._num_frames += len(features)
         if self._is_speaking:
-            yield _frames_of([(features, ear)])
+            yield _frames_of([(features, output)])
         else:
-            self._recent.append((features, ear))
-        self._detector.update(ear.voice)
-        self._traits.accept_position(ear)
+            self._recent.append((features, output))
+        self._detector.update(output.voice)
+        self._traits.accept_position(output)
         if self._is_speaking and not self._detector.is_speech:
             yield self._end_speech()
         elif self._is_speaking:
-            yield from self._predict_lips(ear, self._num_frames - 1)
+            yield from self._predict_lips(output, self._num_frames - 1)
         elif self._detector.is_speech:
             yield from self._start_speech()
 
@@ -176,7 +176,7 @@ class SpeechSegmenter:
         self._is_speaking = False
         return SpeechEnd(self._num_frames)
 
-    def _predict_lips(self, position: EarPosition, newest_frame: int) -> list[LipPositions]:
+    def _predict_lips(self, position: EncoderOutput, newest_frame: int) -> list[LipPositions]:
         """Return the lip frames that follow from a position, whose last frame is given."""
         if self._lip_stream is None:
             return []
@@ -184,7 +184,7 @@ class SpeechSegmenter:
         return self._lip_stream.process_position(known_s, position.frames, position.features)
 
 
-def _frames_of(positions: Sequence[tuple[Floats, EarPosition]]) -> SpeechFrames:
+def _frames_of(positions: Sequence[tuple[Floats, EncoderOutput]]) -> SpeechFrames:
     """Return the frames of some positions."""
     phones = np.array([position.phones for _, position in positions])
     features = np.concatenate([features for features, _ in positions])

@@ -1,11 +1,11 @@
 """Estimates what a voice shows apart from its words: arousal, valence, laughter and breath.
 
-A linear readout of the small ear's hidden layers, every 20 ms:
+A linear readout of the audio encoder's hidden layers, every 20 ms:
 
 ======== ============================================================= ==============
 symbol   meaning                                                       shape, unit
 ======== ============================================================= ==============
-h        state of the ear's recurrent layers                           (state width,)
+h        state of the encoder's recurrent layers                           (state width,)
 W, b     weights of the readout                                        (state width, 4), (4,)
 y        arousal and valence (-1 to 1), evidence of laughter and       (4,)
          of breath (0 to 1)
@@ -30,7 +30,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
-from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
+from kouxing.services.recognizer.encoder import EncoderOutput, Voice, load_encoder
 
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
 FORMAT = "traits 1"
@@ -86,8 +86,8 @@ class VoiceTraitsStream:
         self._evidence = [0.0] * (NUM_TRAITS - 2)  # evidence of laughter and of breath
         self._since_laugh = _LAUGH_POSITIONS  # positions since a laugh
 
-    def accept_position(self, position: EarPosition) -> None:
-        """Take the next position of the ear."""
+    def accept_position(self, position: EncoderOutput) -> None:
+        """Take the next position of the encoder."""
         # Few numbers: lists take less time than arrays.
         outputs: list[float] = (
             position.state @ self._readout.weights + self._readout.bias
@@ -115,7 +115,7 @@ class VoiceTraitsStream:
             evidence > (_STOP if was_on else _START)
             for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
         )
-        # the ear's state contains past laughter for many seconds of silence
+        # the encoder's state contains past laughter for many seconds of silence
         laughter = laughter and self._since_laugh < _LAUGH_POSITIONS
         self.newest = VoiceTraits(arousal, valence, laughter, breath)
 
@@ -128,7 +128,7 @@ def load_voice_readout(path: Path = TRAITS_PATH) -> VoiceReadout:
 
 def _readout_from(archive: Archive) -> VoiceReadout:
     return VoiceReadout(
-        weights=archive.floats("weights", load_ear().state_width, NUM_TRAITS),
+        weights=archive.floats("weights", load_encoder().state_width, NUM_TRAITS),
         bias=archive.floats("bias", NUM_TRAITS),
         mean=archive.floats("mean", 2),
     )

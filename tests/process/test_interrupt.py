@@ -77,7 +77,7 @@ except KeyboardInterrupt:
 # or starts a program.
 IN_INPUT = """
 import importlib, json, os, signal, sys
-for name in ("ear", "universal", "blocks", "lips", "gmm", "ferguson", "visemes", "heads"):
+for name in ("encoder", "universal", "blocks", "lips", "gmm", "ferguson", "visemes", "heads"):
     importlib.import_module(f"kouxing.training.{name}.recipe")
 import kouxing.evaluation.commands, kouxing.evaluation.recognizer.error_rates
 import kouxing.services.cli.main
@@ -107,7 +107,7 @@ RECIPES = (
     *("train phone-lm --corpus {data} -o {out}/a.npz", "train gmm --corpus {data} -o {out}/a.npz"),
     "train blocks --corpus {data} --whisper {data} -o {out}/a.npz",
     "train universal --corpus {data} --languages {data} -o {out}/a.npz",
-    "train ear --corpus {data} --whisper {data} --sounds {data} --clips {data} -o {out}/a.npz",
+    "train encoder --corpus {data} --whisper {data} --sounds {data} --clips {data} -o {out}/a.npz",
     *("train visemes --clips {data} -o {out}/a.json", "train lips --clips {data} -o {out}/a.npz"),
     "train ferguson --clips {data} --corpus {data} -o {out}/a.tsv",
     "train traits --recordings {data} --sounds {data} -o {out}/a.npz",

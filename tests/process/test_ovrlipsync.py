@@ -14,7 +14,7 @@ import soxr
 from numpy.typing import NDArray
 
 from kouxing.services.cli.web_model import web_model
-from kouxing.services.recognizer.ear import load_ear
+from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import load_voice_readout
@@ -25,7 +25,7 @@ from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, server_events
 from tests.system import DEMO, NODE, ROOT, samples_of_file
 
 SOURCE = ROOT / "clients" / "ovrlipsync"
-LIBRARY = "OVRLipSync.c", "lips.c", "ear.c", "face.c", "lips_model.c"
+LIBRARY = "OVRLipSync.c", "lips.c", "encoder.c", "face.c", "lips_model.c"
 NUM_VISEMES = 15
 RATE_HZ, BUFFER = 48_000, 1024
 SUCCESS, CANNOT_CREATE, INVALID, BAD_RATE, UNDEFINED = 0, -2201, -2202, -2203, -2206
@@ -168,12 +168,12 @@ def test_buffers_at_48_khz_from_python(library: Any) -> None:
 
 
 def laughter_of(samples: Frames) -> list[float]:
-    """Return the server's evidence of laughter, after each position of the ear."""
+    """Return the server's evidence of laughter, after each position of the encoder."""
     bands = WhisperMel().accept_waveform(samples)
-    ear, readout = load_ear().create_stream(), load_voice_readout()
+    encoder, readout = load_encoder().create_stream(), load_voice_readout()
     evidence, values = 0.0, []
     for pair in bands[: len(bands) // 2 * 2].reshape(-1, 2, bands.shape[1]):
-        outputs = ear.accept_position(pair).state @ readout.weights + readout.bias
+        outputs = encoder.accept_position(pair).state @ readout.weights + readout.bias
         evidence += EVIDENCE_SHARE * (float(outputs[2]) - evidence)
         values.append(evidence)
     return values

@@ -11,7 +11,7 @@ from kouxing.services.recognizer.acoustic import blocks as blocks_module
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
-from kouxing.services.recognizer.ear import EAR_PATH
+from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
@@ -140,7 +140,7 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     arrays = read_archive(path).arrays
     changes: list[tuple[dict[str, np.ndarray], str]] = [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
-        ({"network": read_archive(EAR_PATH).array("network", None)}, "has the inputs"),
+        ({"network": read_archive(ENCODER_PATH).array("network", None)}, "has the inputs"),
         ({"network": onnx_of(*networks(), BLOCK, past=6000)}, "has the sizes"),  # much memory
         (
             {"network": onnx_of(*networks(178), BLOCK)},

@@ -16,7 +16,7 @@ from kouxing.training.networks import optimizer, teacher
 from kouxing.training.networks.batches import Recording, Targets
 from kouxing.training.networks.network import ReadoutShape
 from tests.unit.test_block_model import HELLO, SMALL
-from tests.unit.test_ear_training import write_sounds
+from tests.unit.test_encoder_training import write_sounds
 from tests.unit.test_whisper_weights import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 

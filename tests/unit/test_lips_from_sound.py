@@ -64,14 +64,14 @@ def test_each_delay_has_separate_outputs_and_times() -> None:
         MODEL.create_stream([0.07])
 
 
-def test_rejects_a_predictor_for_another_ear(tmp_path: Path) -> None:
+def test_rejects_a_predictor_for_another_encoder(tmp_path: Path) -> None:
     path = tmp_path / "lips.npz"
     MODEL.save(path)
     assert load_lip_predictor(path).delays_s == MODEL.delays_s
     wider = np.pad(MODEL.projection, ((0, 2), (0, 0)))
     mean = np.pad(MODEL.feature_mean, (0, 2))
     write_archive(path, {**arrays_of(MODEL), "projection": wider, "feature_mean": mean})
-    with pytest.raises(UserError, match="trained for another ear"):
+    with pytest.raises(UserError, match="trained for another encoder"):
         load_lip_predictor(path)
 
 

@@ -246,7 +246,7 @@ def test_the_system_table_reads_what_the_commands_write() -> None:
         },
         "browser": asdict(page) | {"others": [asdict(other)]},
         "sizes": {
-            "model_bytes": {"ear": 2_400_000},
+            "model_bytes": {"encoder": 2_400_000},
             "frame_bytes": 369,
             "floor_cores": {"hop 1": 0.1, "hop 4": 0.04},
         },

@@ -171,7 +171,7 @@ def test_lips_may_be_early_and_phones_are_the_same() -> None:
     num_early = 0
     for begin in range(0, len(SAMPLES), 320):
         stream.accept_waveform(SAMPLES[begin : begin + 320])
-        recognizer.run_ear([stream])
+        recognizer.run_encoder([stream])
         if recognizer.needs_network(stream):
             stream.decode_early()
             early = recognizer.get_result(stream)

@@ -1,4 +1,4 @@
-"""Voice activity and traits of a voice, from the ear."""
+"""Voice activity and traits of a voice, from the encoder."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.model_file import write_archive
-from kouxing.services.recognizer.ear import EarPosition, Voice, load_ear
+from kouxing.services.recognizer.encoder import EncoderOutput, Voice, load_encoder
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.voice_traits import (
     NUM_TRAITS,
@@ -70,7 +70,7 @@ def traits_of(*parts: tuple[float, Voice, Sequence[float]]) -> list[VoiceTraits]
     seen = []
     for duration_s, kind, state in parts:
         voice = np.eye(len(Voice), dtype=np.float32)[kind]
-        position = EarPosition(none, none, none, voice, np.array(state, np.float32))
+        position = EncoderOutput(none, none, none, voice, np.array(state, np.float32))
         for _ in range(round(duration_s * PER_S)):
             stream.accept_position(position)
             seen.append(stream.newest)
@@ -116,11 +116,11 @@ def test_silence_and_speech_end_laughter() -> None:
         assert not any(trait.is_laughter for trait in seen[3 * PER_S :])
 
 
-def test_the_shipped_readout_fits_the_ear_and_others_are_rejected(tmp_path: Path) -> None:
-    assert load_voice_readout().weights.shape == (load_ear().state_width, NUM_TRAITS)
+def test_the_shipped_readout_fits_the_encoder_and_others_are_rejected(tmp_path: Path) -> None:
+    assert load_voice_readout().weights.shape == (load_encoder().state_width, NUM_TRAITS)
     READOUT.save(tmp_path / "small.npz")
     with pytest.raises(UserError, match="weights has shape"):
         load_voice_readout(tmp_path / "small.npz")
-    write_archive(tmp_path / "other.npz", {"format": np.array("ear 1")})
-    with pytest.raises(UserError, match="format 'ear 1'"):
+    write_archive(tmp_path / "other.npz", {"format": np.array("encoder 1")})
+    with pytest.raises(UserError, match="format 'encoder 1'"):
         load_voice_readout(tmp_path / "other.npz")

@@ -40,7 +40,7 @@ from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, Material
 from kouxing.training.blocks.export import onnx_of
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
-from kouxing.training.ear.singing import sing
+from kouxing.training.encoder.singing import sing
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.batches import Recording, Targets
 from kouxing.training.networks.labels import STATES_PER_PHONE, Mix, label, statistics_of

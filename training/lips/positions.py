@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.positions import record_positions
-from kouxing.services.recognizer.ear import EAR_PATH
+from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 
 Array = NDArray[np.float64]
@@ -42,11 +42,11 @@ def speech_of(clips: Iterable[LipClip], copy: int = 0) -> Iterator[list[Speech]]
 
     A copy is always augmented in the same way.
     """
-    of_ear = hashlib.sha256(_FORMAT.encode())
-    of_ear.update(EAR_PATH.read_bytes())
+    of_encoder = hashlib.sha256(_FORMAT.encode())
+    of_encoder.update(ENCODER_PATH.read_bytes())
     for clip in clips:
         samples, speed = _sound_of(clip, copy)
-        positions = _positions(of_ear, samples)
+        positions = _positions(of_encoder, samples)
         parts = [np.split(positions[name], positions["starts"]) for name in ("features", "known_s")]
         yield [
             Speech(clip=clip, features=features, known_s=known_s, speed=speed)
@@ -63,8 +63,8 @@ def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
     return scale_level(samples, rng), speed
 
 
-def _positions(of_ear: hashlib._Hash, samples: Floats) -> dict[str, NDArray[Any]]:
-    key = of_ear.copy()
+def _positions(of_encoder: hashlib._Hash, samples: Floats) -> dict[str, NDArray[Any]]:
+    key = of_encoder.copy()
     key.update(samples.tobytes())
 
     def compute() -> dict[str, NDArray[Any]]:

@@ -1,8 +1,8 @@
 """From clips of tracked lips to the lip model.
 
-    clips -> [small ear] -> principal components -> recurrent network with each speaker's units
+    clips -> [audio encoder] -> principal components -> recurrent network with each speaker's units
                          -> features             -> linear regressions
-                         -> the ear's own lips   -> weighted mean of the three
+                         -> the encoder's own lips   -> weighted mean of the three
 
 The recipe trains on every clip that is not held out and whose license allows it. These clips do not
 determine any setting. Each clip is used twice, unchanged and augmented. Clips of small sources
@@ -27,7 +27,7 @@ from kouxing.corpora.lip_clips import (
 )
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.ear import LIP_DELAYS_S
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S
 from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     LIP_FAPS,
@@ -48,13 +48,13 @@ Array = NDArray[np.float64]
 # a frame of the face is due.
 DELAYS_S = (-0.005, 0.015, 0.045, 0.055, 0.095, 0.155)
 NUM_EPOCHS = 12
-# Number of log-mel values, and of each kind of the ear's features (early and late components of
+# Number of log-mel values, and of each kind of the encoder's features (early and late components of
 # Whisper's encoder, lips); number of their components; extent of the first component and the last
 # one. Late components mostly describe the speaker, so they get less weight.
 COMPONENTS = ((160, 32, 0.5, 0.5), (128, 96, 1.0, 0.2), (128, 96, 1.0, 0.2), (51, 51, 2.0, 0.5))
-# Shares of the FAPs: the ear's lips, linear regression, recurrent network. Chosen on four speakers
-# without clips in training.
-_EAR_SHARE, _LINEAR_SHARE, _NETWORK_SHARE = 0.5, 0.3, 0.2
+# Weights of the FAPs of the audio encoder, linear regression and recurrent network. Chosen on four
+# speakers without clips in training.
+_ENCODER_WEIGHT, _LINEAR_WEIGHT, _NETWORK_WEIGHT = 0.5, 0.3, 0.2
 _LINEAR_CLOSURE = 0.85  # fraction of a closure's log odds; the rest is the network's
 _MAX_REPEATS = 6  # limit for the clips of a small source
 _NUM_FAPS = len(LIP_FAPS)
@@ -177,7 +177,7 @@ def repeats_by_source(clips: Sequence[LipClip]) -> dict[str, int]:
 def principal_components(features: Floats) -> tuple[Floats, Floats]:
     """Return the mean of features, (n, features), and the projection to their components.
 
-    The log-mel frames and each kind of the ear's features have separate components.
+    The log-mel frames and each kind of the encoder's features have separate components.
     """
     mean = features.mean(axis=0)
     ends = np.cumsum([num_features for num_features, *_ in COMPONENTS])
@@ -216,7 +216,7 @@ def standardize(target: Floats, units: Units) -> Floats:
 def joined(
     basis: Basis, network: LipNetwork, linear_weights: Array, linear_bias: Array
 ) -> LipPredictor:
-    """Combine the network with the linear part (see ``fit_linear``) and the ear's lips.
+    """Combine the network with the linear part (see ``fit_linear``) and the encoder's lips.
 
     Lip-to-teeth contact comes from the network. The FAPs are scaled around their means.
     """
@@ -227,16 +227,17 @@ def joined(
     width = [LIP_FAPS.index(fap) for fap in _WIDTH_FAPS]
     scale[width] = units.extent[width] * _WIDTH_FACTOR
     of_network, of_linear = scale.copy(), scale.copy()
-    of_network[:_NUM_FAPS] *= _NETWORK_SHARE
+    of_network[:_NUM_FAPS] *= _NETWORK_WEIGHT
     of_network[CLOSURE] = 1 - _LINEAR_CLOSURE
-    of_linear[:_NUM_FAPS] *= _LINEAR_SHARE
+    of_linear[:_NUM_FAPS] *= _LINEAR_WEIGHT
     of_linear[CLOSURE] = _LINEAR_CLOSURE
-    ear = np.zeros((len(LIP_DELAYS_S), NUM_OUTPUTS, *shape))
+    encoder_weights = np.zeros((len(LIP_DELAYS_S), NUM_OUTPUTS, *shape))
     for fap in range(_NUM_FAPS):
         for number, delay_weights in enumerate(np.eye(len(LIP_DELAYS_S))):
-            ear[number, fap, :, fap] = np.interp(DELAYS_S, LIP_DELAYS_S, delay_weights)
+            encoder_weights[number, fap, :, fap] = np.interp(DELAYS_S, LIP_DELAYS_S, delay_weights)
     linear = linear_weights * of_linear
-    linear[-ear[..., 0, 0].size :] += _EAR_SHARE * scale * ear.reshape(-1, *shape)
+    num_rows = encoder_weights[..., 0, 0].size
+    linear[-num_rows:] += _ENCODER_WEIGHT * scale * encoder_weights.reshape(-1, *shape)
     bias = weights["output.bias"].reshape(shape) * of_network + linear_bias * of_linear
     bias[:, :_NUM_FAPS] += units.mean
     bias[:, CLOSURE] += np.interp(DELAYS_S, *_CLOSURE_BIAS)

@@ -1,4 +1,4 @@
-// Scores of the light model: the phones of the small ear; services/recognizer/acoustic/light.py explains them.
+// Scores of the light model: the phones of the audio encoder; services/recognizer/acoustic/light.py explains them.
 
 export class LightScorer {
   #lagFrames;
@@ -9,7 +9,7 @@ export class LightScorer {
   #last; // scores of the last row
 
   constructor({ constants, phoneArrays }) {
-    this.#lagFrames = constants.ear.PHONES_LAG_FRAMES;
+    this.#lagFrames = constants.encoder.PHONES_LAG_FRAMES;
     this.#logPrior = phoneArrays.log_prior.values;
     this.#firstState = phoneArrays.first_state.values;
     this.start();

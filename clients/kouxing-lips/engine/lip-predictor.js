@@ -62,7 +62,7 @@ export class LipPredictor {
    * Return the lip frame that follows from a position.
    *
    * @param knownS media time of the last sample that the position has seen, seconds
-   * @param features two log-mel frames and the ear's features
+   * @param features two log-mel frames and the encoder's features
    * @returns { timeS, delayS, faps: of the mouth, closure: probability }
    */
   processPosition(knownS, features) {

@@ -6,7 +6,7 @@ import { PhoneLm } from "./phone-lm.js";
 
 const FORMAT = "kouxing-lips 3";
 const FINAL = "final"; // value of the option phones
-const FILES = ["ear.onnx", "model.bin", "model.json"];
+const FILES = ["encoder.onnx", "model.bin", "model.json"];
 const PHONES_FILE = "phones.bin";
 const BLOCKS_FILE = "blocks.onnx"; // for final phones
 const ARRAYS = {
@@ -23,13 +23,13 @@ const ARRAYS = {
  *
  * @param base URL of the folder with the files; in Node also a file URL
  * @param options { phones: true also loads the phone recognizer, "final" also the block network }
- * @returns a promise of { ear: Network, phoneLm: PhoneLm or null, blocks: Network or null, arrays:
+ * @returns a promise of { encoder: Network, phoneLm: PhoneLm or null, blocks: Network or null, arrays:
  *   { values, shape } by name, constants, ... }; it is rejected if a file is missing or of another version
  */
 export async function loadModel(base, { phones = false } = {}) {
   if (![true, false, FINAL].includes(phones)) throw new RangeError(`phones is ${phones}; it must be true, false or "${FINAL}"`);
   const files = [...FILES, ...(phones ? [PHONES_FILE] : []), ...(phones === FINAL ? [BLOCKS_FILE] : [])];
-  const [ear, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
+  const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
   const model = JSON.parse(new TextDecoder().decode(header));
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
@@ -40,7 +40,7 @@ export async function loadModel(base, { phones = false } = {}) {
     arrays: unpack(blob, model.arrays),
     phoneArrays,
     phoneLm: phones ? new PhoneLm(phoneArrays, model.constants) : null,
-    ear: new Network(ear),
+    encoder: new Network(encoder),
     blocks: blocks ? new Network(blocks) : null,
   };
 }

@@ -32,7 +32,7 @@ export class SpeechSegmenter {
   #model;
   #mel;
   #lips;
-  #state; // state of the ear
+  #state; // state of the encoder
   #detector;
   #traits;
   #phones; // a PhoneRecognizer, or null
@@ -64,13 +64,13 @@ export class SpeechSegmenter {
     while (this.#frames.length >= FRAMES_PER_POSITION) {
       const frames = join(this.#frames.splice(0, FRAMES_PER_POSITION));
       this.#numFrames += FRAMES_PER_POSITION;
-      const { ear } = this.#model;
-      ear.values("frames").set(frames);
-      ear.values("state").set(this.#state);
-      ear.run();
-      this.#state.set(ear.values("new_state"));
-      const row = this.#phones ? ear.values("phones").slice() : null;
-      events.push(...this.#process({ features: join([frames, ear.values("features")]), row }, ear.values("voice")));
+      const { encoder } = this.#model;
+      encoder.values("frames").set(frames);
+      encoder.values("state").set(this.#state);
+      encoder.run();
+      this.#state.set(encoder.values("new_state"));
+      const row = this.#phones ? encoder.values("phones").slice() : null;
+      events.push(...this.#process({ features: join([frames, encoder.values("features")]), row }, encoder.values("voice")));
     }
     return events;
   }

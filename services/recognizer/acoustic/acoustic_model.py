@@ -65,7 +65,7 @@ class AcousticStream(ABC):
     provisional scores of the next frames, computed from less audio than the settled ones will be.
     """
 
-    uses_ear = False  # whether its frames are the ear's phones instead of the front end's
+    uses_encoder = False  # whether its frames are the encoder's phones instead of the front end's
     look_ahead_frames: int  # the settled scores of a frame come at most this many frames after it
     provisional: Floats  # (k, states) of the frames after the settled ones; a change is a new array
 

@@ -96,7 +96,7 @@ class BlockModel(NetworkModel):
 
     @cached_property
     def light(self) -> LightModel | None:
-        """The model that replaces this one on a busy machine; None: the ear has other phones."""
+        """The model for a busy machine, or None if the encoder has other phones."""
         return light_model(self.topology, self.log_prior)
 
     def create_stream(self) -> BlockStream:

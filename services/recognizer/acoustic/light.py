@@ -1,19 +1,19 @@
-"""Light model: the phones of the small ear, for weak or busy machines.
+"""Light model: the phones of the audio encoder, for weak or busy machines.
 
-The ear runs on all audio, so these phones cost only their search. HMMs and phone language model are
-those of the block model.
+The encoder runs on all audio, so these phones cost only their search. HMMs and phone language model
+are those of the block model.
 
 ======== ============================================================== ==================
 symbol   meaning                                                        shape
 ======== ============================================================== ==================
-q        log posteriors of the phones, from the ear                     (frames, phones)
+q        log posteriors of the phones, from the encoder                 (frames, phones)
 prior    prior of the phones, to a power below one                      (phones,)
 ======== ============================================================== ==================
 
     log b(x) = acoustic_scale * (q - log prior), the same for all states of a phone
 
-The ear's posteriors after frame ``t`` are those of frame ``t - PHONES_LAG_FRAMES``. At the end of a
-segment, the last ones are repeated.
+The encoder's posteriors after frame ``t`` are those of frame ``t - PHONES_LAG_FRAMES``. At the end
+of a segment, the last ones are repeated.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
 )
 from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.ear import PHONES_LAG_FRAMES, load_ear
+from kouxing.services.recognizer.encoder import PHONES_LAG_FRAMES, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 
 _ACOUSTIC_SCALE = 1.0
 
 
-class EarPhones:
-    """A front end that runs the ear: its log posteriors, (frames, phones)."""
+class EncoderPhones:
+    """A front end that runs the encoder: its log posteriors, (frames, phones)."""
 
     def __init__(self) -> None:
         self._mel = WhisperMel()
-        self._ear = load_ear().create_stream()
-        self._rows = np.empty((0, load_ear().num_phones), np.float32)
+        self._encoder = load_encoder().create_stream()
+        self._rows = np.empty((0, load_encoder().num_phones), np.float32)
         self._frames = np.empty((0, NUM_MELS), np.float32)
 
     def accept_waveform(self, samples: Floats) -> Floats:
@@ -54,7 +54,7 @@ class EarPhones:
         self._frames = np.concatenate([self._frames, self._mel.accept_waveform(samples)])
         rows = [self._rows[:0]]
         while len(self._frames) >= FRAMES_PER_POSITION:
-            position = self._ear.accept_position(self._frames[:FRAMES_PER_POSITION])
+            position = self._encoder.accept_position(self._frames[:FRAMES_PER_POSITION])
             rows.append(position.phones[np.newaxis].repeat(FRAMES_PER_POSITION, axis=0))
             self._frames = self._frames[FRAMES_PER_POSITION:]
         return np.concatenate(rows)
@@ -62,20 +62,20 @@ class EarPhones:
 
 @dataclass(frozen=True, kw_only=True)
 class LightModel(AcousticModel):
-    """Scores from the ear's phones."""
+    """Scores from the encoder's phones."""
 
     log_prior: Floats  # (phones,)
 
-    def create_front_end(self) -> EarPhones:
-        """Create a front end, for audio that passes through no other ear."""
-        return EarPhones()
+    def create_front_end(self) -> EncoderPhones:
+        """Create a front end, for audio that passes through no other encoder."""
+        return EncoderPhones()
 
     def create_stream(self) -> LightStream:
         """Create the stream of one speaker."""
         return LightStream(self)
 
     def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
-        """Score the ear's rows of several streams; None ends a stream's segment."""
+        """Score the encoder's rows of several streams; None ends a stream's segment."""
         return [self._scores_of(cast(LightStream, stream).take(rows)) for stream, rows in requests]
 
     def _scores_of(self, rows: Floats) -> Floats:
@@ -87,7 +87,7 @@ class LightModel(AcousticModel):
 class LightStream(AcousticStream):
     """Scores of one speaker's speech, segment by segment."""
 
-    uses_ear = True
+    uses_encoder = True
     look_ahead_frames = PHONES_LAG_FRAMES
 
     def __init__(self, model: LightModel) -> None:
@@ -126,10 +126,10 @@ class LightStream(AcousticStream):
 def light_model(topology: Topology, log_prior: Floats) -> LightModel | None:
     """Build the model for HMMs with a prior of their states, (states,).
 
-    Returns None if the ear has other phones.
+    Returns None if the encoder has other phones.
     """
     inventory = topology.inventory
-    if (inventory.language, len(inventory)) != (DEFAULT_LANGUAGE, load_ear().num_phones):
+    if (inventory.language, len(inventory)) != (DEFAULT_LANGUAGE, load_encoder().num_phones):
         return None
     priors = np.add.reduceat(np.exp(log_prior), topology.first_state[:-1])
     return LightModel(topology=topology, log_prior=np.log(priors))
@@ -140,5 +140,5 @@ def light_model_from(archive: Archive) -> LightModel:
     topology = topology_from(archive)
     model = light_model(topology, archive.floats("log_prior", topology.num_states))
     if model is None:
-        raise ValueError("its phones differ from those of the small ear")
+        raise ValueError("its phones differ from those of the audio encoder")
     return model

@@ -1,7 +1,7 @@
 """Voice activity detection (VAD): starts and ends of speech.
 
-The small ear computes the probabilities of the kinds of voice every 20 ms. Speech starts as soon as
-there is enough evidence (a cumulative sum, Page 1954):
+The audio encoder computes the probabilities of the kinds of voice every 20 ms. Speech starts as
+soon as there is enough evidence (a cumulative sum, Page 1954):
 
 ======== ============================================================= ====
 symbol   meaning                                                       unit
@@ -18,7 +18,7 @@ the detection of speech (see :mod:`kouxing.services.recognizer.speech_segmenter`
 """
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.ear import Voice
+from kouxing.services.recognizer.encoder import Voice
 
 _NO_EVIDENCE, _ENOUGH = 0.75, 0.12
 _IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such positions do

@@ -1,14 +1,14 @@
-"""The teachers of the small ear: trained networks that compute its targets from clean recordings.
+"""Teachers of the audio encoder: trained networks that compute targets from clean recordings.
 
 The block network comes from the shipped model. PyTorch runs it on whole recordings. The second
-teacher is Whisper's unchanged encoder. The lip teacher (:mod:`kouxing.training.ear.lip_teacher`)
-uses the outputs of both.
+teacher is Whisper's unchanged encoder. The lip teacher
+(:mod:`kouxing.training.encoder.lip_teacher`) uses the outputs of both.
 
 ======== ==================================================================== =================
 symbol   meaning                                                              shape
 ======== ==================================================================== =================
 p        position: the feature frames 2 p and 2 p + 1                         (positions,)
-encoder  positions of Whisper's encoder after layers 2, 4 and 6, which have   (positions, 3 w)
+whisper  positions of Whisper's encoder after layers 2, 4 and 6, which have   (positions, 3 w)
          seen the whole recording
 phones   posteriors of the phones, of the block network                       (positions, phones)
 pitch    log2 of the pitch in Hz; NaN without voice                           (positions,)
@@ -42,7 +42,7 @@ from kouxing.training.networks.whisper import init_encoder
 Floats = NDArray[np.float32]
 
 POSITION_SAMPLES = 320
-_ENCODER_LAYERS = (1, 3, 5)  # layers of Whisper's encoder, counted from 0
+_WHISPER_LAYERS = (1, 3, 5)  # layers of Whisper's encoder, counted from 0
 _BLOCK_POSITIONS = 50  # for the block network; longer blocks than live cost less
 _LOW_BANDS, _HIGH_BANDS = slice(1, 27), slice(27, 69)  # below 1 kHz, and 1 to 5 kHz
 _LOUD_PERCENTILE = 95
@@ -53,7 +53,7 @@ _TINY_POWER = 1e-7
 class TeacherOutputs:
     """The outputs of the teachers for a recording; arrays have the shapes above."""
 
-    encoder: Floats
+    whisper: Floats
     phones: Floats
     pitch: Floats
     level: Floats
@@ -65,8 +65,8 @@ class Teachers:
 
     def __init__(self, blocks: BlockModel, whisper: Path) -> None:
         self._blocks, self._readout = encoder_of(blocks), readout_of(blocks)
-        self._encoder = init_encoder(whisper, _ENCODER_LAYERS)
-        self._networks = (self._blocks, self._readout, self._encoder)
+        self._whisper = init_encoder(whisper, _WHISPER_LAYERS)
+        self._networks = (self._blocks, self._readout, self._whisper)
         self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
         self._first_state = blocks.topology.first_state
         self.digest = hashlib.sha256(blocks.network.tobytes()).hexdigest()
@@ -83,7 +83,7 @@ class Teachers:
         level = np.log10(power.mean(axis=(1, 2)) + _TINY_POWER)
         low, high = (power[..., part].mean(axis=(1, 2)) for part in (_LOW_BANDS, _HIGH_BANDS))
         return TeacherOutputs(
-            encoder=self._encoder.features(samples)[:num_positions].astype(np.float32),
+            whisper=self._whisper.features(samples)[:num_positions].astype(np.float32),
             phones=self._phones(frames),
             pitch=pitch_of(samples, num_positions),
             level=(level - np.percentile(level, _LOUD_PERCENTILE)).astype(np.float32),

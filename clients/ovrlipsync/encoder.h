@@ -1,22 +1,22 @@
-/* The small ear: features, voice and laughter of 20 ms of sound. services/recognizer has the formulas. */
-#ifndef EAR_H
-#define EAR_H
+/* The audio encoder: features, voice and laughter of 20 ms of sound. services/recognizer has the formulas. */
+#ifndef ENCODER_H
+#define ENCODER_H
 
 #include "lips_model.h"
 
 enum {
-  NUM_FEATURES = SEGMENTER_FRAMES_PER_POSITION * MEL_NUM_MELS + EAR_NUM_FEATURES,
-  EAR_WIDTH = EAR_ENTRY_INTEGERS_SIZE_0,
+  NUM_FEATURES = SEGMENTER_FRAMES_PER_POSITION * MEL_NUM_MELS + ENCODER_NUM_FEATURES,
+  ENCODER_WIDTH = ENCODER_ENTRY_INTEGERS_SIZE_0,
   NUM_MOUTH_FAPS = LEARNT_NUM_MOUTH_FAPS,
   LIP_WIDTH = LIPS_ENTRY_SIZE_1
 };
 
 typedef struct {
-  float state[2 * EAR_WIDTH];
-  float features[NUM_FEATURES]; /* two log-mel frames and the ear's features, at the newest position */
+  float state[2 * ENCODER_WIDTH];
+  float features[NUM_FEATURES]; /* two log-mel frames and the encoder's features, at the newest position */
   double voice;                 /* probability of speech or singing */
   double laughter;              /* evidence */
-} Ear;
+} AudioEncoder;
 
 typedef struct {
   double time_s, delay_s;
@@ -29,11 +29,11 @@ typedef struct {
 } LipPredictor;
 
 /* Compute the tables of log_mel; call it once, in one thread. */
-void ear_init_tables(void);
+void encoder_init_tables(void);
 /* Compute log-mel bands (MEL_NUM_MELS,) of a window (MEL_WINDOW_SAMPLES,). */
 void log_mel(const float *window, float *bands);
 /* Process the next position, whose log-mel frames are at the start of the features. */
-void ear_process(Ear *ear);
+void encoder_process(AudioEncoder *encoder);
 /* Return the lip frame that follows from the features of a position. */
 LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const float *features);
 

@@ -1,7 +1,7 @@
-"""Trains the small ear from corpora: targets, training, export, model card.
+"""Trains the audio encoder from corpora: targets, training, export, model card.
 
     clips, block network, Whisper's encoder -> lip teacher
-    recordings, teachers -> targets -> small ear
+    recordings, teachers -> targets -> audio encoder
 
 If training is interrupted, the same command resumes it. Next to the output, the folder ``.targets``
 contains the lip teacher and the targets, and ``.checkpoint.pt`` the training state.
@@ -28,17 +28,17 @@ from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.ear import Voice
+from kouxing.services.recognizer.encoder import Voice
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.ear.batches import BATCH_S, Batch, Material, batch_of
-from kouxing.training.ear.export import save_ear
-from kouxing.training.ear.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
-from kouxing.training.ear.network import Ear
-from kouxing.training.ear.targets import Columns, Recording, Samples, TargetStore
-from kouxing.training.ear.teachers import Teachers
+from kouxing.training.encoder.batches import BATCH_S, Batch, Material, batch_of
+from kouxing.training.encoder.export import save_encoder
+from kouxing.training.encoder.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
+from kouxing.training.encoder.network import AudioEncoder
+from kouxing.training.encoder.targets import Columns, Recording, Samples, TargetStore
+from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.optimizer import optimize
 from kouxing.training.training_set import read_utterances, weights_of
@@ -53,11 +53,11 @@ def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
     torch.set_num_threads(1)  # reproducible sums on every machine
     blocks = load_model(model_path("blocks"))
     if not isinstance(blocks, BlockModel):
-        raise UserError("the small ear needs the shipped acoustic model; reinstall kouxing")
+        raise UserError("the audio encoder needs the shipped acoustic model; reinstall kouxing")
     return Teachers(blocks, whisper), blocks.inventory
 
 
-def train_ear(
+def train_encoder(
     corpora: Sequence[Path],
     output: Path,
     *,
@@ -69,10 +69,10 @@ def train_ear(
     num_steps: int = 7000,
     shipping: bool = True,
 ) -> None:
-    """Train the small ear, and write it with its model card.
+    """Train the audio encoder, and write it with its model card.
 
-    The arguments are the options of ``kouxing train ear``. Raises UserError if there is nothing to
-    train on, or a file cannot be read.
+    The arguments are the options of ``kouxing train encoder``. Raises UserError if there is nothing
+    to train on, or a file cannot be read.
     """
     teachers, inventory = load_teachers(whisper)
     errors = RowErrors()
@@ -113,10 +113,10 @@ def train_ear(
     material = Material(store.pieces(), backgrounds, Columns(len(inventory)))
     trained = _train_network(material, num_steps, seed, output)
     trained.rescale_lips(store.lips_mean, store.lips_deviation)
-    save_ear(output, trained)
+    save_encoder(output, trained)
     write_card(
         output,
-        title="Small ear: voice and lip features, a recurrent network",
+        title="Audio encoder: voice and lip features, a recurrent network",
         details=f"with Whisper's encoder as a teacher (Radford et al. 2023, MIT license), seed "
         f"{seed}, {num_steps} steps of {BATCH_S:.0f} s of sound",
         recordings=utterances,
@@ -167,9 +167,9 @@ def _load_lip_teacher(
     return LipTeacher.load(path)
 
 
-def _train_network(material: Material, num_steps: int, seed: int, output: Path) -> Ear:
+def _train_network(material: Material, num_steps: int, seed: int, output: Path) -> AudioEncoder:
     torch.manual_seed(seed)
-    ear = Ear(material.columns.num_phones).to(DEVICE)
+    encoder = AudioEncoder(material.columns.num_phones).to(DEVICE)
     batches: Iterator[Batch] | None = None
 
     def loss(step: int) -> Tensor:
@@ -178,11 +178,13 @@ def _train_network(material: Material, num_steps: int, seed: int, output: Path) 
             numbers = range(step, num_steps)
             batches = process_in_order(partial(batch_of, material, seed), numbers)
         with mixed_precision():
-            return ear.loss(*(torch.from_numpy(part).to(DEVICE).float() for part in next(batches)))
+            return encoder.loss(
+                *(torch.from_numpy(part).to(DEVICE).float() for part in next(batches))
+            )
 
     return optimize(
-        ear,
-        [{"params": list(ear.parameters()), "lr": _RATE}],
+        encoder,
+        [{"params": list(encoder.parameters()), "lr": _RATE}],
         loss,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,

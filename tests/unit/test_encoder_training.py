@@ -1,4 +1,4 @@
-"""Training of the small ear: its teachers, its batches, its network, the recipe."""
+"""Training of the audio encoder: its teachers, its batches, its network, the recipe."""
 
 from functools import partial
 from pathlib import Path
@@ -9,19 +9,19 @@ import soundfile
 import torch
 
 from kouxing.corpora.feature_cache import as_integers
-from kouxing.services.recognizer.ear import LIP_DELAYS_S, Voice, load_ear
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S, Voice, load_encoder
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.services.recognizer.onnx_session import open_network
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.training.ear import batches, lip_teacher, targets
-from kouxing.training.ear.batches import Material, batch_of, inputs_of
-from kouxing.training.ear.export import onnx_of
-from kouxing.training.ear.network import NUM_FEATURES, NUM_LIPS, Ear
-from kouxing.training.ear.recipe import load_teachers, train_ear
-from kouxing.training.ear.singing import sing
-from kouxing.training.ear.targets import PITCH, VOICE, Columns, Piece
-from kouxing.training.ear.teachers import POSITION_SAMPLES
+from kouxing.training.encoder import batches, lip_teacher, targets
+from kouxing.training.encoder.batches import Material, batch_of, inputs_of
+from kouxing.training.encoder.export import onnx_of
+from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
+from kouxing.training.encoder.recipe import load_teachers, train_encoder
+from kouxing.training.encoder.singing import sing
+from kouxing.training.encoder.targets import PITCH, VOICE, Columns, Piece
+from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import Shape
@@ -107,36 +107,36 @@ def test_pauses_have_no_voice_and_no_other_target(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(batches, "_PAUSE_PROB", 1.0)
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 3)
     _, rows = batch_of(Material([piece(HELLO)], [as_integers(HELLO)], COLUMNS), 0, 0)
-    paused = np.isnan(rows[..., COLUMNS.encoder]).all(axis=-1)
+    paused = np.isnan(rows[..., COLUMNS.whisper]).all(axis=-1)
     assert paused.any()
     assert (rows[..., VOICE][paused] == Voice.NONE).all()
     assert (rows[..., VOICE][~paused] == Voice.SPEECH).all()
 
 
 def test_loss_leaves_out_unknown_targets() -> None:
-    ear = Ear(NUM_PHONES, width=8)
+    encoder = AudioEncoder(NUM_PHONES, width=8)
     inputs = torch.randn(2, 9, 160)
     rows = torch.randn(2, 9, COLUMNS.lips.start + NUM_LIPS)
     rows[..., VOICE] = 1
     rows[:, 3:5, :VOICE] = rows[:, 3:5, VOICE + 1 :] = torch.nan
-    loss = ear.loss(inputs, rows)
+    loss = encoder.loss(inputs, rows)
     loss.backward()  # type: ignore[no-untyped-call]
     assert loss.isfinite()
-    gradients = [weight.grad for weight in ear.parameters()]
+    gradients = [weight.grad for weight in encoder.parameters()]
     assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
     changed = inputs.clone()
     changed[:, -1] += 1  # the newest position affects only the targets of now
-    before, after = (ear.split(ear(values)) for values in (inputs, changed))
+    before, after = (encoder.split(encoder(values)) for values in (inputs, changed))
     assert torch.equal(before.voice[:, :-1], after.voice[:, :-1])
 
 
 def test_exported_steps_follow_pytorch() -> None:
     torch.manual_seed(0)
-    ear = Ear(NUM_PHONES, width=16).eval()
-    session = open_network(onnx_of(ear).tobytes())
+    encoder = AudioEncoder(NUM_PHONES, width=16).eval()
+    session = open_network(onnx_of(encoder).tobytes())
     inputs = inputs_of(HELLO)[:20]
     with torch.no_grad():
-        expected = ear.split(ear(torch.from_numpy(inputs)[None]))
+        expected = encoder.split(encoder(torch.from_numpy(inputs)[None]))
     state = np.zeros((2, 32), np.float32)
     for number, row in enumerate(inputs):
         names = ["voice", "features", "new_state"]
@@ -173,13 +173,13 @@ def test_trains_resumes_and_writes_a_model(
     clips.mkdir()
     write_clip(clips, name_for("train"), "anna", "CC0")
     write_clip(clips, name_for("choice"), "berta", "MIT")
-    output = tmp_path / "ear.npz"
+    output = tmp_path / "encoder.npz"
     sounds = [write_sounds(tmp_path / "sounds")]
-    train = partial(train_ear, [corpus], output, whisper=whisper, clips=clips, sounds=sounds)
+    train = partial(train_encoder, [corpus], output, whisper=whisper, clips=clips, sounds=sounds)
     train(untranscribed=[corpus], num_steps=2)
     train(untranscribed=[corpus], num_steps=3)
     assert "resuming after step 2" in capsys.readouterr().err
-    assert load_ear(output).num_features == NUM_FEATURES
+    assert load_encoder(output).num_features == NUM_FEATURES
     assert "3 steps of" in output.with_suffix(".md").read_text()
     with pytest.raises(UserError, match="targets of other recordings or models; delete it"):
         train(num_steps=3)
@@ -189,4 +189,4 @@ def test_trains_resumes_and_writes_a_model(
 def test_needs_speech_and_sounds(tmp_path: Path, whisper: Path, name: str, problem: str) -> None:
     corpus = write_corpus(tmp_path / "corpus", {name: HELLO})
     with pytest.raises(UserError, match=problem):
-        train_ear([corpus], tmp_path / "ear.npz", whisper=whisper, clips=tmp_path)
+        train_encoder([corpus], tmp_path / "encoder.npz", whisper=whisper, clips=tmp_path)

@@ -1,4 +1,4 @@
-"""The small ear in PyTorch: a recurrent network of 2.7 million weights, one step every 20 ms.
+"""The audio encoder in PyTorch: a recurrent network of 2.7 million weights, one step every 20 ms.
 
     a = relu(U x)
     h1 = GRU(a),  h2 = GRU(h1)
@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, log_softmax
 
-from kouxing.services.recognizer.ear import LIP_DELAYS_S, Voice
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S, Voice
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
-from kouxing.training.ear.targets import (
+from kouxing.training.encoder.targets import (
     EFFORT,
     LEVEL,
     NUM_COMPONENTS,
@@ -74,7 +74,7 @@ class Outputs:
 MEAN_PITCH = 7.5  # log2 of Hz
 
 
-class Ear(nn.Module):
+class AudioEncoder(nn.Module):
     """The network."""
 
     def __init__(self, num_phones: int, width: int = WIDTH) -> None:
@@ -127,8 +127,8 @@ class Ear(nn.Module):
             late.voicing, is_voiced.float(), reduction="none"
         )
         losses = (
-            _squared_error(now.early, targets[..., self.columns.encoder]),
-            _squared_error(late.late, before[..., self.columns.encoder]),
+            _squared_error(now.early, targets[..., self.columns.whisper]),
+            _squared_error(late.late, before[..., self.columns.whisper]),
             _LIPS_WEIGHT * _squared_error(now.lips, targets[..., self.columns.lips]),
             _PHONES_WEIGHT * _mean(entropy, has_phones),
             cross_entropy(late.voice.flatten(0, 1), voice.flatten().long()),

@@ -1,4 +1,4 @@
-"""The small ear: a recurrent network that processes all audio, with and without speech.
+"""The audio encoder: a recurrent network that processes all audio, with and without speech.
 
 It computes the inputs of the voice activity detector and the lip predictor. A position is 20 ms of
 audio, two log-mel frames.
@@ -15,7 +15,7 @@ v        probabilities of the kinds of voice (:class:`Voice`),    (4,)
          for the audio 40 ms earlier
 ======== ======================================================== ==================
 
-:mod:`kouxing.training.ear` trains the network.
+:mod:`kouxing.training.encoder` trains the network.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from kouxing.services.recognizer.acoustic.network import (
 )
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
-EAR_PATH = Path(__file__).parent / "models" / "ear.npz"
-FORMAT = "ear 1"
+ENCODER_PATH = Path(__file__).parent / "models" / "encoder.npz"
+FORMAT = "encoder 1"
 
 PHONES_LAG_FRAMES = 5
 LIP_DELAYS_S = (0.015, 0.055, 0.155)  # delays of the lips at the end of the features
@@ -58,8 +58,8 @@ class Voice(IntEnum):
     LAUGHTER = 3
 
 
-class EarPosition(NamedTuple):
-    """The ear's outputs at a position; shapes as above."""
+class EncoderOutput(NamedTuple):
+    """The encoder's outputs at a position; shapes as above."""
 
     frames: Floats  # x as (2, 80)
     features: Floats
@@ -68,11 +68,11 @@ class EarPosition(NamedTuple):
     state: Floats  # h after the position
 
 
-class Ear:
+class AudioEncoder:
     """The network, shared by any number of streams."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
-        """Open an ONNX file; ``ValueError`` if it does not contain a small ear."""
+        """Open an ONNX file; ``ValueError`` if it does not contain an audio encoder."""
         self._session = open_session(file)
         nodes = [*self._session.get_inputs(), *self._session.get_outputs()]
         widths = {node.name: node.shape[-1] for node in nodes}
@@ -98,38 +98,43 @@ class Ear:
         outputs: list[Floats] = run_session(self._session, _OUTPUTS, inputs)
         return outputs
 
-    def create_stream(self) -> EarStream:
+    def create_stream(self) -> EncoderStream:
         """Create the stream of one session."""
-        return EarStream(self)
+        return EncoderStream(self)
 
 
-class EarStream:
+class EncoderStream:
     """The positions of one session's audio."""
 
-    def __init__(self, ear: Ear) -> None:
-        self.ear = ear
-        self.state = np.zeros(ear.state_width, np.float32)
+    def __init__(self, encoder: AudioEncoder) -> None:
+        self.encoder = encoder
+        self.state = np.zeros(encoder.state_width, np.float32)
 
-    def accept_position(self, frames: Floats) -> EarPosition:
+    def accept_position(self, frames: Floats) -> EncoderOutput:
         """Take the next position's frames, (2, 80)."""
         return process_positions([self], [frames])[0]
 
 
-def process_positions(streams: Sequence[EarStream], frames: Sequence[Floats]) -> list[EarPosition]:
-    """Process the next frames, (2, 80), of several streams of one ear in one run."""
+def process_positions(
+    streams: Sequence[EncoderStream], frames: Sequence[Floats]
+) -> list[EncoderOutput]:
+    """Process the next frames, (2, 80), of several streams of one encoder in one run."""
     states = np.array([stream.state for stream in streams])
-    outputs = streams[0].ear.run(np.array(frames), states)
+    outputs = streams[0].encoder.run(np.array(frames), states)
     positions = []
     for stream, of_stream, *rows in zip(streams, frames, *outputs, strict=True):
         features, phones, voice, state = (row.copy() for row in rows)  # a view keeps all rows
         stream.state = state
-        positions.append(EarPosition(of_stream, features, phones, voice, state))
+        positions.append(EncoderOutput(of_stream, features, phones, voice, state))
     return positions
 
 
 @cache
-def load_ear(path: Path = EAR_PATH) -> Ear:
+def load_encoder(path: Path = ENCODER_PATH) -> AudioEncoder:
     """Read a model file; ``UserError`` if it is missing, broken or of another format."""
     return load_part(
-        path, FORMAT, "small ear", lambda file: Ear(file.array("network", None).astype(np.uint8))
+        path,
+        FORMAT,
+        "audio encoder",
+        lambda file: AudioEncoder(file.array("network", None).astype(np.uint8)),
     )

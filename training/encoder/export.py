@@ -1,4 +1,4 @@
-"""Export the small ear to ONNX, and write its model file.
+"""Export the audio encoder to ONNX, and write its model file.
 
 The graph computes one step for any number of sessions.
 
@@ -24,32 +24,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.model_file import write_archive
-from kouxing.services.recognizer.ear import FORMAT, Voice
-from kouxing.training.ear.network import (
+from kouxing.services.recognizer.encoder import FORMAT, Voice
+from kouxing.training.encoder.network import (
     MEAN_PITCH,
     NUM_FEATURES,
     NUM_INPUTS,
-    Ear,
+    AudioEncoder,
 )
 from kouxing.training.networks.onnx_graph import Floats, Graph, arrays_of, floats
 
 
-def save_ear(path: Path, ear: Ear) -> None:
+def save_encoder(path: Path, encoder: AudioEncoder) -> None:
     """Write the model as an npz file (arrays only, no pickle)."""
-    write_archive(path, {"format": np.array(FORMAT), "network": onnx_of(ear)})
+    write_archive(path, {"format": np.array(FORMAT), "network": onnx_of(encoder)})
 
 
-def onnx_of(ear: Ear) -> NDArray[np.uint8]:
+def onnx_of(encoder: AudioEncoder) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
-    return _EarGraph(ear).build_step_model()
+    return _EncoderGraph(encoder).build_step_model()
 
 
-class _EarGraph(Graph):
-    def __init__(self, ear: Ear) -> None:
+class _EncoderGraph(Graph):
+    def __init__(self, encoder: AudioEncoder) -> None:
         super().__init__()
-        self._parameters = arrays_of(ear)
+        self._parameters = arrays_of(encoder)
         self._width = len(self._parameters["entry.bias"])
-        self._num_phones = ear.columns.num_phones
+        self._num_phones = encoder.columns.num_phones
 
     def build_step_model(self) -> NDArray[np.uint8]:
         """Add all nodes; return the ONNX file."""
@@ -76,7 +76,7 @@ class _EarGraph(Graph):
             floats("scalars", "sessions", 4),
             floats("new_state", "sessions", 2 * width),
         ]
-        return self.file("ear", inputs, outputs)
+        return self.file("encoder", inputs, outputs)
 
     def _step(self, inputs: str, state: str, name: str) -> str:
         """Run a recurrent layer for one step: (sessions, width) to its new state."""

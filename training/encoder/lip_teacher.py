@@ -1,8 +1,8 @@
 """The lip teacher predicts the lips of a speaker from the whole recording.
 
-It learns from filmed speech. Its inputs come from networks that process the whole clean
-recording, and its recurrent layer runs both ways. It therefore follows unseen speakers more closely
-than a live network can. It labels speech without video, so that the small ear learns lips from many
+It learns from filmed speech. Its inputs come from networks that process the whole clean recording,
+and its recurrent layer runs both ways. It therefore follows unseen speakers more closely than a
+live network can. It labels speech without video, so that the audio encoder learns lips from many
 voices.
 
     z = P clip((h - mean) / deviation, -6, 6)
@@ -42,7 +42,7 @@ from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.events import Phone
-from kouxing.training.ear.teachers import Teachers
+from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.lips.recipe import repeats_by_source, standardize, units_of
 from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
@@ -63,13 +63,13 @@ _PARTS = ("mean", "deviation", "directions")
 class TeacherFeatures:
     """Outputs of the networks for a recording; row p is centered on 20 (p + 1) ms."""
 
-    encoder: Floats  # (positions, 1536)
+    whisper: Floats  # (positions, 1536)
     phones: Floats  # (positions, phones)
 
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Projection of the encoder's positions to principal components of variance 1."""
+    """Projection of Whisper's positions to principal components of variance 1."""
 
     mean: Floats  # (features,)
     deviation: Floats  # (features,)
@@ -137,9 +137,9 @@ def teacher_features(teachers: Teachers, samples: Floats) -> TeacherFeatures:
     for start in range(0, max(1, len(samples) - _MIN_SAMPLES), _PART_SAMPLES):
         part = samples[start : start + _PART_SAMPLES + WINDOW_SAMPLES]
         outputs = teachers.compute_targets(as_integers(part))
-        features.append((outputs.encoder, outputs.phones))
-    encoder, phones = zip(*features, strict=True)
-    return TeacherFeatures(np.concatenate(encoder), np.concatenate(phones))
+        features.append((outputs.whisper, outputs.phones))
+    whisper, phones = zip(*features, strict=True)
+    return TeacherFeatures(np.concatenate(whisper), np.concatenate(phones))
 
 
 def train_lip_teacher(
@@ -149,11 +149,11 @@ def train_lip_teacher(
     seed: int,
 ) -> LipTeacher:
     """Train the teacher on filmed clips; ``phones`` has those of clips in its language, by name."""
-    projection = Projection.of(np.concatenate([one.encoder for one in features]))
+    projection = Projection.of(np.concatenate([one.whisper for one in features]))
     closed_at = closed_below(clips)
     targets = []
     for clip, one in zip(clips, features, strict=True):
-        time_s = POSITION_S * np.arange(1.0, 1 + len(one.encoder))
+        time_s = POSITION_S * np.arange(1.0, 1 + len(one.whisper))
         known = phones.get(clip.name)
         targets.append(targets_at(clip, known, closed_at[clip.speaker], time_s, [0.0]))
     units = units_of(targets)
@@ -176,4 +176,4 @@ def train_lip_teacher(
 
 def _inputs(projection: Projection, features: TeacherFeatures) -> Floats:
     phones = np.log(features.phones + 1e-3) / 3 + 1
-    return np.concatenate([projection.apply(features.encoder), phones], axis=1).astype(np.float32)
+    return np.concatenate([projection.apply(features.whisper), phones], axis=1).astype(np.float32)

@@ -1,17 +1,17 @@
-"""Recordings with the targets of the small ear, computed once and kept on disk.
+"""Recordings with the targets of the audio encoder, computed once and kept on disk.
 
 The recordings are shuffled, and split into chunks that are computed in parallel. Each target file
 has these columns:
 
 ========= ===================================================================== ========
-columns   meaning (:mod:`kouxing.training.ear.teachers`)                        number
+columns   meaning (:mod:`kouxing.training.encoder.teachers`)                        number
 ========= ===================================================================== ========
 pitch     log2 of Hz, NaN without voice                                         1
 level     relative to the recording                                             1
 effort    balance of high and low frequencies                                   1
 voice     number of a :class:`Voice`                                            1
 phones    posteriors                                                            phones
-encoder   principal components of Whisper's encoder                             128
+whisper   principal components of Whisper's encoder                             128
 lips      outputs of the lip teacher, standardized                              17
 ========= ===================================================================== ========
 
@@ -32,12 +32,12 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import as_floats, as_integers, load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
-from kouxing.services.recognizer.ear import Voice
+from kouxing.services.recognizer.encoder import Voice
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import write_text
-from kouxing.training.ear.lip_teacher import LipTeacher, TeacherFeatures
-from kouxing.training.ear.singing import sing
-from kouxing.training.ear.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
+from kouxing.training.encoder.lip_teacher import LipTeacher, TeacherFeatures
+from kouxing.training.encoder.singing import sing
+from kouxing.training.encoder.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
 
 Floats = NDArray[np.float32]
 Samples = NDArray[np.int16]  # 16 kHz
@@ -85,14 +85,14 @@ class Columns:
         return slice(VOICE + 1, VOICE + 1 + self.num_phones)
 
     @property
-    def encoder(self) -> slice:
+    def whisper(self) -> slice:
         """Components of Whisper's encoder."""
         return slice(self.phones.stop, self.phones.stop + NUM_COMPONENTS)
 
     @property
     def lips(self) -> slice:
         """Outputs of the lip teacher; in a batch, of each delay."""
-        return slice(self.encoder.stop, None)
+        return slice(self.whisper.stop, None)
 
 
 class TargetStore:
@@ -158,12 +158,12 @@ class TargetStore:
         speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
         sounds = [sound for one in speech for sound in _cut(one)]
         computed = process_in_order(self._teachers.compute_targets, sounds)
-        features = [TeacherFeatures(outputs.encoder, outputs.phones) for outputs in computed]
-        encoder = np.concatenate([one.encoder for one in features])
+        features = [TeacherFeatures(outputs.whisper, outputs.phones) for outputs in computed]
+        whisper = np.concatenate([one.whisper for one in features])
         lips = np.concatenate([self._lip_teacher.lips_of(one) for one in features])
         return {
-            "encoder_mean": encoder.mean(axis=0),
-            "encoder": _components_of(encoder - encoder.mean(axis=0)),
+            "whisper_mean": whisper.mean(axis=0),
+            "whisper": _components_of(whisper - whisper.mean(axis=0)),
             "lips_mean": lips.mean(axis=0),
             "lips_deviation": lips.std(axis=0),
         }
@@ -215,10 +215,10 @@ class TargetStore:
             voice = np.full(len(outputs.level), recording.voice, np.float32)
             voice[~self._is_audible(outputs, recording.voice)] = Voice.NONE
             scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
-            encoder = (outputs.encoder - self._basis["encoder_mean"]) @ self._basis["encoder"]
-            lips = self._lip_teacher.lips_of(TeacherFeatures(outputs.encoder, outputs.phones))
+            whisper = (outputs.whisper - self._basis["whisper_mean"]) @ self._basis["whisper"]
+            lips = self._lip_teacher.lips_of(TeacherFeatures(outputs.whisper, outputs.phones))
             lips = (lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
-            rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, encoder, lips]
+            rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, whisper, lips]
             targets = np.column_stack(rows).astype(np.float16)
             kept = samples[: POSITION_SAMPLES * len(targets)]
             pieces.append(Piece(kept, targets, recording.weight))

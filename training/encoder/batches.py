@@ -1,4 +1,4 @@
-"""Batches for the small ear: augmented speech with the targets of the clean recordings.
+"""Batches for the audio encoder: augmented speech with the targets of the clean recordings.
 
 An excerpt joins recordings, with pauses between some of them. Its random speed also shifts pitch
 and formants. Music, voices or noise are added in the background, then the augmentations of
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.mouth_profiles.positions import POSITION_S
-from kouxing.services.recognizer.ear import LIP_DELAYS_S, Voice
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S, Voice
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.training.ear.network import NUM_INPUTS
-from kouxing.training.ear.targets import PITCH, VOICE, Columns, Piece, Samples
-from kouxing.training.ear.teachers import POSITION_SAMPLES
+from kouxing.training.encoder.network import NUM_INPUTS
+from kouxing.training.encoder.targets import PITCH, VOICE, Columns, Piece, Samples
+from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks.augmentation import (
     Sound,
     add_sounds,

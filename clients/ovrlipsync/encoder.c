@@ -1,4 +1,4 @@
-#include "ear.h"
+#include "encoder.h"
 
 #include <math.h>
 #include <string.h>
@@ -20,7 +20,7 @@ static double sigmoid(double x) { return 0.5 * tanh(0.5 * x) + 0.5; }
 
 static double cosines[MEL_WINDOW_SAMPLES], sines[MEL_WINDOW_SAMPLES];
 
-void ear_init_tables(void) {
+void encoder_init_tables(void) {
   for (int n = 0; n < MEL_WINDOW_SAMPLES; n++) {
     cosines[n] = cos(2.0 * PI * n / MEL_WINDOW_SAMPLES);
     sines[n] = sin(2.0 * PI * n / MEL_WINDOW_SAMPLES);
@@ -55,10 +55,10 @@ void log_mel(const float *window, float *bands) {
 
 /* Compute a layer with weights and inputs of 8 bits. As on the server, values have 32 bits after each step. */
 static void apply_layer(Layer layer, const float *inputs, float *outputs) {
-  int8_t integers[EAR_WIDTH];
+  int8_t integers[ENCODER_WIDTH];
   float largest = 0.0f;
   for (int i = 0; i < layer.rows; i++) largest = fmaxf(largest, fabsf(inputs[i]));
-  const float scale = fmaxf(largest * (float)EAR_STEP, (float)EAR_MIN_SCALE);
+  const float scale = fmaxf(largest * (float)ENCODER_STEP, (float)ENCODER_MIN_SCALE);
   for (int i = 0; i < layer.rows; i++) {
     const float rounded = rintf(inputs[i] / scale);
     integers[i] = (int8_t)fminf(fmaxf(rounded, -128.0f), 127.0f);
@@ -74,37 +74,37 @@ static void apply_layer(Layer layer, const float *inputs, float *outputs) {
 
 /* Advance a gated recurrent unit (Cho et al. 2014). */
 static void advance_unit(Layer from_inputs, Layer from_state, const float *inputs, float *state) {
-  float x[3 * EAR_WIDTH], h[3 * EAR_WIDTH];
+  float x[3 * ENCODER_WIDTH], h[3 * ENCODER_WIDTH];
   apply_layer(from_inputs, inputs, x);
   apply_layer(from_state, state, h);
-  for (int i = 0; i < EAR_WIDTH; i++) {
+  for (int i = 0; i < ENCODER_WIDTH; i++) {
     const float reset = (float)(1.0 / (1.0 + exp(-(double)(x[i] + h[i]))));
-    const float update = (float)(1.0 / (1.0 + exp(-(double)(x[EAR_WIDTH + i] + h[EAR_WIDTH + i]))));
-    const float next = tanhf(x[2 * EAR_WIDTH + i] + reset * h[2 * EAR_WIDTH + i]);
+    const float update = (float)(1.0 / (1.0 + exp(-(double)(x[ENCODER_WIDTH + i] + h[ENCODER_WIDTH + i]))));
+    const float next = tanhf(x[2 * ENCODER_WIDTH + i] + reset * h[2 * ENCODER_WIDTH + i]);
     state[i] = next + update * (state[i] - next);
   }
 }
 
-void ear_process(Ear *ear) {
-  float entered[EAR_WIDTH], outputs[EAR_OUTPUT_INTEGERS_SIZE_0];
-  float *first = ear->state, *second = ear->state + EAR_WIDTH;
-  apply_layer(LAYER(EAR_ENTRY), ear->features, entered);
-  for (int i = 0; i < EAR_WIDTH; i++) entered[i] = fmaxf(entered[i], 0.0f);
-  advance_unit(LAYER(EAR_FIRST_IH), LAYER(EAR_FIRST_HH), entered, first);
-  advance_unit(LAYER(EAR_SECOND_IH), LAYER(EAR_SECOND_HH), first, second);
-  for (int i = 0; i < EAR_WIDTH; i++) entered[i] = first[i] + second[i];
-  apply_layer(LAYER(EAR_OUTPUT), entered, outputs);
-  memcpy(ear->features + NUM_FEATURES - EAR_NUM_FEATURES, outputs, EAR_NUM_FEATURES * sizeof(float));
+void encoder_process(AudioEncoder *encoder) {
+  float entered[ENCODER_WIDTH], outputs[ENCODER_OUTPUT_INTEGERS_SIZE_0];
+  float *first = encoder->state, *second = encoder->state + ENCODER_WIDTH;
+  apply_layer(LAYER(ENCODER_ENTRY), encoder->features, entered);
+  for (int i = 0; i < ENCODER_WIDTH; i++) entered[i] = fmaxf(entered[i], 0.0f);
+  advance_unit(LAYER(ENCODER_FIRST_IH), LAYER(ENCODER_FIRST_HH), entered, first);
+  advance_unit(LAYER(ENCODER_SECOND_IH), LAYER(ENCODER_SECOND_HH), first, second);
+  for (int i = 0; i < ENCODER_WIDTH; i++) entered[i] = first[i] + second[i];
+  apply_layer(LAYER(ENCODER_OUTPUT), entered, outputs);
+  memcpy(encoder->features + NUM_FEATURES - ENCODER_NUM_FEATURES, outputs, ENCODER_NUM_FEATURES * sizeof(float));
 
-  const float *logits = outputs + EAR_NUM_FEATURES + EAR_NUM_PHONES;
+  const float *logits = outputs + ENCODER_NUM_FEATURES + ENCODER_NUM_PHONES;
   double total = 0.0;
   for (int voice = 0; voice < NUM_VOICES; voice++) total += exp(logits[voice]);
-  ear->voice = (float)((exp(logits[VOICE_SPEECH]) + exp(logits[VOICE_SUNG])) / total);
+  encoder->voice = (float)((exp(logits[VOICE_SPEECH]) + exp(logits[VOICE_SUNG])) / total);
 
   enum { LAUGHTER = 2 }; /* a column of the readout */
   double laughter = TRAITS_BIAS[LAUGHTER];
-  for (int i = 0; i < 2 * EAR_WIDTH; i++) laughter += (double)ear->state[i] * TRAITS_WEIGHTS[i * TRAITS_NUM_TRAITS + LAUGHTER];
-  ear->laughter += TRAITS_EVIDENCE_SHARE * (laughter - ear->laughter);
+  for (int i = 0; i < 2 * ENCODER_WIDTH; i++) laughter += (double)encoder->state[i] * TRAITS_WEIGHTS[i * TRAITS_NUM_TRAITS + LAUGHTER];
+  encoder->laughter += TRAITS_EVIDENCE_SHARE * (laughter - encoder->laughter);
 }
 
 static void copy(double *out, const float *values, int size) {

@@ -1,1 +1,0 @@
-"""Training of the small ear: one network for lips, voice, pitch and effort."""
