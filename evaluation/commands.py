@@ -324,10 +324,9 @@ def report(
 @app.command()
 def schemes(
     manifest: Annotated[
-        Path | None, typer.Option(help="Manifest or corpus folder; 20 sentences are used.")
+        Path | None,
+        typer.Option(help="Manifest or corpus folder; 20 sentences of its split test are used."),
     ] = None,
-    audio: AudioFolder = None,
-    split: Annotated[str | None, typer.Option(help="Split of the corpus. Default: test.")] = None,
     clips: Annotated[
         Path | None, typer.Option(help="Folder of clips with tracked lips, instead of a corpus.")
     ] = None,
@@ -347,13 +346,6 @@ def schemes(
             help="Folder with CLIP.csv: also write videos of another program's curves; repeatable."
         ),
     ] = None,
-    anchor: Annotated[
-        bool, typer.Option("--anchor", help="Also write videos with a mouth at rest.")
-    ] = False,
-    sound_at_once: Annotated[
-        bool,
-        typer.Option("--sound-at-once", help="Do not delay the sound in videos of live faces."),
-    ] = False,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -373,17 +365,11 @@ def schemes(
     check_output(json_file, inputs=[manifest], force=force)
     if manifest and clips:
         raise UserError("use either --manifest or --clips, not both")
-    if (audio or split) and not manifest:
-        raise UserError("--audio and --split apply to a corpus; add --manifest")
-    if (anchor or sound_at_once or from_csv) and not videos:
-        raise UserError(
-            "--anchor, --from-csv and --sound-at-once apply to videos; add --videos FOLDER"
-        )
-    if from_csv and not clips:
-        raise UserError("--from-csv applies to clips with tracked lips; add --clips")
+    if from_csv and not (videos and clips):
+        raise UserError("--from-csv applies to videos of clips; add --videos FOLDER and --clips")
     model = load_model()
     if manifest:
-        chosen = sentences.corpus_sentences(model, manifest, split or "test", audio)
+        chosen = sentences.corpus_sentences(model, manifest)
     elif clips:
         chosen = sentences.clip_sentences(model, clips)
     else:
@@ -395,10 +381,7 @@ def schemes(
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))
     if videos:
-        options = {"has_anchor": anchor, "sound_at_once": sound_at_once}
-        written = write_videos(
-            recognized, recognizers, names, videos, programs=from_csv or (), **options
-        )
+        written = write_videos(recognized, recognizers, names, videos, from_csv or ())
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
         unaligned = [one.sentence.clip.name for one in recognized if one.aligned is None]
         if unaligned:

@@ -11,7 +11,6 @@ from rich.progress import track
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
-    RECOGNIZED,
     Condition,
     RecognizedSentence,
     TestedRecognizer,
@@ -23,7 +22,6 @@ from kouxing.services.driver.config import Framing
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video import film
-from kouxing.services.lip_models import lip_model_info
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import Frame
 from kouxing.shared.errors import UserError
@@ -40,31 +38,20 @@ def write_videos(
     recognizers: Sequence[TestedRecognizer],
     lips: Sequence[str],
     folder: Path,
-    *,
     programs: Sequence[Path] = (),
-    has_anchor: bool = False,
-    sound_at_once: bool = False,
 ) -> list[Path]:
     """Write ``CONDITION/SENTENCE.mp4`` for all conditions and sentences; keep existing videos.
 
     A condition that is not possible for every sentence is left out, because a listening test needs
     all sentences in all conditions. ``programs`` are folders with curves of other programs, and
-    each is a condition, at its best delay for these sentences. ``has_anchor`` adds a condition
-    ``anchor``, with a mouth at rest. ``sound_at_once`` shows live frames when they are made, later
-    than their sound. All mouths have an expressiveness of 1, like the tracked one. Raises UserError
-    if a file cannot be written, or a program's table cannot be used.
+    each is a condition, at its best delay for these sentences. Clips with tracked lips add the
+    conditions ``tracked`` and ``anchor``, a mouth at rest. All mouths have an expressiveness of 1,
+    like the tracked one. Raises UserError if a file cannot be written, or a program's table cannot
+    be used.
     """
-    conditions = _conditions(
-        recognized,
-        recognizers,
-        lips,
-        programs=programs,
-        has_anchor=has_anchor,
-        sound_at_once=sound_at_once,
-    )
     missing = [
         (make, sentence, path)
-        for name, make in conditions
+        for name, make in _conditions(recognized, recognizers, lips, programs)
         for sentence in recognized
         if not (path := folder / name / f"{sentence.sentence.clip.name}.mp4").exists()
     ]
@@ -93,10 +80,7 @@ def _conditions(
     recognized: Sequence[RecognizedSentence],
     recognizers: Sequence[TestedRecognizer],
     lips: Sequence[str],
-    *,
     programs: Sequence[Path],
-    has_anchor: bool,
-    sound_at_once: bool,
 ) -> Iterator[tuple[str, MakeFrames]]:
     """Yield each condition's name, and the function that makes its frames."""
     is_aligned = all(sentence.aligned is not None for sentence in recognized)
@@ -106,19 +90,15 @@ def _conditions(
         if condition.scheme != ALIGNED or is_aligned
     ]
     for condition in conditions:
-        if sound_at_once and condition.scheme > RECOGNIZED:
-            yield f"{condition.name}-sound-at-once", partial(_late_frames, condition)
-        else:
-            yield condition.name, partial(_frames, condition)
+        yield condition.name, partial(_frames, condition)
     if not conditions:
         return
-    if has_anchor:
-        yield "anchor", partial(_frames_with_mouth, conditions[0], _mouth_at_rest)
     clips = [sentence.sentence.clip for sentence in recognized]
     for program in programs:
         yield program.name, partial(_frames_with_mouth, conditions[0], load_shipped(program, clips))
     if all(len(clip.time_s) and clip.is_in_sync for clip in clips):
         yield "tracked", partial(_frames_with_mouth, conditions[0], tracked_frames)
+        yield "anchor", partial(_frames_with_mouth, conditions[0], _mouth_at_rest)
 
 
 def _frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
@@ -127,11 +107,6 @@ def _frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
     )
     assert frames is not None  # noqa: S101 - impossible conditions are left out
     return frames
-
-
-def _late_frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
-    delay_s = lip_model_info(condition.lips).delay_ms / 1e3
-    return [(time_s + delay_s, faps) for time_s, faps in _frames(condition, sentence)]
 
 
 def _frames_with_mouth(

@@ -42,14 +42,12 @@ def sample_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
     return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
 
 
-def corpus_sentences(
-    model: AcousticModel, corpus: Path, split: str, audio: Path | None = None
-) -> list[Sentence]:
-    """Read twenty sentences of a split of a corpus; raises UserError if it has none."""
+def corpus_sentences(model: AcousticModel, corpus: Path) -> list[Sentence]:
+    """Read twenty sentences of the split ``test`` of a corpus; raises UserError if it has none."""
     errors = RowErrors()
-    utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
+    utterances = read_corpus(corpus, errors, model.inventory, split="test")
     if not utterances:
-        raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
+        raise errors.no_recording_error(f"in the split 'test' of {corpus}")
     sentences = []
     for utterance in choose(utterances):
         clip = _clip(model, utterance.path, utterance.utterance_id, utterance.speaker)
@@ -59,14 +57,14 @@ def corpus_sentences(
     return sentences
 
 
-def choose(utterances: Sequence[Utterance], number: int = NUM_SENTENCES) -> list[Utterance]:
-    """Choose equally many utterances of each speaker, preferably about 4 s long."""
+def choose(utterances: Sequence[Utterance]) -> list[Utterance]:
+    """Choose twenty utterances, equally many of each speaker, preferably about 4 s long."""
     by_speaker: dict[str, list[Utterance]] = defaultdict(list)
     for utterance in sorted(utterances, key=lambda u: (abs(u.seconds - _MEAN_S), u.utterance_id)):
         by_speaker[utterance.speaker].append(utterance)
     rounds = zip_longest(*(by_speaker[speaker] for speaker in sorted(by_speaker)))
     ranked = [utterance for turn in rounds for utterance in turn if utterance is not None]
-    return sorted(ranked[:number], key=lambda utterance: utterance.utterance_id)
+    return sorted(ranked[:NUM_SENTENCES], key=lambda utterance: utterance.utterance_id)
 
 
 def clip_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:

@@ -143,9 +143,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("config control --markdown", "leave out the service"),
         ("head export heads --all --head ada", "leave out --head or --all"),
         ("keys add tablet", "tablet.key exists; add --force"),
-        ("evaluate schemes --anchor", "add --videos FOLDER"),
-        ("evaluate schemes --from-csv . --videos .", "add --clips"),
-        ("evaluate schemes --split dev", "add --manifest"),
+        ("evaluate schemes --from-csv . --videos .", "add --videos FOLDER and --clips"),
     ],
 )
 def test_refuses_an_option_without_effect(
