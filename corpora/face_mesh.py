@@ -116,8 +116,8 @@ def _crop(image: UInt8, square: _Square, side_px: int) -> Floats:
     """Return a square of a image, (side_px, side_px, 3), black outside the image."""
     steps = (np.arange(side_px) + 0.5) / side_px - 0.5
     y, x = np.meshgrid(steps, steps, indexing="ij")
-    at = square.to_pixels(np.stack([x, y], axis=-1)) - 0.5
-    rows_columns = at[..., ::-1].transpose(2, 0, 1)
+    positions = square.to_pixels(np.stack([x, y], axis=-1)) - 0.5
+    rows_columns = positions[..., ::-1].transpose(2, 0, 1)
     channels = [
         map_coordinates(image[..., channel], rows_columns, np.float32, order=1)
         for channel in range(3)

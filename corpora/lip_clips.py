@@ -5,8 +5,8 @@ A folder contains for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each 
 FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig
 (``mouth_stretch_c``). A clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
 
-Every clip has one part: training (``train``), choosing settings (``choice``), or scoring
-(``held``). The rule `part_of` decides, so clips cannot be picked by hand. ``held.txt`` in the
+Every clip belongs to one split: training (``train``), choosing settings (``choice``), or scoring
+(``held``). The rule `split_of` decides, so clips cannot be picked by hand. ``held.txt`` in the
 folder names further clips and speakers to hold out.
 """
 
@@ -88,7 +88,7 @@ class LipClip:
     speaker: str = ""
     license: str = ""
     language: str = ""  # "zh", "en", ...
-    part: str = "train"  # "train", "choice" or "held"
+    split: str = "train"  # "train", "choice" or "held"
     is_in_sync: bool = True  # otherwise only shapes can be compared, not times
     is_filmed: bool = True  # otherwise captured with sensors, or animated
     is_rig: bool = False  # an animator's rig, whose mouth rests at 0
@@ -114,8 +114,8 @@ class LipClip:
         )
 
 
-def part_of(name: str, *, may_train: bool) -> str:
-    """Return a clip's part, by the CRC-32 of its name modulo 4.
+def split_of(name: str, *, may_train: bool) -> str:
+    """Return the split of a clip, by the CRC-32 of its name modulo 4.
 
     2 is ``held``, odd values are ``train`` if the license allows it, all others are ``choice``.
     """
@@ -149,7 +149,7 @@ def read_clips(
 def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> list[LipClip]:
     """Return the clips that a model may be trained on. By default, their license must allow it."""
     return [
-        clip for clip in clips if clip.part != "held" and (any_license or may_ship(clip.license))
+        clip for clip in clips if clip.split != "held" and (any_license or may_ship(clip.license))
     ]
 
 
@@ -194,13 +194,13 @@ def _read_clip(
         faps = _rig_faps(values) if is_rig else _tracked_faps(values)
         if np.isnan(faps).all():
             raise ValueError("it contains no FAP of the mouth")
-        part = part_of(path.stem, may_train=any_license or may_ship(license_name))
+        split = split_of(path.stem, may_train=any_license or may_ship(license_name))
         return LipClip(
             name=path.stem,
             speaker=speaker,
             license=license_name,
             language=clip_language,
-            part="held" if {path.stem, speaker} & {*held_out} else part,
+            split="held" if {path.stem, speaker} & {*held_out} else split,
             is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
             is_filmed=str(about.get("kind", _FILMED)).startswith(_FILMED),
             is_rig=is_rig,

@@ -73,7 +73,7 @@ class Movements:
     """Rate of a movement, and how often it matches a stressed vowel."""
 
     per_minute: float  # rate per minute of speech
-    at_end: float  # share after a phrase
+    at_end: float  # fraction after a phrase
     matched: float | None  # fraction of the others; None without any or without stressed vowels
 
 

@@ -78,9 +78,9 @@ def _draw_visemes() -> Image.Image:
     rows = [
         [
             _labelled(_picture(DEFAULT_HEAD, _spoken(viseme), _VISEME_PX, turn), viseme)
-            for viseme in visemes[at : at + _VISEMES_A_ROW]
+            for viseme in visemes[start : start + _VISEMES_A_ROW]
         ]
-        for at in range(0, len(visemes), _VISEMES_A_ROW)
+        for start in range(0, len(visemes), _VISEMES_A_ROW)
         for turn in _TURNS_DEG
     ]
     return _sheet(rows)

@@ -37,7 +37,7 @@ MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # limit for a session; files above are resampled to it
 BLOCK_S = 0.02
 CLIPPED_LEVEL = 0.999
-CLIPPED_SHARE = 0.01  # fraction of the samples; the user is warned above it
+CLIPPED_FRACTION = 0.01  # fraction of the samples; the user is warned above it
 _MIN_MISSING_S = 0.05  # a file that lacks more is reported as cut off
 _MAX_SPOOLED_BYTES = 64 << 20  # for a pipe that must be read to its end first; more goes to a file
 MAX_FILE_BYTES = 8 << 30
@@ -263,11 +263,11 @@ def num_clipped(samples: Samples) -> int:
     return int(np.count_nonzero(np.abs(samples) >= CLIPPED_LEVEL))
 
 
-def clipping_warnings(name: str, share: float) -> list[str]:
+def clipping_warnings(name: str, fraction: float) -> list[str]:
     """Return a warning for the user if too large a fraction of the samples is clipped."""
-    if share <= CLIPPED_SHARE:
+    if fraction <= CLIPPED_FRACTION:
         return []
-    return [f"{name}: {share:.0%} of the samples are clipped; record at a lower level"]
+    return [f"{name}: {fraction:.0%} of the samples are clipped; record at a lower level"]
 
 
 def raw_audio(

@@ -5,8 +5,10 @@ from numpy.typing import NDArray
 
 Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
 
-_LOST_SHARE = 0.01  # fraction of the loudest channel's energy; a mix with less has lost the channel
-_LOST_SHARE_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one voice
+_LOST_FRACTION = (
+    0.01  # fraction of the loudest channel's energy; a mix with less has lost the channel
+)
+_LOST_FRACTION_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one voice
 _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 
 
@@ -28,9 +30,9 @@ class CancellationGuard:
 
     def mix(self, channels: Samples, mixed: Samples) -> Samples:
         """Return ``mixed`` or the loudest of ``channels``, with ``num_channels`` columns."""
-        lost_share = _LOST_SHARE
+        lost_fraction = _LOST_FRACTION
         if mixed.shape[1] != self._num_channels:  # not mixed yet, or the format changed
-            lost_share = _LOST_SHARE_OF_AVERAGE
+            lost_fraction = _LOST_FRACTION_OF_AVERAGE
             mixed = mixed.mean(axis=1, keepdims=True).repeat(self._num_channels, axis=1)
         if channels.shape[1] == 1 or len(channels) == 0:
             return mixed
@@ -43,8 +45,8 @@ class CancellationGuard:
         loudest = int(energy.argmax())
         is_lost = (
             energy[loudest] > _SILENT_POWER * len(channels)
-            and mixed_energy < lost_share * energy[loudest]
-            and self._mixed_energy < lost_share * self._energy.max()
+            and mixed_energy < lost_fraction * energy[loudest]
+            and self._mixed_energy < lost_fraction * self._energy.max()
         )
         if not is_lost:
             return mixed

@@ -304,8 +304,8 @@ class ConnectionLimiter:
 
     def save_budget(self, connection: Connection) -> None:
         """Keep what is left of a connection's budget for its owner's next connections."""
-        kept = self._budgets.get(connection.owner)
-        if connection.budget.left < (BUDGET if kept is None else kept.left):
+        saved = self._budgets.get(connection.owner)
+        if connection.budget.left < (BUDGET if saved is None else saved.left):
             self._budgets[connection.owner] = connection.budget
 
     def limit_topics(self, num_bytes: int) -> None:
@@ -327,8 +327,8 @@ class ConnectionLimiter:
 
     def is_blocked(self, owner: str) -> bool:
         """Return whether a key or an address cannot connect for now."""
-        kept = self._budgets.get(owner)
-        return kept is not None and kept.left < 0
+        saved = self._budgets.get(owner)
+        return saved is not None and saved.left < 0
 
     def close(self) -> None:
         """Stop watching."""
@@ -393,7 +393,7 @@ class ConnectionLimiter:
             if connection.is_cut or connection.unread or self._num_ended >= NUM_ENDED_BEFORE_TRIM:
                 self._trims_s = [now_s + delay_s for delay_s in TRIMS_S]
             self.save_budget(connection)
-        for owner in [owner for owner, kept in self._budgets.items() if kept.left >= BUDGET]:
+        for owner in [owner for owner, saved in self._budgets.items() if saved.left >= BUDGET]:
             del self._budgets[owner]
         return bool(ended)
 

@@ -238,10 +238,10 @@ def revoke_key(name: str) -> None:
     """Revoke a key; raise ``UserError`` if no key has this name."""
     with _locked_folder() as folder:
         grants = _parse_grants(folder / _ALLOWED)  # unchecked, so that it works with too many keys
-        kept = {public: grant for public, grant in grants.items() if grant.name != name}
-        if len(kept) == len(grants):
+        remaining = {public: grant for public, grant in grants.items() if grant.name != name}
+        if len(remaining) == len(grants):
             raise UserError(f"no key is named {name!r}; list them with 'kouxing keys list'")
-        _write(folder / _ALLOWED, _lines(kept))
+        _write(folder / _ALLOWED, _lines(remaining))
 
 
 def save_grants(grants: Grants) -> None:

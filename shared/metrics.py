@@ -132,7 +132,7 @@ class LoadMeter:
         """Add work of another thread. A negative time reduces the loop's work."""
         self._busy_s += duration_s
 
-    def share(self, now_s: float) -> float:
+    def load(self, now_s: float) -> float:
         """Return the fraction of time, 0 to 1, since an earlier call. Call this regularly."""
         busy_s = self._busy_at(now_s)
         self._marks.append((now_s, busy_s))

@@ -355,7 +355,7 @@ class Service(MessageLoop):
     def _send_heartbeat(self, *, all_sessions: bool = False) -> None:
         now_s = time.monotonic()
         self._sent_ns = now_ns()
-        sessions, load = self.session_inputs(), self.busy.share(now_s)
+        sessions, load = self.session_inputs(), self.busy.load(now_s)
         is_idle = not sessions or self.kind.role != "worker"
         self._heartbeat_due_s = now_s + (IDLE_HEARTBEAT_S if is_idle else HEARTBEAT_S)
         parent_process.send_pulse(is_idle=is_idle)

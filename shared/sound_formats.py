@@ -175,7 +175,9 @@ def codec_of_padded_wav(begin: bytes) -> str | None:
     FFmpeg takes such samples for smaller ones.
     """
     header = begin[begin.find(b"fmt ") + 8 :]
-    kind, valid, subtype = (int.from_bytes(header[at : at + 2], "little") for at in (0, 18, 24))
+    kind, valid, subtype = (
+        int.from_bytes(header[offset : offset + 2], "little") for offset in (0, 18, 24)
+    )
     bits = int.from_bytes(header[14:16], "little")
     is_padded = kind == 0xFFFE and subtype == 1 and bits in (24, 32) and 8 < valid < bits
     return f"pcm_s{bits}le" if begin[8:12] == b"WAVE" and is_padded else None

@@ -109,7 +109,7 @@ def clip_of(time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> LipClip:
         speaker="nobody",
         license="CC0",
         language="zh",
-        part="held",
+        split="held",
         time_s=time_s,
         faps=faps,
         samples=np.zeros(0, dtype=np.float32),

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 
-const MIN_SHARE = 0.1; // fraction of the largest displacement; vertices that move less are not in the region
+const MIN_FRACTION = 0.1; // fraction of the largest displacement; vertices that move less are not in the region
 const MAX_HEAD = 3; // height of a head, relative to the region from chin to brows
 const MAX_TALL = 2; // height of a head whose mesh also has a body, relative to the same region
 const MAX_TALL_OF_MOUTH = 5; // the same, relative to the region of shapes that move only the mouth
@@ -92,7 +92,7 @@ function movedBox(mesh, index) {
   const box = new THREE.Box3();
   const point = new THREE.Vector3();
   squares.forEach((square, v) => {
-    if (square > 0 && square >= MIN_SHARE ** 2 * largest) {
+    if (square > 0 && square >= MIN_FRACTION ** 2 * largest) {
       box.expandByPoint(mesh.getVertexPosition(v, point).applyMatrix4(mesh.matrixWorld));
     }
   });

@@ -104,7 +104,7 @@ void encoder_process(AudioEncoder *encoder) {
   enum { LAUGHTER = 2 }; /* a column of the readout */
   double laughter = TRAITS_BIAS[LAUGHTER];
   for (int i = 0; i < 2 * ENCODER_WIDTH; i++) laughter += (double)encoder->state[i] * TRAITS_WEIGHTS[i * TRAITS_NUM_TRAITS + LAUGHTER];
-  encoder->laughter += TRAITS_EVIDENCE_SHARE * (laughter - encoder->laughter);
+  encoder->laughter += TRAITS_EVIDENCE_FRACTION * (laughter - encoder->laughter);
 }
 
 static void copy(double *out, const float *values, int size) {

@@ -158,7 +158,7 @@ static double closure_doubt(Rest *rest, double time_s, double closure) {
   return is_silent ? REST_DOUBT : 0.0;
 }
 
-static double ajar_share_at(Rest *rest, double time_s) {
+static double ajar_amount_at(Rest *rest, double time_s) {
   const double next_s = next_sound_s(rest);
   bool starts_soon = false;
   for (int i = 0; i < rest->num_changes; i++) {
@@ -357,7 +357,7 @@ void face_visemes(Face *face, double time_s, float *weights) {
   double faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
   follow_voice(&face->rest, time_s);
   if (face->has_lip_frames) follow_track(face, time_s);
-  const double ajar = ajar_share_at(&face->rest, time_s);
+  const double ajar = ajar_amount_at(&face->rest, time_s);
   face->time_s = time_s;
   for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
     faps[MOUTH_FAPS[i] - 1] = (float)(face->mouth.value[i] + ajar * (REST_AJAR[i] - face->mouth.value[i]));

@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.04
 _OPEN = 100.0  # opening of predicted lips in FAP units: 3 mm on a face
-_OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2  # fraction of a real mouth's range
+_OPEN_FRACTION, _OPEN_WINDOW_S = 0.5, 0.2  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ def real_closures(mouth: Mouth) -> Array:
     if not len(moments_s):
         return moments_s
     low, high = np.percentile(mouth.opening, [1, 99])
-    opened_s = mouth.time_s[mouth.opening > low + _OPEN_SHARE * (high - low)]
+    opened_s = mouth.time_s[mouth.opening > low + _OPEN_FRACTION * (high - low)]
     return np.asarray(moments_s[is_near(moments_s, opened_s, _OPEN_WINDOW_S)])
 
 

@@ -171,20 +171,20 @@ def face_input(condition: Condition, output: RecognizerOutput) -> Sequence[Sound
 
 def without_corrections(events: Sequence[SoundEvent]) -> list[SoundEvent]:
     """Keep only the phones that the rule emits, renumbered, and all other events: scheme 3."""
-    kept: list[SoundEvent] = []
+    remaining: list[SoundEvent] = []
     num_phones = 0
     for event, after in zip_longest(events, events[1:]):
         if not isinstance(event, Phone):
-            kept.append(event)
+            remaining.append(event)
         elif _is_emitted(event, after):
-            kept.append(replace(event, index=num_phones))
+            remaining.append(replace(event, index=num_phones))
             num_phones += 1
-    return kept
+    return remaining
 
 
 def delay_by_one_phone(events: Sequence[SoundEvent]) -> list[SoundEvent]:
     """Keep each phone once, when the next is emitted or speech ends: scheme 4."""
-    kept: list[SoundEvent] = []
+    remaining: list[SoundEvent] = []
     latest: dict[int, Phone] = {}  # revision of each phone, by index
     middle_s = 0.0  # middle of the last phone kept; a phone that starts earlier is not new
     for event, after in zip_longest(events, events[1:]):
@@ -196,11 +196,11 @@ def delay_by_one_phone(events: Sequence[SoundEvent]) -> list[SoundEvent]:
         elif isinstance(event, SpeechChange) and not event.active and latest:
             delayed = latest[max(latest)]
         if delayed is not None and delayed.onset_s >= middle_s and not delayed.is_withdrawn:
-            kept.append(delayed)
+            remaining.append(delayed)
             middle_s = delayed.onset_s + 0.5 * delayed.duration_s
         if not isinstance(event, Phone):
-            kept.append(event)
-    return kept
+            remaining.append(event)
+    return remaining
 
 
 def _is_emitted(phone: Phone, after: SoundEvent | None) -> bool:

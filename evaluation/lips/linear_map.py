@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 _HISTORY_S = 0.02 * np.arange(10)
 _RIDGE = 1000.0  # strength of the regularization, frames
 _TOLERANCE = 0.005  # tolerance of the correlation
-_SHUT_SHARES = range(0, 65, 5)  # percentages of the frames that the constant may close
+_CLOSED_PERCENTS = range(0, 65, 5)  # percentages of the frames that the constant may close
 _JAW, _LOWER_LIP, _CORNERS = 2, 4, (5, 6)  # columns of FAPs
 
 
@@ -111,4 +111,4 @@ def _best_constant(
         return sum(detections, Detections()).f1 or 0.0
 
     openings = np.concatenate([CURVES["opening"](faps) for faps in predicted])
-    return max((float(c) for c in -np.percentile(openings, _SHUT_SHARES)), key=f1)
+    return max((float(c) for c in -np.percentile(openings, _CLOSED_PERCENTS)), key=f1)

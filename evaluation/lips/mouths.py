@@ -19,7 +19,7 @@ CURVES: dict[str, Callable[[Array], Array]] = {  # functions of FAPs (num_frames
     "jaw": lambda faps: faps[:, 2],
 }
 _CLOSED = 20.0  # opening of predicted lips in FAP units: 0.6 mm on a face
-_CLOSED_SHARE = 0.1  # fraction of a real mouth's range
+_CLOSED_FRACTION = 0.1  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def real_mouth(time_s: Array, faps: Array) -> Mouth:
     curves = {name: curve[is_known] for name, curve in curves.items()}
     opening = curves["opening"]
     low, high = np.percentile(opening, [1, 99]) if len(opening) else (0.0, 0.0)
-    return Mouth(time_s[is_known], curves, opening < low + _CLOSED_SHARE * (high - low))
+    return Mouth(time_s[is_known], curves, opening < low + _CLOSED_FRACTION * (high - low))
 
 
 def real_faps(clip: LipClip) -> Array:

@@ -77,12 +77,12 @@ class Reference:
     def viseme_at(self, time_s: float) -> str:
         """Return the viseme at a time, or ``PAUSE``."""
         for phone in self.phones:
-            share = (time_s - phone.onset_s) / max(phone.duration_s, 1e-9)
-            if 0.0 <= share < 1.0:
+            fraction = (time_s - phone.onset_s) / max(phone.duration_s, 1e-9)
+            if 0.0 <= fraction < 1.0:
                 for viseme, extent in self.visemes[phone.symbol]:
-                    if share < extent + 1e-9:
+                    if fraction < extent + 1e-9:
                         return PAUSE if viseme == "rest" else viseme
-                    share -= extent
+                    fraction -= extent
         return PAUSE
 
     def labials(self) -> list[Phone]:
@@ -146,7 +146,7 @@ def _held_out(
     folder: Path, clips: list[LipClip], parameters: Collection[Path | None]
 ) -> list[LipClip]:
     seen = {name for path in {None, *parameters} for name in clips_seen(path)}
-    clips = [clip for clip in clips if clip.part == "held"]
+    clips = [clip for clip in clips if clip.split == "held"]
     if not clips:
         raise UserError(f"{folder}: no clip is held out; list clips or speakers in held.txt")
     faults: dict[str, Callable[[LipClip], bool]] = {

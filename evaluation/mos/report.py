@@ -82,10 +82,12 @@ def is_within_fences(scores: ArrayLike) -> NDArray[np.bool_]:
 def opinion_of(scale: str, condition: str, scores: Scores) -> Opinion:
     """Summarize the scores of one condition."""
     is_kept = is_within_fences([*scores.values()])
-    kept = {key: score for (key, score), keep in zip(scores.items(), is_kept, strict=True) if keep}
+    included = {
+        key: score for (key, score), keep in zip(scores.items(), is_kept, strict=True) if keep
+    }
     num_judges = len({judge for judge, _ in scores})
-    means = mean_of(scores), mean_of(kept)
-    return Opinion(scale, condition, *means, num_judges, len(scores), len(scores) - len(kept))
+    means = mean_of(scores), mean_of(included)
+    return Opinion(scale, condition, *means, num_judges, len(scores), len(scores) - len(included))
 
 
 def mean_of(scores: Scores) -> Mean:

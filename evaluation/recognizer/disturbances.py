@@ -121,15 +121,15 @@ def change_speed(samples: Samples, factor: float) -> Samples:
     out = np.zeros((num_segments + 1) * hop)
     source = 0  # start of the last segment
     for number in range(num_segments):
-        at = round(number * hop * factor)
+        position = round(number * hop * factor)
         if number:
             continuation = padded[source + hop : source + 3 * hop]  # the natural continuation
-            near = padded[at : at + 2 * search + 2 * hop]
+            near = padded[position : position + 2 * search + 2 * hop]
             energy = np.convolve(near**2, np.ones(2 * hop), "valid")
             similarity = np.correlate(near, continuation, "valid") / np.sqrt(energy + 1e-9)
-            at += int(similarity.argmax())
-        source = at
-        out[number * hop : (number + 2) * hop] += window * padded[at : at + 2 * hop]
+            position += int(similarity.argmax())
+        source = position
+        out[number * hop : (number + 2) * hop] += window * padded[position : position + 2 * hop]
     return as_samples(out[hop:])
 
 

@@ -128,9 +128,9 @@ def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:
             table = read_table(Path(name) / f"{clip.name}.csv")
             middle_s = table.time_s - _WINDOW / SAMPLE_RATE_HZ / 2.0
             for phone in label_clip(model, clip):
-                (viseme, share), *_ = model.inventory.visemes[phone.symbol]
+                (viseme, weight), *_ = model.inventory.visemes[phone.symbol]
                 distance_s = np.abs(middle_s - phone.onset_s - phone.duration_s / 2.0)
-                if share == 1.0:
+                if weight == 1.0:
                     near = distance_s <= phone.duration_s / 4.0
                     windows[_VOWELS.get(viseme, viseme)].append(table.values[near, -_NUM_CEPSTRA:])
     joined = {viseme: np.concatenate(found) for viseme, found in sorted(windows.items())}
@@ -148,7 +148,7 @@ def _write_loudness(clip: LipClip, path: Path) -> None:
     ends = np.arange(0, len(energy), hop)
     power = (energy[ends] - energy[np.maximum(ends - 2 * hop, 0)]) / (2 * hop)
     level_db = 10.0 * np.log10(power + 1e-10)
-    share = (level_db - np.percentile(level_db, 95)) / _LOUDNESS_RANGE_DB + 1.0
-    rows = zip(ends / SAMPLE_RATE_HZ, np.clip(share, 0.0, 1.0), strict=True)
+    loudness = (level_db - np.percentile(level_db, 95)) / _LOUDNESS_RANGE_DB + 1.0
+    rows = zip(ends / SAMPLE_RATE_HZ, np.clip(loudness, 0.0, 1.0), strict=True)
     lines = ["t,opening", *(f"{time_s:.4f},{value:.4f}" for time_s, value in rows)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -87,7 +87,10 @@ class Run:
     def worst_by_second_s(self) -> list[float]:
         """The largest lateness of each second."""
         size = round(1.0 / STEP_S)
-        return [max(self.lateness_s[at : at + size]) for at in range(0, len(self.lateness_s), size)]
+        return [
+            max(self.lateness_s[start : start + size])
+            for start in range(0, len(self.lateness_s), size)
+        ]
 
     @property
     def summary(self) -> dict[str, float | None]:
@@ -270,8 +273,11 @@ def show(busy: Busy, console: Console) -> None:
             "largest lateness of each second, ms",
             ("from s", *(f"+{second}" for second in range(_COLUMNS))),
             (
-                [str(at), *(f"{max(0.0, 1e3 * late_s):.0f}" for late_s in rows[at : at + _COLUMNS])]
-                for at in range(0, len(rows), _COLUMNS)
+                [
+                    str(start),
+                    *(f"{max(0.0, 1e3 * late_s):.0f}" for late_s in rows[start : start + _COLUMNS]),
+                ]
+                for start in range(0, len(rows), _COLUMNS)
             ),
         )
     print_table(

@@ -92,7 +92,7 @@ class _Speaker:
         self._session = session
         self._output = session.results(FapFrame, Phone, keep_all=True)
         pcm, size = sound.astype("<f4").tobytes(), 4 * CHUNK
-        self._chunks = [pcm[at : at + size] for at in range(0, len(pcm), size)]
+        self._chunks = [pcm[start : start + size] for start in range(0, len(pcm), size)]
         self._paced = paced
         self._has_finished = False
         start_s = time.monotonic()

@@ -309,9 +309,9 @@ class Spoken:
     def send(self) -> None:
         """Send the next chunk; skip it if the queue is full."""
         size = 2 * CHUNK
-        at = self.num_sent * size % (len(self.sound) // size * size)
+        start = self.num_sent * size % (len(self.sound) // size * size)
         self.num_sent += 1
-        if not self.session.try_push(self.sound[at : at + size]):
+        if not self.session.try_push(self.sound[start : start + size]):
             self.session.skip(CHUNK)
 
     def record(self, frame: FapFrame) -> None:

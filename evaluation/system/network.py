@@ -117,9 +117,11 @@ class Network:
             form = "{ type filter hook forward priority 0; }"
             self._on_router("nft", f"add chain inet network {chain} {form}")
         if self._link.loss:
-            share = round(1e4 * self._link.loss)
+            lost_of_10000 = round(1e4 * self._link.loss)
             not_delayed = f'iifname != "{DELAY_DEVICE}"'  # a delayed packet is forwarded twice
-            self._rule(f"{not_delayed} numgen random mod 10000 < {share} drop", chain="loss")
+            self._rule(
+                f"{not_delayed} numgen random mod 10000 < {lost_of_10000} drop", chain="loss"
+            )
         if self._link.delay_ms:
             self._delay()
 

@@ -142,21 +142,21 @@ def shape_keys(set_name):
 
 def problem(set_name):
     """Return why weights of a set cannot move the scene, or an empty text."""
-    missing, share, speaking = {}, {}, []
+    missing, penalty, speaking = {}, {}, []
     for name, entries in SETS.items():
         keys = shape_keys(name)
         needed = [shape for shape, _, is_needed in entries if is_needed]
         missing[name] = [shape for shape in needed if shape not in keys]
         # between equals, the number of known shapes decides
-        share[name] = len(missing[name]) / len(needed) - len(keys) / 1000
+        penalty[name] = len(missing[name]) / len(needed) - len(keys) / 1000
         if needed[0] in keys:
             speaking.append(name)
     if set_name in speaking:
         return ""
     if speaking:
-        name = min(reversed(speaking), key=share.get)
+        name = min(reversed(speaking), key=penalty.get)
         return f"the avatar has shapes of {TITLES[name]}; insert a recording made with --as {name}"
-    nearest = min(share, key=share.get)
+    nearest = min(penalty, key=penalty.get)
     return (
         f"the avatar cannot speak: it has no shape {', '.join(missing[nearest])} of"
         f" {TITLES[nearest]}; use an avatar with the shapes of ARKit, Oculus or VRM"

@@ -91,7 +91,7 @@ class VideoExporter(PictureExporter):
             frame_rate_hz=self._options.rate_hz or motion.image_rate_hz,
             samples=motion.samples,
             captions=make_captions(self._options.captions, motion, self._size_px),
-            on_progress=lambda share: progress.update(task, completed=share),
+            on_progress=lambda fraction: progress.update(task, completed=fraction),
         )
 
 

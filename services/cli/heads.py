@@ -84,9 +84,9 @@ def export_page_heads(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in _page_files().items():
-            part = folder / f".{os.getpid()}-{file}"  # another process may export, too
-            export_glb(load_head(name), part)
-            part.replace(folder / file)
+            unfinished = folder / f".{os.getpid()}-{file}"  # another process may export, too
+            export_glb(load_head(name), unfinished)
+            unfinished.replace(folder / file)
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from None
 

@@ -304,9 +304,9 @@ def _write_csv(output: Path, mouth: _Mouth) -> str:
             for time_s, opening, lines in zip(
                 times_s[block], openings[block], contours, strict=True
             ):
-                at, phone = f"{time_s:.3f}", _label_at(time_s, symbols)
+                time, phone = f"{time_s:.3f}", _label_at(time_s, symbols)
                 table.writerows(
-                    (at, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
+                    (time, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
                     for name, line in zip(LINES, lines, strict=True)
                     for number, (x, y) in enumerate(line)
                 )

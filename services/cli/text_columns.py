@@ -33,8 +33,8 @@ def remove_columns(text: str) -> str:
     if _are_times(after) or _are_names(after, _NAME_AFTER):
         after = [""] * len(parts)
     rows = zip(before, (match["spoken"] for match in parts), after, strict=True)
-    kept = ["".join(row) for row in rows]
-    return text if kept == lines else "\n".join(kept)
+    remaining = ["".join(row) for row in rows]
+    return text if remaining == lines else "\n".join(remaining)
 
 
 def _are_times(cells: Sequence[str]) -> bool:

@@ -82,7 +82,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "learnt": (
         model,
         "HOLD_S MAX_GAP_S NUM_MOUTH_FAPS _TRANSITION_S _MEMORY_S _TEETH_LOG_ODDS "
-        "_CLOSED_SHARE _EPSILON _UNTRACKED _JITTER_SQUARED",
+        "_CLOSED_FRACTION _EPSILON _UNTRACKED _JITTER_SQUARED",
     ),
     "lips": (lip_predictor, "CLOSURE NUM_OUTPUTS _COLUMNS _ONES _OTHERS"),
     "lipFrames": (lip_frames, "POSITION_LAG_S"),
@@ -115,7 +115,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "traits": (
         voice_traits,
         "NUM_TRAITS MIN_VOICE _MEAN_POSITIONS _PRIOR_FEELING _PRIOR_POSITIONS _MAX_POSITIONS "
-        "_DIGITS _EVIDENCE_SHARE _START _STOP _MIN_LAUGHTER _LAUGH_POSITIONS",
+        "_DIGITS _EVIDENCE_FRACTION _START _STOP _MIN_LAUGHTER _LAUGH_POSITIONS",
     ),
     "vad": (vad, "_NO_EVIDENCE _ENOUGH _IMPROBABLE _STOP_POSITIONS"),
 }

@@ -263,13 +263,13 @@ class Sessions:
         The recognizer is told last. By then the synthesizer has reported its final phones, and a
         new synthesizer has the session, so that the recognizer can resume the face there.
         """
-        kept = {name: i for name, i in record.workers.items() if i not in record.lost}
+        remaining = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
-            workers = self._placement.place(kept, now_s, record.facts.language)
+            workers = self._placement.place(remaining, now_s, record.facts.language)
         except Refusal:
             return False
         record.deferred = {workers["audio"]}
-        if "audio" not in kept:
+        if "audio" not in remaining:
             record.resume_sequence = record.next_sequence
         record.lost = set()
         self._set_workers(record, workers, now_s)

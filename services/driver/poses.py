@@ -33,7 +33,7 @@ class Poses:
         self._poses: dict[str, _Pose] = {}  # in order of opening
         self._rest = RestingFace(idle_motion_seed)
         self._face = np.zeros(NUM_FAPS, np.float32)  # the last session frame that was shown
-        self._share, self._shown_s = 0.0, 0.0  # its share in the picture, and the time of that
+        self._weight, self._shown_s = 0.0, 0.0  # weight of the face in the picture, and its time
 
     @property
     def shown(self) -> str:
@@ -92,10 +92,10 @@ class Poses:
         self._shown_s = now_s
         if pose is not None and pose.faps is not None and now_s - pose.updated_s <= STALL_S:
             self._face = pose.faps
-            self._share = min(self._share + step, 1.0)
+            self._weight = min(self._weight + step, 1.0)
         else:
-            self._share = max(self._share - step, 0.0)
-        return self._rest.blend(self._face, self._share, now_s)
+            self._weight = max(self._weight - step, 0.0)
+        return self._rest.blend(self._face, self._weight, now_s)
 
     def caption(self, now_s: float) -> str:
         """Describe the shown session for the window title."""

@@ -12,7 +12,7 @@ SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
 RATES_HZ = (8000, 48000)
 NOISE_BLOCK = 2000  # samples of each channel that are judged together
-_MIN_LOUD_SHARE = 0.15  # of samples beyond half of full scale; more than in natural noise
+_MIN_LOUD_FRACTION = 0.15  # of samples beyond half of full scale; more than in natural noise
 _MAX_NOISE_CORRELATION, _MIN_SOUND_CORRELATION = 0.15, 0.3  # of neighboring samples
 _SILENT_POWER, _SOUND_POWER = 1e-4, 1e-3  # of full scale
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
@@ -120,7 +120,7 @@ class NoiseCheck:
         power = (block**2).mean(axis=0)
         heard = power > _SILENT_POWER
         correlation = (block[1:] * block[:-1]).mean(axis=0)[heard] / power[heard]
-        is_loud = (np.abs(block) > 0.5).mean(axis=0)[heard] > _MIN_LOUD_SHARE
+        is_loud = (np.abs(block) > 0.5).mean(axis=0)[heard] > _MIN_LOUD_FRACTION
         if (is_loud & (np.abs(correlation) < _MAX_NOISE_CORRELATION)).any():
             self._num_noisy += 1
         elif (correlation > _MIN_SOUND_CORRELATION).all() and power.max() > _SOUND_POWER:

@@ -29,8 +29,12 @@ def decode(path: Path) -> None:
             clipped += num_clipped(block)
             mono = np.rint(block.mean(axis=1) * 32768).clip(-32768, 32767)
             output.writeframes(mono.astype("<i2").tobytes())
-    share = clipped / max(1, num_samples * source.num_channels)
-    for warning in (*source.notices, *source.warnings, *clipping_warnings(str(path), share)):
+    clipped_fraction = clipped / max(1, num_samples * source.num_channels)
+    for warning in (
+        *source.notices,
+        *source.warnings,
+        *clipping_warnings(str(path), clipped_fraction),
+    ):
         print(warning, file=sys.stderr)
 
 

@@ -58,10 +58,10 @@ class ViewerQueue:
         # session's name, errors) keeps its order relative to the remaining frames.
         num_before = len(self._messages)
         num_left = dict(_NUM_KEPT)
-        kept: deque[tuple[MessageKind, str | bytes]] = deque()
+        remaining: deque[tuple[MessageKind, str | bytes]] = deque()
         for kind, message in reversed(self._messages):
             if num_left[kind] > 0:
                 num_left[kind] -= 1
-                kept.appendleft((kind, message))
-        self._messages = kept
-        return num_before - len(kept)
+                remaining.appendleft((kind, message))
+        self._messages = remaining
+        return num_before - len(remaining)

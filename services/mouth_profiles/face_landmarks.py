@@ -76,8 +76,8 @@ LANDMARKS = tuple(sorted({*_STEADY, _UNDER_NOSE, *(point for point, _, _ in _FAP
 
 _QUIET_DB = 30.0  # silent frames are this far below the loud ones
 _LOUD_PERCENTILE = 95.0
-_CLOSED_SHARE = 0.35  # fraction of the frames whose lips count as closed
-_CLOSED_SHARE_SPEAKING = 0.08  # the same share, without silent frames
+_CLOSED_FRACTION = 0.35  # fraction of the frames whose lips count as closed
+_CLOSED_FRACTION_SPEAKING = 0.08  # the same fraction, without silent frames
 _MIN_NEUTRAL = 5  # frames
 
 
@@ -129,7 +129,7 @@ def _align_head(landmarks: Array) -> Array:
 
 def _is_neutral(height: Array, level_db: Array) -> NDArray[np.bool_]:
     quiet = level_db < np.percentile(level_db, _LOUD_PERCENTILE) - _QUIET_DB
-    neutral: NDArray[np.bool_] = quiet & (height <= np.quantile(height, _CLOSED_SHARE))
+    neutral: NDArray[np.bool_] = quiet & (height <= np.quantile(height, _CLOSED_FRACTION))
     if neutral.sum() < _MIN_NEUTRAL:
-        neutral = height <= np.quantile(height, _CLOSED_SHARE_SPEAKING)
+        neutral = height <= np.quantile(height, _CLOSED_FRACTION_SPEAKING)
     return neutral

@@ -41,7 +41,7 @@ _FEELING = slice(0, 2)
 _MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # memory of the mean arousal and valence; its prior
 _PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean, memory of m
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
-_EVIDENCE_SHARE = 0.1  # weight of a new position
+_EVIDENCE_FRACTION = 0.1  # weight of a new position
 _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
 _MIN_LAUGHTER = 0.3  # minimum probability of a laugh
 _LAUGH_POSITIONS = 50  # laughter ends after this many positions without a laugh
@@ -97,12 +97,12 @@ class VoiceTraitsStream:
             feeling = outputs[_FEELING]
             num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)
             self._mean = [m + (f - m) / num_known for m, f in zip(self._mean, feeling, strict=True)]
-            share = 1.0 / min(self._num_voiced + _PRIOR_FEELING, _MEAN_POSITIONS)
+            gain = 1.0 / min(self._num_voiced + _PRIOR_FEELING, _MEAN_POSITIONS)
             self._feeling = [
-                old + share * (new - old) for old, new in zip(self._feeling, feeling, strict=True)
+                old + gain * (new - old) for old, new in zip(self._feeling, feeling, strict=True)
             ]
         self._evidence = [
-            old + _EVIDENCE_SHARE * (new - old)
+            old + _EVIDENCE_FRACTION * (new - old)
             for old, new in zip(self._evidence, outputs[2:], strict=True)
         ]
         is_laugh = position.voice[Voice.LAUGHTER] > _MIN_LAUGHTER

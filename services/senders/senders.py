@@ -217,9 +217,9 @@ class Senders:
         now_s = time.monotonic()
         stalled_s = now_s - self._newest_s - STALL_S
         if stalled_s > 0:
-            share = max(0.0, 1.0 - stalled_s / FADE_S)
+            weight = max(0.0, 1.0 - stalled_s / FADE_S)
             time_s = self._session_time_s + now_s - self._newest_s
-            self._queue(FaceFrame(self._rest.blend(self._newest, share, now_s), time_s), now_s)
+            self._queue(FaceFrame(self._rest.blend(self._newest, weight, now_s), time_s), now_s)
         for url, sender in self._senders.items():
             problem = sender.connection.problem
             if problem != sender.reported:

@@ -28,7 +28,7 @@ from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.face.shapes import ARKIT
-from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_share
+from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_gain
 
 CLOSED = 20.0  # largest gap of a closure, FAP units
 OPEN = 80.0  # from this gap upwards, lips have the width of an open mouth
@@ -94,7 +94,7 @@ class ExpressionMotion:
         if is_speaking:
             self._free = max(self._free - step_s / _BIND_S, 0.0)
         else:
-            self._free += (1.0 - self._free) * smoothing_share(step_s, _FREE_S)
+            self._free += (1.0 - self._free) * smoothing_gain(step_s, _FREE_S)
         if is_held or self._is_shown:
             goal = is_held * self._goal
             shown = self._shown.step(goal, step_s, self._ease_s if is_held else _FADE_S)

@@ -50,8 +50,8 @@ def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
 
     ``blend`` goes from 0 (second viseme only) to 63 (first viseme only).
     """
-    share = np.float32(blend / FULL)
-    blended: Float32 = VISEMES[select1] * share + VISEMES[select2] * (1 - share)
+    fraction = np.float32(blend / FULL)
+    blended: Float32 = VISEMES[select1] * fraction + VISEMES[select2] * (1 - fraction)
     return blended
 
 

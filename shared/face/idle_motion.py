@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.face.expression_motion import ExpressionMotion
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.smoothing import smooth_step, smoothing_share
+from kouxing.shared.face.smoothing import smooth_step, smoothing_gain
 
 RESTING_RATE_HZ = 25.0
 STALL_S = 1.0  # a face without new frames for this time fades to rest
@@ -130,7 +130,7 @@ class IdleMotion:
         self._time_s = time_s
         goal = _LIVELINESS_IN_PAUSES if state in _PAUSES else 1.0
         change = (0.0 if self.is_still else goal) - self._liveliness
-        self._liveliness += change * smoothing_share(elapsed_s, _STATE_S)
+        self._liveliness += change * smoothing_gain(elapsed_s, _STATE_S)
         angles = self._wave_rate * time_s + self._wave_phase
         breath, *sway = (self._wave_size * np.sin(angles)).sum(axis=1)
         head = self._liveliness * np.array(sway)
@@ -192,8 +192,8 @@ class IdleMotion:
     def _target(self) -> NDArray[np.float64]:
         """Return the target of the current fixation in the current state."""
         rng = np.random.default_rng([self._seed, self._fixation])
-        share = 1.0 if self.has_eye_contact else _ON_LISTENER[self._state]
-        is_on_listener = rng.random() < share
+        probability = 1.0 if self.has_eye_contact else _ON_LISTENER[self._state]
+        is_on_listener = rng.random() < probability
         sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
         return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * _DEGREE
 
@@ -222,7 +222,7 @@ class RestingFace:
             self._motion.apply(faps, now_s - self._start_s)
         return faps
 
-    def blend(self, face: NDArray[np.float32], share: float, now_s: float) -> NDArray[np.float32]:
-        """Return a mixture (68,) of another face, with the given share, and the resting face."""
+    def blend(self, face: NDArray[np.float32], weight: float, now_s: float) -> NDArray[np.float32]:
+        """Blend another face with the resting face; return FAPs (68,). 1 is the other face."""
         rest = self.faps(now_s)
-        return rest + np.float32(share) * (face - rest)
+        return rest + np.float32(weight) * (face - rest)

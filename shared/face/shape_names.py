@@ -58,17 +58,17 @@ def choose_set(names: Iterable[str]) -> ShapeSetName:
     Raises ``UserError`` if the avatar cannot speak; the text names what the nearest set lacks.
     """
     names = list(names)
-    missing, share = {}, {}
+    missing, penalty = {}, {}
     for set_name, needed in _NEEDED.items():
         known = set(find_shapes(set_name, names).values())
         missing[set_name] = [shape for shape in needed if shape not in known]
         # between equals, the number of known shapes decides
-        share[set_name] = len(missing[set_name]) / len(needed) - len(known) / 1000
+        penalty[set_name] = len(missing[set_name]) / len(needed) - len(known) / 1000
     speaking = [name for name in missing if _NEEDED[name][0] not in missing[name]]
     if speaking:
         complete = [name for name in speaking if not missing[name]]
-        return ShapeSetName((complete or [min(reversed(speaking), key=share.__getitem__)])[0])
-    nearest = min(missing, key=share.__getitem__)
+        return ShapeSetName((complete or [min(reversed(speaking), key=penalty.__getitem__)])[0])
+    nearest = min(missing, key=penalty.__getitem__)
     raise UserError(
         f"the avatar cannot speak: it has no shape {', '.join(missing[nearest])} of"
         f" {_TITLES[nearest]}; use an avatar with the shapes of ARKit, Oculus or VRM"

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 Value = TypeVar("Value", float, NDArray[np.float32])
 
 
-def smoothing_share(elapsed_s: float, time_constant_s: float) -> float:
+def smoothing_gain(elapsed_s: float, time_constant_s: float) -> float:
     """Return the fraction of a change that a one-pole low-pass filter makes in a time, 0 to 1."""
     return -math.expm1(-elapsed_s / time_constant_s)
 
 
-def smooth_step(share: float) -> float:
+def smooth_step(x: float) -> float:
     """Map 0 to 1 onto 0 to 1 with a slope of 0 at both ends; other values are clipped."""
-    share = min(max(share, 0.0), 1.0)
-    return share * share * (3.0 - 2.0 * share)
+    x = min(max(x, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 class TwoPoleFilter(Generic[Value]):
@@ -29,7 +29,7 @@ class TwoPoleFilter(Generic[Value]):
 
     def step(self, goal: Value, step_s: float, time_constant_s: float) -> Value:
         """Move towards a goal for ``step_s`` seconds; return the new value."""
-        share = smoothing_share(step_s, time_constant_s)
-        self._halfway = self._halfway + share * (goal - self._halfway)
-        self.value = self.value + share * (self._halfway - self.value)
+        gain = smoothing_gain(step_s, time_constant_s)
+        self._halfway = self._halfway + gain * (goal - self._halfway)
+        self.value = self.value + gain * (self._halfway - self.value)
         return self.value

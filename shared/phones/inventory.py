@@ -25,8 +25,8 @@ column          meaning
 phone           symbol, 1 to 4 lower-case letters
 kind            ``initial`` (a consonant that begins a syllable), ``vowel`` (the rest of a syllable)
                 or ``silence`` (exactly one row, ``sil``)
-visemes         the phone's mouth shapes in order, ``name:share`` separated by spaces; the shares
-                of its duration add up to 1
+visemes         the phone's mouth shapes in order, ``name:fraction`` separated by spaces; the
+                fractions of its duration add up to 1
 before_rounded  the phone's viseme before a rounded one, if different; may be empty
 =============== ===================================================================================
 """
@@ -65,7 +65,9 @@ _SYMBOL = re.compile(r"[a-z]{1,4}")
 _WORDS = re.compile(r"[^\W\d_]+(?: +[^\W\d_]+)*")
 
 Syllable = tuple[str, ...]
-VisemeShares = tuple[tuple[str, float], ...]  # (viseme, fraction of the phone's duration), in order
+VisemeFractions = tuple[
+    tuple[str, float], ...
+]  # (viseme, fraction of the phone's duration), in order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +77,7 @@ class PhoneInventory:
     language: str
     phones: tuple[str, ...]  # (num_phones,) in the order of the acoustic models' outputs
     kinds: tuple[str, ...]  # (num_phones,) of KINDS
-    visemes: dict[str, VisemeShares]  # by phone
+    visemes: dict[str, VisemeFractions]  # by phone
     before_rounded: dict[str, str]  # different viseme of a phone before a rounded one
     pronounce: Callable[[str], list[Syllable]]  # text to syllables of phones; the lexicon
     transcribe: Callable[[str], Transcript] | None = None  # like pronounce, with the spelling
@@ -100,10 +102,10 @@ class PhoneInventory:
                 f"and exactly one phone must be silence: {SILENCE}"
             )
         for phone in self.phones:
-            total = sum(share for _, share in self.visemes.get(phone, ()))
+            total = sum(fraction for _, fraction in self.visemes.get(phone, ()))
             if not math.isclose(total, 1.0, abs_tol=1e-6):
                 raise UserError(
-                    f"language {self.language}: viseme shares of {phone} must add up to 1"
+                    f"language {self.language}: viseme fractions of {phone} must add up to 1"
                 )
 
     def __len__(self) -> int:
@@ -217,7 +219,7 @@ def _inventory_of(
         language=language,
         phones=tuple(row["phone"] for row in rows),
         kinds=tuple(row["kind"] for row in rows),
-        visemes={row["phone"]: _viseme_shares(row["visemes"]) for row in rows},
+        visemes={row["phone"]: _viseme_fractions(row["visemes"]) for row in rows},
         before_rounded={
             row["phone"]: row["before_rounded"] for row in rows if row["before_rounded"]
         },
@@ -261,6 +263,6 @@ def _universal_phones(package: str, language: str) -> Mapping[str, Syllable]:
     return {row["phone"]: tuple(row["universal"].split()) for row in rows}
 
 
-def _viseme_shares(text: str) -> VisemeShares:
+def _viseme_fractions(text: str) -> VisemeFractions:
     pairs = [part.split(":") for part in text.split()]
-    return tuple((viseme, float(share)) for viseme, share in pairs)
+    return tuple((viseme, float(fraction)) for viseme, fraction in pairs)

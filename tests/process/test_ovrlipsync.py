@@ -32,7 +32,7 @@ SUCCESS, CANNOT_CREATE, INVALID, BAD_RATE, UNDEFINED = 0, -2201, -2202, -2203, -
 ENHANCED, WITH_LAUGHTER = 1, 2
 S16_MONO, F32_MONO, F32_STEREO = 0, 2, 3
 VISEME_ON, SMOOTHING = 0, 3
-EVIDENCE_SHARE = 0.1  # of a new position, for laughter
+EVIDENCE_FRACTION = 0.1  # of a new position, for laughter
 Weights = NDArray[np.float64]
 
 
@@ -174,7 +174,7 @@ def laughter_of(samples: Frames) -> list[float]:
     evidence, values = 0.0, []
     for pair in bands[: len(bands) // 2 * 2].reshape(-1, 2, bands.shape[1]):
         outputs = encoder.accept_position(pair).state @ readout.weights + readout.bias
-        evidence += EVIDENCE_SHARE * (float(outputs[2]) - evidence)
+        evidence += EVIDENCE_FRACTION * (float(outputs[2]) - evidence)
         values.append(evidence)
     return values
 

@@ -31,7 +31,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_LENGTHS", (30, 40))
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 2)
     monkeypatch.setattr(recipe, "READOUT", SMALL_READOUT)
-    monkeypatch.setattr(recipe, "_SUNG_SHARE", 2)
+    monkeypatch.setattr(recipe, "_SUNG_EVERY", 2)
     monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
 
 

@@ -27,5 +27,5 @@ def test_packs_the_clips_that_may_be_shared(tmp_path: Path) -> None:
     with zipfile.ZipFile(archive) as file:
         file.extractall(tmp_path / "copy")
     (copy,) = read_clips(tmp_path / "copy")
-    assert (copy.name, copy.part, copy.license) == ("cam_1", "held", "CC BY 4.0")
+    assert (copy.name, copy.split, copy.license) == ("cam_1", "held", "CC BY 4.0")
     assert "cam_1\theld\tzh\tann\tCC BY 4.0" in (tmp_path / "copy" / "clips.tsv").read_text()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, part_of
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, split_of
 from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     LIP_FAPS,
@@ -37,9 +37,9 @@ def write_clip(folder: Path, name: str, speaker: str, license_name: str) -> None
     (folder / f"{name}.csv").write_text("\n".join([head, *rows]) + "\n")
 
 
-def name_for(part: str) -> str:
-    """Return a name that the rule gives this part."""
-    return next(name for k in range(100) if part_of(name := f"clip_{k}", may_train=True) == part)
+def name_for(split: str) -> str:
+    """Return a name that the rule puts into this split."""
+    return next(name for k in range(100) if split_of(name := f"clip_{k}", may_train=True) == split)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Snapshots of metrics, their page for Prometheus, and the busy share of a loop."""
+"""Snapshots of metrics, their page for Prometheus, and the busy load of a loop."""
 
 import pytest
 
@@ -22,35 +22,35 @@ def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
     assert metrics.snapshot(11.0)["frames_per_s"] == 0.0
 
 
-def busy_share(until_s: float, work_s: float) -> LoadMeter:
-    """Return the share of a loop that works at the start of each second, read every 0.25 s."""
+def busy_load(until_s: float, work_s: float) -> LoadMeter:
+    """Return the load of a loop that works at the start of each second, read every 0.25 s."""
     busy = LoadMeter(2.0, 0.0)
     for quarter in range(int(4 * until_s)):
         if quarter % 4 == 0:
             busy.start_working(quarter / 4)
             busy.start_waiting(quarter / 4 + work_s)
-        busy.share(quarter / 4 + 0.25)
+        busy.load(quarter / 4 + 0.25)
     return busy
 
 
 @pytest.mark.parametrize("work_s", [0.0, 0.1, 0.25])
-def test_the_busy_share_is_that_of_the_work(work_s: float) -> None:
-    assert busy_share(6.0, work_s).share(6.0) == pytest.approx(work_s, abs=0.03)
+def test_the_busy_load_is_that_of_the_work(work_s: float) -> None:
+    assert busy_load(6.0, work_s).load(6.0) == pytest.approx(work_s, abs=0.03)
 
 
-def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None:
-    busy = busy_share(4.0, 0.2)
+def test_the_busy_load_forgets_old_work_and_includes_work_in_progress() -> None:
+    busy = busy_load(4.0, 0.2)
     for quarter in range(1, 13):
-        last = busy.share(4.0 + quarter / 4)
+        last = busy.load(4.0 + quarter / 4)
     assert last == 0.0
     busy.start_working(7.0)
-    assert busy.share(9.0) == 1.0
+    assert busy.load(9.0) == 1.0
 
 
-@pytest.mark.parametrize(("added_s", "share"), [(-0.4, 0.2), (0.1, 0.7), (9.0, 1.0)])
-def test_the_busy_share_includes_added_work(added_s: float, share: float) -> None:
+@pytest.mark.parametrize(("added_s", "load"), [(-0.4, 0.2), (0.1, 0.7), (9.0, 1.0)])
+def test_the_busy_load_includes_added_work(added_s: float, load: float) -> None:
     busy = LoadMeter(2.0, 0.0)
     busy.start_working(0.0)
     busy.start_waiting(0.6)
     busy.add(added_s)
-    assert busy.share(1.0) == pytest.approx(share)
+    assert busy.load(1.0) == pytest.approx(load)

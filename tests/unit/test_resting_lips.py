@@ -38,7 +38,7 @@ def shares(
             lips.follow_voice(frame_s)
             is_phone = phone_s <= frame_s < phone_s + 0.1
             lips.doubt_at(frame_s, closure if frame_s > SOUND_S else 0.1, 2.0 * is_phone)
-            made.append(lips.share_at(frame_s))
+            made.append(lips.amount_at(frame_s))
     return np.array(made)
 
 
@@ -119,6 +119,6 @@ def test_the_end_of_the_sound_closes_the_lips_in_300_ms() -> None:
         if number == 79:
             lips.add_event(EndOfSound(time_s=number * FRAME_S))
         lips.follow_voice(number * FRAME_S)
-        made.append(lips.share_at(number * FRAME_S))
+        made.append(lips.amount_at(number * FRAME_S))
     assert made[78] == 1.0
     assert made[-1] == 0.0

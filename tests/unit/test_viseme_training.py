@@ -75,7 +75,7 @@ def test_reads_tracked_clips_and_rigs(tmp_path: Path) -> None:
         read_clips(tmp_path)
     (tmp_path / "b_rig.json").unlink()
     (film,) = read_clips(tmp_path)
-    assert film.part == "held"
+    assert film.split == "held"
     assert film.faps[0, [JAW, LOWER_LIP]].tolist() == [10.0, -20.0]
     assert np.isnan(film.faps[0, WIDTH])
 

@@ -176,8 +176,8 @@ def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -
         durations *= 1 - shortening / (1 + np.square(change / (np.median(change) + _TINY)))
     ends = np.cumsum(durations)
     ends *= max(1.0, num_frames / ends[-1])
-    kept = np.searchsorted(ends, np.arange(num_frames) + 0.5)
-    return np.minimum(kept, len(frames) - 1)
+    source_frames = np.searchsorted(ends, np.arange(num_frames) + 0.5)
+    return np.minimum(source_frames, len(frames) - 1)
 
 
 def _add_background(sound: Samples, material: Material, rng: np.random.Generator) -> Samples:

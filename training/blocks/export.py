@@ -210,8 +210,8 @@ class BlockGraph(ReadoutGraph):
     def new_caches(self) -> None:
         """Output the block's keys and values."""
         order = [
-            self._new[layer + at]
-            for at in range(2)
+            self._new[layer + index]
+            for index in range(2)
             for layer in range(0, 2 * self._shape.layers, 2)
         ]
         new = self.node("Concat", order, axis=1)

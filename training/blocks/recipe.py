@@ -53,7 +53,7 @@ BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY, _RATE_WEIGHT = 3.2, 120.0  # chosen on speech of many rates, for `light` too
 _MIX = Mix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
-_SUNG_SHARE, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
+_SUNG_EVERY, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
 _FRAMES_PER_POSITION = 2
 
@@ -81,16 +81,16 @@ class _Labeled:
         }
 
     @classmethod
-    def of(cls, kept: dict[str, NDArray[Any]]) -> _Labeled:
+    def of(cls, saved: dict[str, NDArray[Any]]) -> _Labeled:
         """Restore the object from :meth:`arrays`."""
-        samples = np.split(kept["samples"], np.cumsum(kept["num_samples"])[:-1])
-        bounds = np.cumsum(kept["num_frames"])[:-1]
-        states, probs = np.split(kept["states"], bounds), np.split(kept["probs"], bounds)
+        samples = np.split(saved["samples"], np.cumsum(saved["num_samples"])[:-1])
+        bounds = np.cumsum(saved["num_frames"])[:-1]
+        states, probs = np.split(saved["states"], bounds), np.split(saved["probs"], bounds)
         recordings = [
             Recording(samples=sound, targets=Targets(*pair), weight=float(weight))
-            for sound, *pair, weight in zip(samples, states, probs, kept["weights"], strict=True)
+            for sound, *pair, weight in zip(samples, states, probs, saved["weights"], strict=True)
         ]
-        return cls(recordings, topology_from(Archive(kept)), kept["log_prior"])
+        return cls(recordings, topology_from(Archive(saved)), saved["log_prior"])
 
 
 def train_blocks(
@@ -167,7 +167,7 @@ def train_blocks(
 
 def _sung_copies(recordings: Sequence[Recording], seed: int) -> Iterator[Recording]:
     """Yield copies of some recordings that are sung, or have a held vowel."""
-    numbers = np.random.default_rng(seed).permutation(len(recordings))[::_SUNG_SHARE].tolist()
+    numbers = np.random.default_rng(seed).permutation(len(recordings))[::_SUNG_EVERY].tolist()
     copies = process_in_order(partial(_sung_copy, recordings, seed), numbers)
     for copy in track(copies, "sung copies", len(numbers)):
         if copy:

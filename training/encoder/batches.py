@@ -91,8 +91,8 @@ def _excerpt(
             sound = _add_background(sound, material, rng, snr_db, with_voices=True)
         sound = disturb(sound, rng)
     inputs = inputs_of(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
-    at = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
-    chosen = _rows(targets, at)
+    source = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
+    chosen = _rows(targets, source)
     chosen[:, PITCH] += np.float32(np.log2(speed))
     lips = material.columns.lips
     delayed = [
@@ -102,10 +102,10 @@ def _excerpt(
     return inputs, np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
 
 
-def _rows(targets: Floats, at: NDArray[np.floating]) -> Floats:
+def _rows(targets: Floats, positions: NDArray[np.floating]) -> Floats:
     """Return the rows that are nearest to positions; NaN before the first one."""
-    rows: Floats = targets[np.clip(np.rint(at).astype(np.int64), 0, len(targets) - 1)]
-    rows[at < -1] = np.nan
+    rows: Floats = targets[np.clip(np.rint(positions).astype(np.int64), 0, len(targets) - 1)]
+    rows[positions < -1] = np.nan
     return rows
 
 
@@ -151,6 +151,6 @@ def _add_background(
 
 def _change_pitch(samples: Samples, rng: np.random.Generator) -> Samples:
     """Play a sound faster or slower."""
-    at = np.arange(0, len(samples) - 1, rng.uniform(_MIN_PITCH, _MAX_PITCH))
-    changed: Samples = np.interp(at, np.arange(len(samples)), samples).astype(np.int16)
+    positions = np.arange(0, len(samples) - 1, rng.uniform(_MIN_PITCH, _MAX_PITCH))
+    changed: Samples = np.interp(positions, np.arange(len(samples)), samples).astype(np.int16)
     return changed

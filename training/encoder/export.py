@@ -94,5 +94,5 @@ class _EncoderGraph(Graph):
         reset, update = self.split(gates, [f"{name}.reset", f"{name}.update"])
         from_state = self.node("Mul", [reset, from_state])
         new = self.node("Tanh", [self.node("Add", [from_input, from_state])])
-        kept = self.node("Mul", [update, self.node("Sub", [state, new])])
-        return self.node("Add", [new, kept])
+        retained = self.node("Mul", [update, self.node("Sub", [state, new])])
+        return self.node("Add", [new, retained])

@@ -135,11 +135,15 @@ def _speech_of(
     for folder in untranscribed:
         of_sources.append([(path, 1.0) for path in audio_files(folder) if not is_held_out(path)])
     of_sources.append([(path, 1.0) for path in filmed])
-    shares = np.sqrt([sum(path.stat().st_size for path, _ in source) for source in of_sources])
+    source_weights = np.sqrt(
+        [sum(path.stat().st_size for path, _ in source) for source in of_sources]
+    )
     recordings = []
-    for source, share in zip(of_sources, shares / shares.sum(), strict=True):
+    for source, source_weight in zip(
+        of_sources, source_weights / source_weights.sum(), strict=True
+    ):
         total = sum(weight for _, weight in source)
-        recordings += [_recording(path, share * weight / total) for path, weight in source]
+        recordings += [_recording(path, source_weight * weight / total) for path, weight in source]
     return recordings
 
 

@@ -220,8 +220,8 @@ class TargetStore:
             lips = (lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
             rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, whisper, lips]
             targets = np.column_stack(rows).astype(np.float16)
-            kept = samples[: POSITION_SAMPLES * len(targets)]
-            pieces.append(Piece(kept, targets, recording.weight))
+            trimmed = samples[: POSITION_SAMPLES * len(targets)]
+            pieces.append(Piece(trimmed, targets, recording.weight))
         return pieces
 
     def _is_audible(self, outputs: TeacherOutputs, voice: Voice) -> NDArray[np.bool_]:

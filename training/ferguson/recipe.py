@@ -62,7 +62,7 @@ def phone_table(
     """Add durations, zero crossings and influence to the openings of the phones."""
     durations: dict[str, list[float]] = defaultdict(list)
     crossings: dict[str, list[float]] = defaultdict(list)
-    shares: dict[str, list[float]] = defaultdict(list)
+    initial_fractions: dict[str, list[float]] = defaultdict(list)
     for recording in speech:
         onset_crossings = OnsetCrossings(recording.slices)
         remaining = iter(recording.phones)
@@ -75,11 +75,11 @@ def phone_table(
             )
             if len(syllable) > 1 and syllable[0] in inventory.initials:
                 length_s = phones[0].duration_s + phones[1].duration_s
-                shares[syllable[1]].append(phones[0].duration_s / length_s)
+                initial_fractions[syllable[1]].append(phones[0].duration_s / length_s)
     kind = dict(zip(inventory.phones, inventory.kinds, strict=True))
-    share = _means(shares, sorted(inventory.vowels), lambda _: "vowel")
-    counts = {phone: len(shares[phone]) + _KIND_RIDGE for phone in share}
-    level, influence = influence_levels(share, counts)
+    mean_fractions = _means(initial_fractions, sorted(inventory.vowels), lambda _: "vowel")
+    counts = {phone: len(initial_fractions[phone]) + _KIND_RIDGE for phone in mean_fractions}
+    level, influence = influence_levels(mean_fractions, counts)
     return PhoneTable(
         opening=opening,
         duration_s=_means(durations, inventory.phones, kind.__getitem__),
@@ -90,15 +90,15 @@ def phone_table(
 
 
 def influence_levels(
-    share: Mapping[str, float], weight: Mapping[str, float]
+    fractions: Mapping[str, float], weight: Mapping[str, float]
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Group finals by their initials' share; return level and factor of each.
+    """Group finals by the fraction of their initials; return level and factor of each.
 
-    ``share`` is the mean fraction of the syllable that is the initial, for at least ``NUM_LEVELS``
-    finals.
+    ``fractions`` has the mean fraction of the syllable that is the initial, for at least
+    ``NUM_LEVELS`` finals.
     """
-    finals = sorted(share, key=lambda final: (-share[final], final))
-    values = np.array([share[final] for final in finals])
+    finals = sorted(fractions, key=lambda final: (-fractions[final], final))
+    values = np.array([fractions[final] for final in finals])
     weights = np.array([weight[final] for final in finals])
 
     def groups(cuts: tuple[int, ...]) -> list[slice]:
@@ -164,11 +164,11 @@ def fit_openings(
         parts.append(_opening_weights(clip.time_s[is_measured], phones, inventory) * is_open)
         heights.append(opening[is_measured])
     weights, height = np.concatenate(parts), np.concatenate(heights)
-    shares = _viseme_shares(inventory) * is_open[:, None]
+    fractions = _viseme_fractions(inventory) * is_open[:, None]
     of_visemes = _least_squares(
-        weights @ shares, height, np.full(shares.shape[1], _DEFAULT_OPENING)
+        weights @ fractions, height, np.full(fractions.shape[1], _DEFAULT_OPENING)
     )
-    fitted = _least_squares(weights, height, shares @ of_visemes)
+    fitted = _least_squares(weights, height, fractions @ of_visemes)
     return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
 
 
@@ -201,14 +201,14 @@ def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneIn
     return weights
 
 
-def _viseme_shares(inventory: PhoneInventory) -> Array:
+def _viseme_fractions(inventory: PhoneInventory) -> Array:
     """Return the fraction of each viseme in each phone, (num_phones, num_visemes)."""
-    names = sorted({name for shares in inventory.visemes.values() for name, _ in shares})
-    shares = np.zeros((len(inventory), len(names)))
+    names = sorted({name for fractions in inventory.visemes.values() for name, _ in fractions})
+    fractions = np.zeros((len(inventory), len(names)))
     for row, phone in enumerate(inventory.phones):
-        for name, share in inventory.visemes[phone]:
-            shares[row, names.index(name)] += share
-    return shares
+        for name, fraction in inventory.visemes[phone]:
+            fractions[row, names.index(name)] += fraction
+    return fractions
 
 
 def _least_squares(weights: Array, height: Array, start: Array) -> Array:
@@ -234,7 +234,7 @@ def train_ferguson(
     """
     model = load_model()
     inventory = model.inventory
-    used = [clip for clip in read_clips(clips, any_license=any_license) if clip.part == "train"]
+    used = [clip for clip in read_clips(clips, any_license=any_license) if clip.split == "train"]
     if not used:
         raise no_clip_error(clips)
     openings = fit_openings(used, [label_clip(model, clip) for clip in used], inventory)

@@ -222,12 +222,12 @@ def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
             now = GaussianMixtures(weights=weights[one], means=means[one], covars=covars[one])
             sums = _component_sums(design, now.score_matrix(), frames.weights[numbers])
             counts = sums[:, -1]
-            kept = counts > 0
+            is_used = counts > 0
             safe = np.maximum(counts, 1e-9)[:, None]
             mean = sums[:, NUM_FEATURES:-1] / safe
             covar = np.maximum(sums[:, :NUM_FEATURES] / safe - mean**2, floor)
-            means[state, kept] = mean[kept]
-            covars[state, kept] = covar[kept]
+            means[state, is_used] = mean[is_used]
+            covars[state, is_used] = covar[is_used]
             weights[state] = counts / counts.sum()
     log_stay, log_leave = _transitions(frames, hmm)
     return replace(
@@ -378,9 +378,9 @@ def _component_covariances(
             count = float(frames.weights[numbers][members].sum())
             if members.sum() < 2 * num:
                 continue
-            at = state * num_mixtures + component
+            row = state * num_mixtures + component
             centered = (x[members] - mixtures.means[state, component]).astype(np.float64)
             weighted = centered * frames.weights[numbers][members][:, None]
-            scatter[at] = weighted.T @ centered / count + 1e-4 * np.eye(num)  # never singular
-            counts[at] = count
+            scatter[row] = weighted.T @ centered / count + 1e-4 * np.eye(num)  # never singular
+            counts[row] = count
     return scatter, counts

@@ -277,15 +277,15 @@ class Builder:
         turn = np.arctan2(x, depth)
         low = np.clip((eye[1] + 0.55 - y) / 0.5, 0, 1)
         low = low * low * (3 - 2 * low)
-        share = np.clip(turn + np.pi / 2, 0, None) * np.clip((0.6 - turn) / 0.6, 0, 1) * low
-        turned = turn - _SWEEP * share
+        swept_part = np.clip(turn + np.pi / 2, 0, None) * np.clip((0.6 - turn) / 0.6, 0, 1) * low
+        turned = turn - _SWEEP * swept_part
 
         def reach(angle: Float) -> Float:
             return 1 / np.hypot(np.sin(angle) / width, np.cos(angle) / 1.0)
 
         radius = np.hypot(x, depth) * reach(turned) / reach(turn)
         swept = np.stack([radius * np.sin(turned), y, paint.AXIS_Z + radius * np.cos(turned)], 1)
-        return np.where((share > 0)[:, None], swept, points)
+        return np.where((swept_part > 0)[:, None], swept, points)
 
     def _brows(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the brows, and raise their inner ends; they follow the skin below them."""
@@ -297,7 +297,7 @@ class Builder:
         front = skin.vertices[self._outer]
         front = front[front[:, 2] > 0.6]
         surface = interpolate.LinearNDInterpolator(front[:, :2], front[:, 2])
-        before, after = (surface(np.abs(at[:, 0]), at[:, 1]) for at in (points, raised))
+        before, after = (surface(np.abs(place[:, 0]), place[:, 1]) for place in (points, raised))
         points = raised + [0, 0, 1] * (after - before)[:, None]
         rows = self.reference.number[brows.base]
         shifts = {

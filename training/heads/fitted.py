@@ -50,9 +50,9 @@ class Fitted:
         """Transfer displacements (19158, 3) of the base mesh to the vertices (V, 3)."""
         return np.asarray(np.einsum("vk,vkd->vd", self.weights, field[self.base]))
 
-    def only(self, kept: NDArray[np.bool_]) -> "Fitted":
+    def only(self, mask: NDArray[np.bool_]) -> "Fitted":
         """Return the triangles (F,) that are kept, without unused vertices."""
-        used, triangles, welds = subdivision.used_vertices(self.triangles[kept], self.welds)
+        used, triangles, welds = subdivision.used_vertices(self.triangles[mask], self.welds)
         return Fitted(
             triangles,
             self.uv[used],

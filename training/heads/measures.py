@@ -72,8 +72,8 @@ def neckline_height(z: Float) -> Float:
 def head_weight(source: MakeHuman) -> Float:
     """Return how far each vertex of the base mesh follows the head; it fades down the neck."""
     weight = np.ones(19158)
-    for bone, share in (("neck03", 0.25), ("neck02", 0.55), ("neck01", 0.85)):
-        weight -= share * source.bone_weights(bone)
+    for bone, fraction in (("neck03", 0.25), ("neck02", 0.55), ("neck01", 0.85)):
+        weight -= fraction * source.bone_weights(bone)
     for bone in source.bones():
         if bone.startswith(_TORSO):
             weight -= source.bone_weights(bone)

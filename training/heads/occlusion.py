@@ -156,8 +156,8 @@ def _shown(triangles: NDArray[np.int64], visible: NDArray[np.bool_]) -> NDArray[
     graph = coo_array((np.ones(edges.shape[1]), edges), shape=(len(visible), len(visible)))
     tooth = connected_components(graph, directed=False)[1][triangles[:, 0]]
     shown = visible[triangles].any(axis=1)
-    share = np.bincount(tooth, shown) / np.maximum(np.bincount(tooth), 1)
-    return np.asarray(shown & (share[tooth] > _TOOTH_SHOWN))
+    shown_fraction = np.bincount(tooth, shown) / np.maximum(np.bincount(tooth), 1)
+    return np.asarray(shown & (shown_fraction[tooth] > _TOOTH_SHOWN))
 
 
 def _outward(piece: HeadPiece) -> Float:

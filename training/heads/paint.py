@@ -70,8 +70,8 @@ def face_map(vertices: Float, uv: Float, source: Float) -> FaceMap:
 
 def resample(face: FaceMap, texture: Float, order: int) -> Float:
     """Move one of MakeHuman's skins (H, W, 3) to this texture's coordinates."""
-    at = face.source * (np.array(texture.shape[:2]) - 1)[:, None, None]
-    bands = [ndimage.map_coordinates(texture[..., k], at, order=order) for k in range(3)]
+    pixels = face.source * (np.array(texture.shape[:2]) - 1)[:, None, None]
+    bands = [ndimage.map_coordinates(texture[..., k], pixels, order=order) for k in range(3)]
     return np.asarray(np.clip(np.stack(bands, axis=2), 0, 1))
 
 
@@ -115,11 +115,11 @@ class Look:
 
 def _inpaint(image: Float, hidden: Float) -> Float:
     """Replace the hidden part (H, W), 0 to 1, of an image (H, W, 3) by its surroundings."""
-    kept = (1 - hidden)[..., None]
+    weight = (1 - hidden)[..., None]
     sigma = (24, 24, 0)
-    around = ndimage.gaussian_filter(image * kept, sigma)
-    around /= ndimage.gaussian_filter(kept, sigma) + 1e-4
-    return np.asarray(image * kept + around * (1 - kept))
+    around = ndimage.gaussian_filter(image * weight, sigma)
+    around /= ndimage.gaussian_filter(weight, sigma) + 1e-4
+    return np.asarray(image * weight + around * (1 - weight))
 
 
 def skin(
@@ -141,8 +141,8 @@ def skin(
     tones = complexion / np.median(complexion[usual], axis=0)
     # MakeHuman's skin has a seam below the jaw, and stubble on the scalp
     jaw = np.interp(face.angle, [0.0, 0.8, 1.3, 1.5, 1.7, 2.0], [4.95, 5.05, 5.20, 5.28, 5.4, 6.0])
-    kept = np.clip((face.y - jaw) / 0.15, 0, 1) * np.clip((6.45 - face.y) / 0.2, 0, 1)
-    tones = 1 + (tones - 1) * kept[..., None]
+    weight = np.clip((face.y - jaw) / 0.15, 0, 1) * np.clip((6.45 - face.y) / 0.2, 0, 1)
+    tones = 1 + (tones - 1) * weight[..., None]
     # the nostrils of MakeHuman's skin are larger than those of the heads
     nose = np.clip(1.5 * _spot(face, 0.10, 5.38, 0.17, 0.13), 0, 1)[..., None]
     tones += (ndimage.gaussian_filter(np.maximum(tones, 0.85), (18, 18, 0)) - tones) * nose
@@ -215,11 +215,11 @@ def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
         curve = interpolate.make_interp_spline(np.linspace(0, 1, len(line)), line, 2)(steps)
         near = (np.abs(texels - curve.mean(axis=0)) < np.ptp(curve, axis=0) / 2 + 0.06).all(axis=-1)
         near &= face.angle < 1.6
-        away, at = spatial.cKDTree(curve).query(texels[near])
-        above = (texels[near] - curve[at])[:, 1]
-        fade = np.sin(np.pi * np.clip(0.02 + 0.96 * steps[at], 0, 1))
+        away, index = spatial.cKDTree(curve).query(texels[near])
+        above = (texels[near] - curve[index])[:, 1]
+        fade = np.sin(np.pi * np.clip(0.02 + 0.96 * steps[index], 0, 1))
         if line[0, 0] == 0.0:  # it continues across the middle
-            fade = np.cos(np.pi / 2 * steps[at])
+            fade = np.cos(np.pi / 2 * steps[index])
         across = away + waver[near]
         groove = np.exp(-((across / 0.009) ** 2)) + 0.45 * np.exp(-((across / 0.028) ** 2))
         rim = np.exp(-(((away - 0.022) / 0.012) ** 2)) * (above < 0)

@@ -94,10 +94,10 @@ class HeadPiece:
     coarse_vertices: int = 0  # 0: there is only one level of detail
     coarse_triangles: Index | None = None
 
-    def keep(self, kept: NDArray[np.bool_]) -> None:
+    def keep(self, mask: NDArray[np.bool_]) -> None:
         """Remove the other triangles (F,) of a piece without coarse ones, and unused vertices."""
         part = self.part
-        used, triangles, welds = subdivision.used_vertices(part.triangles[kept], _welds(part))
+        used, triangles, welds = subdivision.used_vertices(part.triangles[mask], _welds(part))
         self.part = Geometry(
             part.vertices[used], triangles, part.uv[used], part.colors[used], welds
         )
@@ -125,18 +125,19 @@ def write(
         return np.asarray((points - PIVOT) * METERS_PER_UNIT, dtype=np.float32)
 
     first = np.cumsum([0] + [len(p.part.vertices) for p in pieces])
-    start = {p.name: int(at) for p, at in zip(pieces, first, strict=False)}
+    start = {p.name: int(offset) for p, offset in zip(pieces, first, strict=False)}
     part_vertices, part_triangles, triangles = [], [], []
     count = 0
     for piece in pieces:
-        at, size = start[piece.name], len(piece.part.vertices)
-        part_vertices.append((at, at + (piece.coarse_vertices or size), at + size))
-        triangles.append(piece.part.triangles + at)
+        offset, size = start[piece.name], len(piece.part.vertices)
+        end_coarse = offset + (piece.coarse_vertices or size)
+        part_vertices.append((offset, end_coarse, offset + size))
+        triangles.append(piece.part.triangles + offset)
         fine = (count, count + len(triangles[-1]))
         count = fine[1]
         coarse = fine
         if piece.coarse_triangles is not None:
-            triangles.append(piece.coarse_triangles + at)
+            triangles.append(piece.coarse_triangles + offset)
             coarse = (count, count + len(triangles[-1]))
             count = coarse[1]
         part_triangles.append((*fine, *coarse))

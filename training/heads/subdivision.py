@@ -124,7 +124,7 @@ def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, 
     in the direction of their triangles.
     """
     above = height[triangles] > 0
-    kept = triangles[~above.any(axis=1)].tolist()
+    remaining = triangles[~above.any(axis=1)].tolist()
     rows = list(values)
     new_rows: dict[tuple[int, int], int] = {}
     rim = []
@@ -132,9 +132,9 @@ def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, 
     def cut(i: int, j: int) -> int:
         key = (min(i, j), max(i, j))
         if key not in new_rows:
-            share = height[i] / (height[i] - height[j])
+            fraction = height[i] / (height[i] - height[j])
             new_rows[key] = len(rows)
-            rows.append(values[i] + share * (values[j] - values[i]))
+            rows.append(values[i] + fraction * (values[j] - values[i]))
         return new_rows[key]
 
     for corners, high in zip(triangles, above, strict=True):
@@ -145,9 +145,9 @@ def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, 
         a, b, c = (int(vertex) for vertex in np.roll(corners, -alone))
         p, q = cut(a, b), cut(a, c)
         if high.sum() == 1:
-            kept += [[p, b, c], [p, c, q]]
+            remaining += [[p, b, c], [p, c, q]]
             rim.append([q, p])
         else:
-            kept.append([a, p, q])
+            remaining.append([a, p, q])
             rim.append([p, q])
-    return np.array(rows), np.array(kept), np.array(rim)
+    return np.array(rows), np.array(remaining), np.array(rim)

@@ -90,9 +90,9 @@ def strands(texture: Float, contrast: float) -> Float:
 def sample_alpha(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float:
     """Return alpha at N points of each triangle (F, N); ``uv`` (V, 2) has v downward."""
     steps = np.linspace(0.02, 0.96, 9)
-    share = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])
-    at = np.einsum("sk,fkd->fsd", share, uv[triangles]) * (alpha.shape[1], alpha.shape[0])
-    column, row = np.clip(at.astype(int), 0, np.array(alpha.shape[::-1]) - 1).transpose(2, 0, 1)
+    barycentric = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])
+    pixels = np.einsum("sk,fkd->fsd", barycentric, uv[triangles]) * (alpha.shape[1], alpha.shape[0])
+    column, row = np.clip(pixels.astype(int), 0, np.array(alpha.shape[::-1]) - 1).transpose(2, 0, 1)
     return np.asarray(alpha[row, column])
 
 
@@ -139,9 +139,11 @@ def eye(texture: Float, color: Color, iris_size: float = 1.0, size: int = 512) -
         angle, [0, angle_of_iris, EYE_RINGS[-1]], [0, _EYE_IRIS, _EYE_WHITE]
     )  # fmt: skip
     turn = np.arctan2(y, x)
-    at = np.array([_EYE_CENTER[0] + radius * np.sin(turn), _EYE_CENTER[1] + radius * np.cos(turn)])
+    pixel = np.array(
+        [_EYE_CENTER[0] + radius * np.sin(turn), _EYE_CENTER[1] + radius * np.cos(turn)]
+    )
     image = np.stack(
-        [ndimage.map_coordinates(texture[..., k], at, order=1) for k in range(3)], axis=2
+        [ndimage.map_coordinates(texture[..., k], pixel, order=1) for k in range(3)], axis=2
     )
     light = image.mean(axis=2)
     within = radius / _EYE_IRIS

@@ -89,8 +89,8 @@ def close_lips(skin: Skin, overlap: float = 0.002) -> None:
     shifts = {}
     for half, sign in ((upper, -1.0), (lower, 1.0)):
         for vertex in half:
-            at = skin.vertices[vertex, 0]
-            up, low = (np.interp(at, *curve) for curve in height)
+            vertex_x = skin.vertices[vertex, 0]
+            up, low = (np.interp(vertex_x, *curve) for curve in height)
             shifts[int(vertex)] = (up + low) / 2 + sign * overlap - skin.vertices[vertex, 1]
     for vertex in (ring[corner], ring[-corner]):
         shifts[int(vertex)] = 0.0
@@ -305,12 +305,12 @@ def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
 
 
 def jaw_fields(
-    vertices: Float, share: Float, fapu: dict[str, float], chin_z: float = 1.104
+    vertices: Float, weight: Float, fapu: dict[str, float], chin_z: float = 1.104
 ) -> Fields:
     """Compute the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
-    lever = share * np.maximum(vertices[:, 2] - _HINGE_Z, 0) / (chin_z - _HINGE_Z)
+    lever = weight * np.maximum(vertices[:, 2] - _HINGE_Z, 0) / (chin_z - _HINGE_Z)
     return {
         3: _axis_field(3, lever) * fapu["MNS"],
-        14: _axis_field(14, share) * fapu["MNS"],
+        14: _axis_field(14, weight) * fapu["MNS"],
         15: _axis_field(15, lever) * fapu["MW"],
     }

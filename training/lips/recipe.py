@@ -188,10 +188,10 @@ def principal_components(features: Floats) -> tuple[Floats, Floats]:
         centered = features[:, part] - mean[part]
         covariance = (centered.T @ centered).astype(np.float64) / len(centered)
         variances, directions = np.linalg.eigh(covariance)
-        kept = min(number, len(part))
-        extents = np.linspace(first_extent, last_extent, kept)
-        scale = extents / np.sqrt(np.maximum(variances[::-1][:kept], _MIN_VARIANCE))
-        projection[part, first : first + kept] = directions[:, ::-1][:, :kept] * scale
+        num_kept = min(number, len(part))
+        extents = np.linspace(first_extent, last_extent, num_kept)
+        scale = extents / np.sqrt(np.maximum(variances[::-1][:num_kept], _MIN_VARIANCE))
+        projection[part, first : first + num_kept] = directions[:, ::-1][:, :num_kept] * scale
         first += number
     return mean, projection
 

@@ -26,7 +26,7 @@ from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 
-_CLOSED_SHARE = 0.1  # fraction of the range of a speaker's opening
+_CLOSED_FRACTION = 0.1  # fraction of the range of a speaker's opening
 _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
 
@@ -47,7 +47,7 @@ def closed_below(clips: Sequence[LipClip]) -> dict[str, float]:
         known = np.concatenate(heights)
         known = known[~np.isnan(known)]
         low, high = np.percentile(known, _RANGE_PERCENTILES) if len(known) else (np.nan, np.nan)
-        limits[speaker] = float(low + _CLOSED_SHARE * (high - low))
+        limits[speaker] = float(low + _CLOSED_FRACTION * (high - low))
     return limits
 
 

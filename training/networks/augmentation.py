@@ -111,8 +111,8 @@ def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
 
 def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.int64]:
     """Return the source frame of each frame after a change of speed, (num_frames,)."""
-    at = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
-    return np.asarray(np.clip(np.rint(at), 0, num_source - 1).astype(np.int64))
+    source = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
+    return np.asarray(np.clip(np.rint(source), 0, num_source - 1).astype(np.int64))
 
 
 def _room(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -139,8 +139,8 @@ def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
     if rng.random() < _FLUTTER_PROB:
         num_knots = 2 + num_samples // _FLUTTER_SAMPLES
         knots = rng.normal(0.0, rng.uniform(0.2, 0.8), num_knots)
-        at = np.arange(num_samples) / _FLUTTER_SAMPLES
-        noise *= np.exp(np.interp(at, np.arange(num_knots), knots))
+        position = np.arange(num_samples) / _FLUTTER_SAMPLES
+        noise *= np.exp(np.interp(position, np.arange(num_knots), knots))
     if rng.random() < _KNOCKS_PROB:
         num_pieces = num_samples // _KNOCK_SAMPLES + 1
         knocks = (rng.random(num_pieces) < _KNOCK_RATE) * rng.uniform(1.0, 6.0, num_pieces)
@@ -182,5 +182,5 @@ def _random_curve(
 ) -> NDArray[np.float64]:
     """Draw amplitudes over frequency; the spread of their logarithm is also drawn."""
     knots = rng.normal(0.0, rng.uniform(*spread), num_knots)
-    at = np.linspace(0.0, _HALF_RATE_HZ, num_knots)
-    return np.asarray(np.exp(np.interp(frequency, at, knots)))
+    frequency_hz = np.linspace(0.0, _HALF_RATE_HZ, num_knots)
+    return np.asarray(np.exp(np.interp(frequency, frequency_hz, knots)))

@@ -118,7 +118,7 @@ def label(
 
 
 def _recordings(aligned: Sequence[AlignedExample], mix: Mix) -> list[Recording]:
-    """Weight aligned recordings: kinds of speech have fixed shares, rare speakers count more."""
+    """Weight recordings: a kind of speech has a fixed total weight; rare speakers weigh more."""
     frames = dict.fromkeys(mix.kinds, 0.0)
     for one in aligned:
         frames[one.example.kind] += one.example.weight * len(one.alignment.states)

@@ -173,8 +173,8 @@ class Readout(nn.Module):
             amount = self.shape.constant_noise * torch.rand(batch, 1, 1, device=device)
             noisy = noisy + amount * torch.randn(batch, 1, num_features, device=device)
         if self.shape.feature_dropout:
-            kept = torch.rand(batch, 1, num_features, device=device) >= self.shape.feature_dropout
-            noisy = noisy * kept
+            mask = torch.rand(batch, 1, num_features, device=device) >= self.shape.feature_dropout
+            noisy = noisy * mask
         position = torch.arange(num_positions, device=device)[:, None]
         for _ in range(self.shape.num_masks):
             first = torch.randint(num_positions, (batch, 1, 1), device=device)

@@ -149,8 +149,8 @@ class Teacher:
             best, states = log_posteriors.topk(min(_NUM_TARGETS, log_posteriors.shape[-1]))
             rows = zip(states.cpu().numpy(), best.softmax(dim=-1).cpu().numpy(), strict=True)
             for (row, probs), sound in zip(rows, sounds, strict=False):
-                kept = slice(frames_in(len(sound)))
-                yield Targets(row[kept].astype(np.uint16), probs[kept].astype(np.float16))
+                window = slice(frames_in(len(sound)))
+                yield Targets(row[window].astype(np.uint16), probs[window].astype(np.float16))
 
 
 def train_teacher(

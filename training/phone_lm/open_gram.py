@@ -46,14 +46,14 @@ class _Level:
         first, end = (np.searchsorted(self.code, (context + n) * _BASE) for n in (0, 1))
         start = self.cumulative[first]
         height = rng.random(len(context))
-        at = np.searchsorted(self.cumulative, start + height, side="right") - 1
+        index = np.searchsorted(self.cumulative, start + height, side="right") - 1
         counted = (height < self.cumulative[end] - start) & (first < end)
-        return self.code[np.minimum(at, len(self.code) - 1)] % _BASE, counted
+        return self.code[np.minimum(index, len(self.code) - 1)] % _BASE, counted
 
     def has(self, code: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which n-grams are counted."""
-        at = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
-        return np.asarray(self.code[at] == code)
+        index = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
+        return np.asarray(self.code[index] == code)
 
 
 def draw_phones(

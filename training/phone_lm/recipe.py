@@ -127,9 +127,9 @@ def _prune(
         threshold = np.partition(all_gains, -max_ngrams)[-max_ngrams]
     prefixes = np.empty(0, np.int64)
     for n in range(max(gains), 1, -1):
-        kept = gains[n] >= threshold
-        kept[np.searchsorted(grams[n], prefixes)] = True
-        grams[n], probs[n] = grams[n][kept], probs[n][kept]
+        is_kept = gains[n] >= threshold
+        is_kept[np.searchsorted(grams[n], prefixes)] = True
+        grams[n], probs[n] = grams[n][is_kept], probs[n][is_kept]
         prefixes = np.unique(grams[n] // num_phones)
 
 
@@ -171,14 +171,14 @@ class _Tree:
 
     def _prob(self, wanted: NDArray[np.int64], n: int, backoffs: _Probs) -> NDArray[np.float64]:
         num_phones = len(self.inventory)
-        at = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
-        probs = self.probs[n][at]
-        missing = np.flatnonzero(self.grams[n][at] != wanted)
+        index = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
+        probs = self.probs[n][index]
+        missing = np.flatnonzero(self.grams[n][index] != wanted)
         if len(missing):
             pruned = wanted[missing]
             context, contexts = pruned // num_phones, self.grams[n - 1]
-            at = np.minimum(np.searchsorted(contexts, context), len(contexts) - 1)
-            weight = np.where(contexts[at] == context, backoffs[n - 1][at], 1.0)
+            index = np.minimum(np.searchsorted(contexts, context), len(contexts) - 1)
+            weight = np.where(contexts[index] == context, backoffs[n - 1][index], 1.0)
             shorter = self._prob(pruned % num_phones ** (n - 1), n - 1, backoffs)
             probs[missing] = weight * shorter
         return probs

@@ -73,8 +73,8 @@ class FeatureStore:
             joined = np.concatenate(features)
             return {"mean": joined.mean(axis=0), "deviation": joined.std(axis=0) + 1e-3}
 
-        kept = load_or_compute(self._folder / "standard.npz", compute)
-        self.mean, self.deviation = kept["mean"], kept["deviation"]
+        stored = load_or_compute(self._folder / "standard.npz", compute)
+        self.mean, self.deviation = stored["mean"], stored["deviation"]
 
     def read(self, recordings: Sequence[Utterance]) -> Iterator[Features]:
         """Yield the features of recordings, computed if they are missing."""

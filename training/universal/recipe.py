@@ -70,9 +70,9 @@ def train_universal(
         one.utterance_id: weight for one, weight in zip(data.recordings, data.weights, strict=True)
     }
     aligner = Aligner(by_name, inventory)
-    kept = load_or_compute(states_file, partial(_aligned_states, aligner, stored, seed))
-    pieces = np.split(kept["states"].astype(np.int64), np.cumsum(kept["lengths"])[:-1])
-    states = dict(zip(kept["names"].tolist(), pieces, strict=True))
+    saved = load_or_compute(states_file, partial(_aligned_states, aligner, stored, seed))
+    pieces = np.split(saved["states"].astype(np.int64), np.cumsum(saved["lengths"])[:-1])
+    states = dict(zip(saved["names"].tolist(), pieces, strict=True))
     aligned = [one for one in stored if one.name in states]
     readout = train_readout(
         new_readout(STATES_PER_PHONE * len(inventory)),

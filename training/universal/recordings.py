@@ -31,11 +31,11 @@ _HELD_OUT_SPEAKERS = frozenset(
     "emodb_03 emodb_13 vctk_p226 lj_linda_johnson "
     "grid_s31 grid_s33 grid_s5 grid_m_lbax grid_f_lbbc".split()
 )
-_HELD_OUT_SHARE = 10  # one in 10 speakers of English by native speakers of Mandarin
-# fraction of each group in training; synthetic speech other than Mandarin has _SYNTHETIC_SHARE
-_SHARES = {"learners": 0.27, "mandarin": 0.15, "en": 0.10, "emodb": 0.10, "grid": 0.08, "fr": 0.07,
-           "es": 0.06, "ru": 0.06, "de": 0.04, "yue": 0.04, "pt": 0.03}  # fmt: skip
-_SYNTHETIC_SHARE = 0.16
+_HELD_OUT_EVERY = 10  # one in 10 speakers of English by native speakers of Mandarin
+# fraction of each group in training; synthetic speech other than Mandarin has _SYNTHETIC_FRACTION
+_FRACTIONS = {"learners": 0.27, "mandarin": 0.15, "en": 0.10, "emodb": 0.10, "grid": 0.08,
+              "fr": 0.07, "es": 0.06, "ru": 0.06, "de": 0.04, "yue": 0.04, "pt": 0.03}  # fmt: skip
+_SYNTHETIC_FRACTION = 0.16
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +72,11 @@ def read_training_set(
         groups["grid"] += _grid_clips(clips, errors)
     recordings, weights = [], []
     for name, group in sorted(groups.items()):
-        kept = [one for one in group if _may_train(one)]
-        minutes = sum(one.seconds for one in kept)
-        recordings += kept
-        share = _SHARES.get(name, _SYNTHETIC_SHARE)
-        weights += [share * one.seconds / minutes for one in kept]
+        usable = [one for one in group if _may_train(one)]
+        minutes = sum(one.seconds for one in usable)
+        recordings += usable
+        fraction = _FRACTIONS.get(name, _SYNTHETIC_FRACTION)
+        weights += [fraction * one.seconds / minutes for one in usable]
     if not recordings:
         raise errors.no_recording_error("in the corpora")
     return TrainingSet(recordings, weights)
@@ -127,7 +127,7 @@ def _some_of_each_speaker(corpus: Path, errors: RowErrors) -> list[Utterance]:
     drawn = []
     for speaker, rows in sorted(by_speaker.items()):
         random.Random(speaker).shuffle(rows)  # noqa: S311 - reproducible
-        if zlib.crc32(speaker.encode()) % _HELD_OUT_SHARE:
+        if zlib.crc32(speaker.encode()) % _HELD_OUT_EVERY:
             chosen = rows[:_MAX_OF_SPEAKER]
             drawn += [replace(row, license=row.license or _LEARNERS_LICENSE) for row in chosen]
     return drawn

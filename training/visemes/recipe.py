@@ -103,7 +103,7 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
     Raises UserError if no clip may be used, or the file cannot be written.
     """
     clips = read_clips(folder, any_license=any_license)
-    used = [clip for clip in clips if clip.part == "train"]
+    used = [clip for clip in clips if clip.split == "train"]
     if not used:
         raise no_clip_error(folder)
     model = load_model()
@@ -124,7 +124,7 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
         parameters,
         f"{_SOURCE}; the rest learned from clips under: {licenses}",
         learnt_from=[clip.name for clip in used],
-        chosen_with=[clip.name for clip in clips if clip.part == "choice"],
+        chosen_with=[clip.name for clip in clips if clip.split == "choice"],
     )
     write_text(output, text)
 

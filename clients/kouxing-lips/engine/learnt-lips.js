@@ -90,7 +90,7 @@ export class LearntLips {
 
   /** Return the FAPs of the next lip frame, stabilized and with closures. */
   #stabilize(frame) {
-    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_SHARE, TEETH_LOG_ODDS } = this.#model.constants.learnt;
+    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_FRACTION, TEETH_LOG_ODDS } = this.#model.constants.learnt;
     const { closures } = this.#model.constants;
     const rule = this.#model.closureRule;
     if (frame.timeS - this.#track.endS <= MAX_GAP_S) {
@@ -112,7 +112,7 @@ export class LearntLips {
     moveToRest(faps, shareOf(teeth), closures.LOWER, closures.LOWER_OUTER);
     let share = shareOf(closure);
     const [before, newest] = this.#shares;
-    if (before < CLOSED_SHARE && CLOSED_SHARE <= newest) share = Math.max(share, newest);
+    if (before < CLOSED_FRACTION && CLOSED_FRACTION <= newest) share = Math.max(share, newest);
     this.#shares = [newest, share];
     moveToRest(faps, share, closures.INNER, closures.OUTER);
     return faps;

@@ -26,7 +26,7 @@ export class VoiceTraits {
 
   /** Take the next position's state and probabilities of the kinds of voice. */
   accept(state, voice) {
-    const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_SHARE } = this.#c;
+    const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_FRACTION } = this.#c;
     const { values, shape: [, numOutputs] } = this.#weights;
     const outputs = new Float64Array(this.#bias);
     for (let i = 0, at = 0; i < state.length; i++) {
@@ -39,7 +39,7 @@ export class VoiceTraits {
       this.#mean = towards(this.#mean, 1 / Math.min(this.#numVoiced + PRIOR_POSITIONS, MAX_POSITIONS));
       this.#feeling = towards(this.#feeling, 1 / Math.min(this.#numVoiced + PRIOR_FEELING, MEAN_POSITIONS));
     }
-    this.#evidence = this.#evidence.map((value, i) => value + EVIDENCE_SHARE * (outputs[2 + i] - value));
+    this.#evidence = this.#evidence.map((value, i) => value + EVIDENCE_FRACTION * (outputs[2 + i] - value));
     const [arousal, valence] = this.#feeling.map((value, i) => this.#rounded(clamp(value - this.#mean[i], -1, 1)));
     const isLaugh = voice[this.#voices.LAUGHTER] > this.#c.MIN_LAUGHTER;
     this.#sinceLaugh = isLaugh ? 0 : this.#sinceLaugh + 1;

@@ -203,8 +203,8 @@ def _rotation(node: str, faps: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def _attachment(head: Head, part: HeadPart) -> str:
     """Return what a part is attached to: "head", "body", or "both" (the neck)."""
-    share = np.round(head.head_weight[part.vertices] * 255)
-    return "head" if share.min() == 255 else "body" if share.max() == 0 else "both"
+    weight = np.round(head.head_weight[part.vertices] * 255)
+    return "head" if weight.min() == 255 else "body" if weight.max() == 0 else "both"
 
 
 def _parent(name: str, children: list[int]) -> dict[str, Any]:
@@ -237,10 +237,10 @@ def _part_node(
         ),
     }
     if _attachment(head, part) == "both":
-        share = np.round(head.head_weight[part.vertices] * 255).astype(np.uint8)
+        turning = np.round(head.head_weight[part.vertices] * 255).astype(np.uint8)
         joints, weights = np.zeros((2, len(vertices), 4), np.uint8)
-        joints[:, 1] = share > 0  # an unused joint must be 0
-        weights[:, 0], weights[:, 1] = 255 - share, share
+        joints[:, 1] = turning > 0  # an unused joint must be 0
+        weights[:, 0], weights[:, 1] = 255 - turning, turning
         attributes["JOINTS_0"] = document.accessor(joints, "VEC4")
         attributes["WEIGHTS_0"] = document.accessor(weights, "VEC4", normalized=True)
         node["skin"] = 0

@@ -59,13 +59,13 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
     if length > len(data):
         raise BadGlbError(f"it is cut off after {len(data)} of {length} bytes; copy it again")
     chunks: dict[bytes, bytes] = {}
-    at = 12
-    while at + 8 <= length:
-        size, kind = struct.unpack_from("<I4s", data, at)
-        if at + 8 + size > length:
+    offset = 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", data, offset)
+        if offset + 8 + size > length:
             raise ValueError("a chunk is cut off")
-        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 8 + size
+        chunks.setdefault(kind, data[offset + 8 : offset + 8 + size])
+        offset += 8 + size
     return chunks
 
 

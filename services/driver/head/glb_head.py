@@ -43,7 +43,7 @@ from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
 
 EYE_DISTANCE_M = 0.055  # heads are scaled to this
-FAPU_SHARES = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
+RELATIVE_FAPU = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
 # offsets from the middle between the eyes, in eye distances
 PIVOT = np.array([0.0, -0.66, -1.42])
 MOUTH = np.array([0.0, -1.2, 0.25])
@@ -129,7 +129,7 @@ def _turn_jaw(piece: Primitive, arm: Float64, known: Names) -> None:
     opening = {name: row[_JAW] / _OPEN_JAW for name, row in known.items() if row[_JAW] > 0}
     if not opening.keys() & piece.shapes.keys():
         shift = _JAW_RAD * np.cross([1, 0, 0], arm)
-        piece.shapes |= {name: share * shift for name, share in opening.items()}
+        piece.shapes |= {name: weight * shift for name, weight in opening.items()}
 
 
 # --- the head -------------------------------------------------------------------------------------
@@ -177,14 +177,14 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
 
 def standard_fapu() -> dict[str, float]:
     """Return the FAPUs of an average face, m and rad."""
-    lengths = {name: share * EYE_DISTANCE_M for name, share in FAPU_SHARES.items()}
+    lengths = {name: relative * EYE_DISTANCE_M for name, relative in RELATIVE_FAPU.items()}
     return lengths | {"AU": RADIANS_PER_ANGLE_UNIT}
 
 
 def fade(height: Float64) -> Float64:
-    """Return the share (V,) of the head rotation by height above the eyes, in eye distances."""
-    share = np.clip((height - _FADE[1]) / (_FADE[0] - _FADE[1]), 0, 1)
-    faded: Float64 = share**2 * (3 - 2 * share)
+    """Return the fraction (V,) of the head rotation by height above the eyes, in eye distances."""
+    x = np.clip((height - _FADE[1]) / (_FADE[0] - _FADE[1]), 0, 1)
+    faded: Float64 = x**2 * (3 - 2 * x)
     return faded
 
 
@@ -276,17 +276,17 @@ def _pivot(glb: Glb, turn: Float64, middle: Float64, unit: float) -> Float64:
     """Return the position of the joint that the head rotates about."""
     bones = find_bones(glb)
     for number, matrix in glb.nodes():
-        at = turn @ matrix[:3, 3]
+        position = turn @ matrix[:3, 3]
         is_joint = bones.get(number) == "head" and "mesh" not in glb.item("nodes", number)
-        if is_joint and np.linalg.norm(at - middle) < 4 * unit:
-            return at
+        if is_joint and np.linalg.norm(position - middle) < 4 * unit:
+            return position
     return middle + PIVOT * unit
 
 
 def _head_weight(pieces: list[Primitive], height: Float64) -> Float64:
-    """Return the share (V,) of the head rotation; heights above the eyes are in eye distances."""
-    shares = [piece.head_weight for piece in pieces if piece.head_weight is not None]
-    return np.concatenate(shares) if len(shares) == len(pieces) else fade(height)
+    """Return the fraction (V,) of the head rotation; heights above the eyes in eye distances."""
+    weights = [piece.head_weight for piece in pieces if piece.head_weight is not None]
+    return np.concatenate(weights) if len(weights) == len(pieces) else fade(height)
 
 
 def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:

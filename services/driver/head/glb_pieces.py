@@ -31,7 +31,7 @@ def read_pieces(glb: Glb) -> list[Primitive]:
     """Return the triangles of the scene with everything that moves them."""
     nodes = glb.nodes()
     matrices = dict(nodes)
-    turn_shares = _turn_shares(glb, matrices)
+    turn_fractions = _turn_fractions(glb, matrices)
     expressions = _expressions(glb)
     pieces: list[Primitive] = []
     num_vertices = num_triangles = num_shifts = 0
@@ -55,9 +55,9 @@ def read_pieces(glb: Glb) -> list[Primitive]:
             ):
                 if count_so_far > limit:
                     raise BadGlbError(f"it has more than {limit} {what}")
-            piece = _piece(glb, node, mesh, primitive, matrices, matrix, turn_shares, binds)
-            if piece.head_weight is None and turn_shares:
-                piece.head_weight = np.full(len(piece.vertices), turn_shares.get(number, 0.0))
+            piece = _piece(glb, node, mesh, primitive, matrices, matrix, turn_fractions, binds)
+            if piece.head_weight is None and turn_fractions:
+                piece.head_weight = np.full(len(piece.vertices), turn_fractions.get(number, 0.0))
             pieces.append(piece)
             num_triangles += len(piece.triangles)
     if not any(len(piece.triangles) for piece in pieces):
@@ -86,17 +86,17 @@ def _check_textures(pieces: list[Primitive]) -> None:
         piece.texture = known[piece.texture]
 
 
-def _turn_shares(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
+def _turn_fractions(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
     """Return each node's fraction of the head rotation: 1 below a node "head", less on the neck."""
-    share: dict[int, float] = {}
+    fraction: dict[int, float] = {}
     bones = find_bones(glb)
     for number in nodes:  # parents come first
         bone = bones.get(number)
         if bone in ("head", "neck"):
-            share[number] = 1.0 if bone == "head" else max(0.4, share.get(number, 0.0))
+            fraction[number] = 1.0 if bone == "head" else max(0.4, fraction.get(number, 0.0))
         for child in glb.item("nodes", number).get("children", []):
-            share[int(child)] = share.get(number, 0.0)
-    return share if any(value == 1.0 for value in share.values()) else {}
+            fraction[int(child)] = fraction.get(number, 0.0)
+    return fraction if any(value == 1.0 for value in fraction.values()) else {}
 
 
 def find_bones(glb: Glb) -> dict[int, str]:
@@ -153,7 +153,7 @@ def _piece(
     primitive: dict[str, Any],
     matrices: dict[int, Float64],
     matrix: Float64,
-    turn_shares: dict[int, float],
+    turn_fractions: dict[int, float],
     binds: Binds,
 ) -> Primitive:
     material = glb.item("materials", primitive["material"]) if "material" in primitive else {}
@@ -184,8 +184,8 @@ def _piece(
     shapes, rest = _shapes(glb, node, mesh, primitive, placed[:, :3, :3], binds)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
     weight = jaw_arm = None
-    if skin and turn_shares:
-        weight, jaw_arm = skin.mean(turn_shares), skin.jaw_arm(vertices)
+    if skin and turn_fractions:
+        weight, jaw_arm = skin.mean(turn_fractions), skin.jaw_arm(vertices)
         if _uses_eye_bones(glb):
             shapes = skin.eye_look_shapes(vertices) | shapes
     for values in (vertices, uv, colors, *shapes.values()):
@@ -324,10 +324,10 @@ class _Skin:
         for node in self._nodes:  # parents come first
             if node in below:
                 below |= set(self._glb.item("nodes", node).get("children", []))
-        share = self.mean(dict.fromkeys(below, 1.0))[:, None]
-        if not share.any():
+        weight = self.mean(dict.fromkeys(below, 1.0))[:, None]
+        if not weight.any():
             return None
-        arm: Float64 = share * (vertices - self._nodes[jaw][:3, 3])
+        arm: Float64 = weight * (vertices - self._nodes[jaw][:3, 3])
         return arm
 
     def eye_look_shapes(self, vertices: Float64) -> dict[str, Float64]:
@@ -338,10 +338,10 @@ class _Skin:
         shapes = {}
         for side, outward in (("Left", 1.0), ("Right", -1.0)):
             eyes = [joint for joint in self._joints if bones.get(joint) == f"{side.lower()}Eye"]
-            share = self.mean(dict.fromkeys(eyes, 1.0))[:, None]
-            if not share.any():
+            weight = self.mean(dict.fromkeys(eyes, 1.0))[:, None]
+            if not weight.any():
                 continue
-            arm = share * (vertices - self._nodes[eyes[0]][:3, 3])
+            arm = weight * (vertices - self._nodes[eyes[0]][:3, 3])
             shapes[f"eyeLookOut{side}"] = outward * out * np.cross([0, 1, 0], arm)
             shapes[f"eyeLookDown{side}"] = (-down if is_old else down) * np.cross([1, 0, 0], arm)
         return shapes

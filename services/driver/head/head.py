@@ -162,9 +162,9 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
     # coarse vertices come first in each part, so the coarse head is a selection of rows
     first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
     ends = after_coarse if coarse else after
-    kept = np.concatenate([np.arange(a, b) for a, b in zip(first, ends, strict=True)])
+    used = np.concatenate([np.arange(a, b) for a, b in zip(first, ends, strict=True)])
     new_index = np.full(int(after[-1]), -1, dtype=np.int64)
-    new_index[kept] = np.arange(len(kept))
+    new_index[used] = np.arange(len(used))
 
     parts, triangles, coarse_triangles = [], [], []
     num_triangles = 0
@@ -194,9 +194,9 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         num_triangles += len(part_triangles)
 
     faces = np.concatenate(triangles)
-    vertices = arrays["vertices"].astype(np.float32)[kept]
-    basis = _basis(arrays, new_index, len(kept))
-    welds = new_index[arrays["welds"].astype(np.int64)[kept]] if "welds" in arrays else None
+    vertices = arrays["vertices"].astype(np.float32)[used]
+    basis = _basis(arrays, new_index, len(used))
+    welds = new_index[arrays["welds"].astype(np.int64)[used]] if "welds" in arrays else None
     shading = Shading.of(vertices, faces, basis, welds)
     return Head(
         name=name,
@@ -205,9 +205,9 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         shading=shading,
         triangles=faces,
         coarse_triangles=tuple(coarse_triangles),
-        uv=arrays["uv"].astype(np.float32)[kept] / np.float32(65535),
-        colors=(arrays["colors"].astype(np.float32)[kept] / np.float32(255)) ** 2,
-        head_weight=arrays["head_weight"].astype(np.float32)[kept] / np.float32(255),
+        uv=arrays["uv"].astype(np.float32)[used] / np.float32(65535),
+        colors=(arrays["colors"].astype(np.float32)[used] / np.float32(255)) ** 2,
+        head_weight=arrays["head_weight"].astype(np.float32)[used] / np.float32(255),
         basis=basis,
         fapu=_by_name(arrays["fapu_names"], arrays["fapu"].astype(float)),
         feature_points=_by_name(
@@ -264,10 +264,10 @@ def _basis(
     unit = np.repeat(arrays["field_units"].astype(np.float64), np.diff(bounds))
     vertex = new_index[arrays["field_vertices"].astype(np.int64)]
     shift = arrays["field_shifts"].astype(np.float64) / unit[:, None]
-    kept = vertex >= 0
-    rows = (3 * vertex[kept, None] + np.arange(3)).ravel()
+    is_kept = vertex >= 0
+    rows = (3 * vertex[is_kept, None] + np.arange(3)).ravel()
     basis = sparse.csr_array(
-        (shift[kept].ravel().astype(np.float32), (rows, np.repeat(column[kept], 3))),
+        (shift[is_kept].ravel().astype(np.float32), (rows, np.repeat(column[is_kept], 3))),
         (3 * num_vertices, NUM_FAPS),
     )
     if not np.isfinite(basis.data).all():

@@ -166,12 +166,12 @@ class SkinFields:
         moving = np.flatnonzero((below | lower | floor) & ~away & ~upper)
         weight = self._geodesics.zone(moving, np.flatnonzero((upper | roof | away) & ~lower))
         lever = self._jaw_share(z)
-        for fap, share, taken_out in (
+        for fap, motion, taken_out in (
             (3, weight * lever, self._lip_y),
             (14, weight, self._lip_z),
             (15, weight * lever, self._lip_x),
         ):
-            left = share / share[self._points["2.1"]]
+            left = motion / motion[self._points["2.1"]]
             for name, field in taken_out.items():
                 left = left - left[self._points[name]] * field
             self._add(fap, left)

@@ -179,7 +179,7 @@ class _Import:
         self._welded = np.zeros((count, 3))
         self._welded[self._weld_of] = self._vertices
         triangles = np.concatenate(
-            [p.triangles + at for p, at in zip(self._pieces, first, strict=False)]
+            [p.triangles + offset for p, offset in zip(self._pieces, first, strict=False)]
         )
         triangles = self._weld_of[triangles]
         a, b, c = triangles.T
@@ -313,9 +313,9 @@ class _Import:
                     fields.setdefault(fap, np.zeros_like(self._welded))[rows] = field
             else:
                 distance, nearest = tree.query(self._welded[rows])
-                share = np.clip(1 - distance / (0.25 * fapu["ES"]), 0, 1)[:, None]
+                weight = np.clip(1 - distance / (0.25 * fapu["ES"]), 0, 1)[:, None]
                 for fap, field in face.fields.items():
-                    fields[fap][rows] = share * field[nearest]
+                    fields[fap][rows] = weight * field[nearest]
         if (roles == 0).all():
             self._warnings.append("no eyeballs separate from the skin: the eyes do not rotate")
         return {fap: field[self._weld_of] for fap, field in fields.items()}, roles[self._weld_of]
@@ -335,23 +335,23 @@ class _Import:
         for piece in self._pieces:
             piece_roles = roles[first : first + len(piece.vertices)]
             for role, name in ((0, piece.name), (1, "eye_left"), (2, "eye_right")):
-                kept = np.flatnonzero(piece_roles == role)
+                used = np.flatnonzero(piece_roles == role)
                 shown = (piece_roles[piece.triangles] == role).all(axis=1)
                 if not shown.any():
                     continue
                 number = np.full(len(piece_roles), -1)
-                number[kept] = np.arange(len(kept))
+                number[used] = np.arange(len(used))
                 pieces.append(
                     replace(
                         piece,
                         name=name,
-                        vertices=piece.vertices[kept],
+                        vertices=piece.vertices[used],
                         triangles=number[piece.triangles[shown]],
-                        uv=piece.uv[kept],
-                        colors=piece.colors[kept],
+                        uv=piece.uv[used],
+                        colors=piece.colors[used],
                     )
                 )
-                rows.append(kept + first)
+                rows.append(used + first)
             first += len(piece_roles)
         return pieces, rows
 

@@ -60,20 +60,20 @@ def _decode_attributes(data: Bytes, end: int, tail: int, out: Bytes) -> bool:
         return False
     last = data[tail : tail + stride].copy()  # the element before the first one
     rows_per_block = min((8192 // stride) & ~15, 256)
-    at = 1
+    offset = 1
     for first in range(0, count, rows_per_block):
         num_rows = min(rows_per_block, count - first)
         num_groups = (num_rows + 15) // 16
         for column in range(stride):
-            header = at
-            at += (num_groups + 3) // 4
+            header = offset
+            offset += (num_groups + 3) // 4
             value = last[column]
             for group in range(num_groups):
-                if at > end:
+                if offset > end:
                     return False
                 bits = (0, 2, 4, 8)[(data[header + group // 4] >> (group % 4 * 2)) & 3]
-                packed = at
-                at += 2 * bits
+                packed = offset
+                offset += 2 * bits
                 escape = (1 << bits) - 1
                 for k in range(16):
                     delta = 0
@@ -82,41 +82,41 @@ def _decode_attributes(data: Bytes, end: int, tail: int, out: Bytes) -> bool:
                         shift = 8 - bits - position % 8
                         delta = (int(data[packed + position // 8]) >> shift) & escape
                         if bits < 8 and delta == escape:
-                            delta = int(data[at])
-                            at += 1
+                            delta = int(data[offset])
+                            offset += 1
                     row = group * 16 + k
                     if row < num_rows:
                         value = np.uint8(value + (delta >> 1 ^ -(delta & 1)))
                         out[first + row, column] = value
             last[column] = value
-    return at <= end
+    return offset <= end
 
 
 @numba.njit(cache=True)
-def _decode_varint(data: Bytes, at: int) -> tuple[np.int64, int]:
+def _decode_varint(data: Bytes, offset: int) -> tuple[np.int64, int]:
     """Return a number in LEB128 and the offset after it."""
     value, shift = np.int64(0), 0
     while True:
-        byte = np.int64(data[at])
-        at += 1
+        byte = np.int64(data[offset])
+        offset += 1
         value |= (byte & 127) << shift
         shift += 7
         if byte < 128 or shift > 28:
-            return value, at
+            return value, offset
 
 
 @numba.njit(cache=True)
 def _decode_indices(data: Bytes, end: int, out: NDArray[np.uint32]) -> bool:
-    at = 1
+    offset = 1
     last = np.zeros(2, np.int64)
     for i in range(len(out)):
-        if at >= end:
+        if offset >= end:
             return False
-        value, at = _decode_varint(data, at)
+        value, offset = _decode_varint(data, offset)
         delta = value >> 1
         last[value & 1] += delta >> 1 ^ -(delta & 1)
         out[i] = last[value & 1] & 0xFFFFFFFF
-    return at <= end
+    return offset <= end
 
 
 @numba.njit(cache=True)

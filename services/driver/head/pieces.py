@@ -110,7 +110,7 @@ def pack(
     vertices = np.concatenate([piece.vertices for piece in pieces]).astype(np.float32)
     uv = np.concatenate([piece.uv for piece in pieces]).astype(np.float32)
     colors = np.clip(np.concatenate([piece.colors for piece in pieces]), 0, 1)
-    triangles = [piece.triangles + at for piece, at in zip(pieces, first, strict=False)]
+    triangles = [piece.triangles + offset for piece, offset in zip(pieces, first, strict=False)]
     return {
         "format": np.array(FORMAT),
         "vertices": vertices,

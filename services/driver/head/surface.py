@@ -48,11 +48,11 @@ class Geodesics:
         """
         to_moving, to_fixed = self.distance(moving), self.distance(fixed)
         reached = np.isfinite(to_moving)
-        share = np.where(np.isfinite(to_fixed), 1.0, 0.0)
-        both = reached & (share > 0)
-        share = np.where(reached, 1.0, 0.0)
-        share[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
-        weight: Float = 0.5 - 0.5 * np.cos(np.pi * share)
+        fraction = np.where(np.isfinite(to_fixed), 1.0, 0.0)
+        both = reached & (fraction > 0)
+        fraction = np.where(reached, 1.0, 0.0)
+        fraction[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
+        weight: Float = 0.5 - 0.5 * np.cos(np.pi * fraction)
         return weight
 
 

@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kouxing.services.driver.render.renderer import Float32, Renderer, UInt8
 
-_CAPTION_SHARE = 1 / 20  # height of the letters, as a fraction of the picture
+_CAPTION_FRACTION = 1 / 20  # height of the letters, as a fraction of the picture
 
 
 class SideBySide:
@@ -36,8 +36,8 @@ def _draw_captions(captions: Sequence[str], width_px: int, height_px: int) -> Im
     """Return the coverage of each pixel by the captions, centered below the faces."""
     mask = Image.new("L", (width_px * len(captions), height_px))
     pen = ImageDraw.Draw(mask)
-    font = ImageFont.load_default(max(height_px * _CAPTION_SHARE, 8))
+    font = ImageFont.load_default(max(height_px * _CAPTION_FRACTION, 8))
     for number, caption in enumerate(captions):
-        middle = ((number + 0.5) * width_px, height_px * (1 - _CAPTION_SHARE))
+        middle = ((number + 0.5) * width_px, height_px * (1 - _CAPTION_FRACTION))
         pen.text(middle, caption, fill=255, font=font, anchor="ms")
     return mask

@@ -55,13 +55,13 @@ def render_video(
     frame_rate_hz: float,
     samples: NDArray[np.float32] | None,
     captions: Captions | None = None,
-    on_progress: Callable[[float], None] = lambda _share: None,
+    on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> int:
     """Write a video or one picture per image; return the number of images.
 
     The last of the ``frames``, at least one, is held until the sound (n,), 16 kHz mono, ends.
     ``captions`` are drawn below the images.
-    ``on_progress`` is called with the finished share, 0 to 1.
+    ``on_progress`` is called with the finished fraction, 0 to 1.
 
     Raises ``UserError`` if the file cannot be written.
     """

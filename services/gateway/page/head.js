@@ -18,7 +18,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
 const DRAWN_AFTER_HAIR = ["brows", "lashes"]; // the hair may be behind them
-const OVERLAY_SHARE = 0.6; // fraction of the overlay that the head avoids
+const OVERLAY_FRACTION = 0.6; // fraction of the overlay that the head avoids
 const HEAD_HALF_WIDTH = 0.3; // relative to the window's height
 const PORTRAIT_ASPECT = 0.66; // in narrower windows the camera moves back, so that the face fits
 
@@ -223,7 +223,7 @@ export class Head {
     const isBelow = left <= 0 && panelHeight > 0;
     const beside = left > 0 ? width - left : 0; // the panel is at the right
     const moved = Math.min(beside / 2, Math.max(0, beside + HEAD_HALF_WIDTH * height - width / 2));
-    const covered = isBelow ? panelHeight : controls.offsetHeight * OVERLAY_SHARE;
+    const covered = isBelow ? panelHeight : controls.offsetHeight * OVERLAY_FRACTION;
     const free = Math.max(0.5 * height, height - covered);
     const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
     const widened = half * Math.max(height / free, PORTRAIT_ASPECT * (height / width));

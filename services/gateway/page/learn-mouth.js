@@ -12,7 +12,7 @@ import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
 const GOOD_RATE_HZ = 10; // rate of the images; below it, the reading is longer
-const SLOW_SHARE = 1.5; // multiple of the usual time
+const SLOW_FACTOR = 1.5; // multiple of the usual time
 const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the tracker is loaded
 const SLOW_START_MS = 2500; // a longer start is reported
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
@@ -210,7 +210,7 @@ export class MouthLesson {
       return;
     }
     const readingMs = nowMs - startMs - CLOSED_LIPS_MS;
-    const wholeMs = 1000 * this.readingS * (this.#isSlow ? SLOW_SHARE : 1);
+    const wholeMs = 1000 * this.readingS * (this.#isSlow ? SLOW_FACTOR : 1);
     const leftS = Math.ceil((readingMs < 0 ? -readingMs : wholeMs - readingMs) / 1000);
     element("lesson-count").textContent = leftS;
     element("lesson-time").value = Math.max(0, readingMs / wholeMs);

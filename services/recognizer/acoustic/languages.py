@@ -53,8 +53,8 @@ def _load(acoustic: str) -> AcousticModel:
 def restrict_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticModel:
     """Return a model that recognizes only some of its phones. Both share the network."""
     language_model = model.topology.phone_lm
-    kept = np.array([phone in phones for phone in model.inventory.phones])
-    log_prob = np.where(kept[language_model.phone], language_model.log_prob, _EXCLUDED)
+    is_spoken = np.array([phone in phones for phone in model.inventory.phones])
+    log_prob = np.where(is_spoken[language_model.phone], language_model.log_prob, _EXCLUDED)
     if isinstance(model, BlockModel):
         model.session  # noqa: B018 - opens the network before the copy
     limited = copy.copy(model)

@@ -182,13 +182,13 @@ def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
     children = archive.array("lm_children", None).astype(np.int64)
     if children.ndim != 1 or not 1 + num_phones <= len(children) <= _MAX_NODES:
         raise ValueError(f"lm_children has shape {children.shape}")
-    at = np.arange(len(children))
+    node = np.arange(len(children))
     first_child = 1 + np.cumsum(children) - children
     if (
         children.min() < 0
         or children[0] != num_phones
         or children.sum() != len(children) - 1
-        or (first_child <= at)[children > 0].any()
+        or (first_child <= node)[children > 0].any()
     ):
         raise ValueError("its phone language model does not form a tree")
     phone = archive.array("lm_phone", children.shape).astype(np.int64)

@@ -262,8 +262,8 @@ def _warp(
         # From the top down, because a band is computed from the old values at or below it.
         for k in range(num_bands - 1, -1, -1):
             mel = MELS * math.log1p(centers_hz[k] / factor / MEL_KNEE_HZ)
-            at = max((mel - _LOWEST_MEL) / _STEP_MEL - 1.0, 0.0)
-            below = min(int(at), num_bands - 2)
-            share = np.float32(at - below)
+            position = max((mel - _LOWEST_MEL) / _STEP_MEL - 1.0, 0.0)
+            below = min(int(position), num_bands - 2)
+            fraction = np.float32(position - below)
             band = frames[row, 1 + below : 3 + below]
-            frames[row, 1 + k] = (np.float32(1.0) - share) * band[0] + share * band[1]
+            frames[row, 1 + k] = (np.float32(1.0) - fraction) * band[0] + fraction * band[1]

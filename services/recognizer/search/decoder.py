@@ -488,7 +488,7 @@ def _normalize_scores(
     context, top, score, link = tokens
     best = score[best_token, best_state]
     best_phone = graph.last_phone[context[best_token]]
-    share, total = 0.0, 0.0
+    agreeing, total = 0.0, 0.0
     for token in range(num_tokens):
         before = NO_RECORD
         for state in range(score.shape[1]):
@@ -502,5 +502,5 @@ def _normalize_scores(
             if graph.last_phone[context[token]] == best_phone or (
                 before != NO_RECORD and records[before, 1] == best_phone
             ):
-                share += np.exp(top[token])
-    return share / total
+                agreeing += np.exp(top[token])
+    return agreeing / total

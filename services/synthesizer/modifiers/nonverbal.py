@@ -26,7 +26,7 @@ from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
-_BREATH_OPENING = 0.3  # share of an open vowel's opening
+_BREATH_OPENING = 0.3  # fraction of an open vowel's opening
 _LAUGH_OPENING = (0.12, 0.58)  # the same, in silence and added by the loudest notes
 _LAUGH_DEG, _BREATH_DEG = (-2.5, -2.0), -1.2  # the head's pitch; upwards
 _LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
@@ -38,9 +38,9 @@ _OPEN_VOWEL = VISEMES[VISEME_NAMES.index("A:")]
 _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
 
 
-def _opened(share: float, pitch_deg: float) -> NDArray[np.float32]:
+def _opened(amount: float, pitch_deg: float) -> NDArray[np.float32]:
     """Return FAPs (68,) of an open mouth and a lifted head."""
-    faps: NDArray[np.float32] = np.float32(share) * _OPEN_VOWEL
+    faps: NDArray[np.float32] = np.float32(amount) * _OPEN_VOWEL
     faps[_HEAD_PITCH] = pitch_deg * _DEGREE
     return faps
 

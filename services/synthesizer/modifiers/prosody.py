@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.shared.face.smoothing import smoothing_share
+from kouxing.shared.face.smoothing import smoothing_gain
 
 _LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filters
 _LEVEL_S = 0.03  # time constant of the level
@@ -89,8 +89,8 @@ class ProsodyTracker:
         above_st = pitch_st - self._mean_st
         spread_st = max(self._spread_st, _MIN_SPREAD_ST)
         self._now.raised = min(max(above_st / spread_st, -1.0), 1.0)
-        self._mean_st += above_st * smoothing_share(elapsed_s, _MEAN_S)
-        self._spread_st += (abs(above_st) - self._spread_st) * smoothing_share(elapsed_s, _MEAN_S)
+        self._mean_st += above_st * smoothing_gain(elapsed_s, _MEAN_S)
+        self._spread_st += (abs(above_st) - self._spread_st) * smoothing_gain(elapsed_s, _MEAN_S)
         self._recent.append((time_s, pitch_st))
         while self._recent[0][0] < time_s - _RISE_S:
             self._recent.popleft()
@@ -99,15 +99,15 @@ class ProsodyTracker:
         now = self._now
         elapsed_s = min(max(time_s - self._level_s, 0.0), 1.0)
         self._level_s = time_s
-        self._level_db += (level_db - self._level_db) * smoothing_share(elapsed_s, _LEVEL_S)
+        self._level_db += (level_db - self._level_db) * smoothing_gain(elapsed_s, _LEVEL_S)
         above_db = self._level_db - self._mean_db
         if above_db < -_PAUSE_DB:
             now.stress = 0.0
             return
         now.silence_s = 0.0
         now.phrase_s += elapsed_s
-        self._mean_db += above_db * smoothing_share(elapsed_s, _MEAN_S)
-        self._spread_db += (abs(above_db) - self._spread_db) * smoothing_share(elapsed_s, _MEAN_S)
+        self._mean_db += above_db * smoothing_gain(elapsed_s, _MEAN_S)
+        self._spread_db += (abs(above_db) - self._spread_db) * smoothing_gain(elapsed_s, _MEAN_S)
         prominence = above_db / max(self._spread_db, _MIN_SPREAD_DB) + now.raised
         now.stress = prominence if prominence > _STRESS else 0.0
 

@@ -79,7 +79,7 @@ _TONED_WORDS = (
     rf"(?!{_LETTER}|\d)[)）]?"
 )
 _ANNOTATION = re.compile(f"{WORDS_IN_BOPOMOFO.pattern}|{_TONED_WORDS}")
-_MIN_ALIKE = 0.7  # share of equal syllables: characters may have several readings
+_MIN_ALIKE = 0.7  # fraction of equal syllables: characters may have several readings
 _MAX_WORD_LETTERS = 500
 _MAX_LETTERS = 10  # limit for a syllable with its tone, decomposed
 _LATIN = "A-Za-z\u00c0-\u04ff"
@@ -176,9 +176,12 @@ def write(spelling: str) -> str:
     mark = next((mark for mark, number in _TONES.items() if str(number) == tone), None)
     if mark is None:
         return letters
-    vowels = [at for at, letter in enumerate(letters) if letter in "aeêiouü"]
-    marked = [at for at in vowels if letters[at] in "aeê" or letters[at:].startswith("ou")]
-    nasals = [at for at, letter in enumerate(letters) if letter in "mn"]  # without vowel: hm, ng
+    vowels = [index for index, letter in enumerate(letters) if letter in "aeêiouü"]
+    marked = [
+        index for index in vowels if letters[index] in "aeê" or letters[index:].startswith("ou")
+    ]
+    # syllables without a vowel: hm, ng
+    nasals = [index for index, letter in enumerate(letters) if letter in "mn"]
     place = (marked or vowels[-1:] or nasals)[0]
     return unicodedata.normalize("NFC", letters[: place + 1] + mark + letters[place + 1 :])
 

@@ -193,8 +193,8 @@ def _placed_visemes(
 ) -> list[_PlacedViseme]:
     """Place the visemes of a phone that lasts until ``end_s``."""
     placed, start_s = [], phone.onset_s
-    for viseme, share in visemes_of(phone.symbol, next_symbol, inventory):
-        length_s = share * (end_s - phone.onset_s)
+    for viseme, fraction in visemes_of(phone.symbol, next_symbol, inventory):
+        length_s = fraction * (end_s - phone.onset_s)
         edge_s = min(0.5 * length_s, EDGE_S)
         placed.append(
             (VISEME_INDEX[viseme], start_s + edge_s, start_s + length_s - edge_s, phone.index)

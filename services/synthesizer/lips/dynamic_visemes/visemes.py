@@ -14,7 +14,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.derived import (
     derived_visemes,
 )
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory, VisemeShares
+from kouxing.shared.phones.inventory import PhoneInventory, VisemeFractions
 from kouxing.shared.tables import read_table
 
 REST = "rest"
@@ -33,7 +33,7 @@ CLOSURE_FAPS = {"b": LIP_HEIGHT_FAPS, "f": LOWER_LIP_FAPS}
 ROUNDED_VISEMES = frozenset({"u", "v", "w", "oe"})
 
 
-def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) -> VisemeShares:
+def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) -> VisemeFractions:
     """Return the visemes of a phone in order, each with its fraction of the phone's duration.
 
     ``next_phone`` is the phone that follows without a pause, if known. Some phones have another
@@ -54,7 +54,7 @@ def check_visemes(inventory: PhoneInventory) -> None:
 
     Raises ``UserError`` if a viseme is unknown.
     """
-    named = {viseme for shares in inventory.visemes.values() for viseme, _ in shares}
+    named = {viseme for visemes in inventory.visemes.values() for viseme, _ in visemes}
     unknown = sorted({*named, *inventory.before_rounded.values()} - VISEME_INDEX.keys())
     if unknown:
         raise UserError(

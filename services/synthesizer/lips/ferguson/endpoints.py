@@ -34,9 +34,9 @@ SLICE_S = 0.02
 
 # Chosen on recordings of the training split, by boundaries found within 50 ms; no value is
 # critical.
-HIGH_SHARE = 0.4  # high threshold, relative to the range of recent levels
+HIGH_FRACTION = 0.4  # high threshold, relative to the range of recent levels
 MIN_HIGH_DB = 4.0  # more than the variation of steady noise
-LOW_SHARE = 0.5  # low threshold, relative to the high threshold
+LOW_FRACTION = 0.5  # low threshold, relative to the high threshold
 HIGH_ZERO_CROSSINGS, LOW_ZERO_CROSSINGS = 0.3, 0.1
 HANGOVER_S = 0.06
 DIP_DB = 3.0  # fall and rise that separate two segments
@@ -115,8 +115,8 @@ class SyllableSegmenter:
         """Return the low and the high threshold of the level, dB of full scale."""
         self._levels_db.append(max(level_db, _MIN_LEVEL_DB))
         floor_db = min(self._levels_db)
-        high_db = max(HIGH_SHARE * (max(self._levels_db) - floor_db), MIN_HIGH_DB)
-        return floor_db + LOW_SHARE * high_db, floor_db + high_db
+        high_db = max(HIGH_FRACTION * (max(self._levels_db) - floor_db), MIN_HIGH_DB)
+        return floor_db + LOW_FRACTION * high_db, floor_db + high_db
 
     def _start(self, low_db: float) -> None:
         """Start where the level passed the low threshold, at most ``_ONSET_S`` ago."""

@@ -72,11 +72,11 @@ def parse_table(text: str, inventory: PhoneInventory) -> PhoneTable:
         )
     except (KeyError, ValueError, TypeError) as error:
         raise UserError(f"the table of the lip model ferguson is damaged: {error}") from None
-    shares = (*table.crossings.values(), *table.influence.values())
+    fractions = (*table.crossings.values(), *table.influence.values())
     is_valid = (
         all(0.0 <= opening <= MAX_OPENING for opening in table.opening.values())
         and all(0.0 < duration_s < 10.0 for duration_s in table.duration_s.values())
-        and all(0.0 <= share <= 1.0 for share in shares)
+        and all(0.0 <= fraction <= 1.0 for fraction in fractions)
     )
     if not is_valid:
         raise UserError("the table of the lip model ferguson is damaged: a value is out of range")

@@ -122,8 +122,8 @@ def syllable_times(
     for group in _cheapest_assignment(segments, text, OnsetCrossings(slices)):
         start_s, end_s = segments[group.first_segment].start_s, segments[group.last_segment].end_s
         duration_s = text.duration_s[group.syllables]
-        share = np.concatenate([[0.0], np.cumsum(duration_s) / duration_s.sum()])
-        edges_s = start_s + (end_s - start_s) * share
+        fraction = np.concatenate([[0.0], np.cumsum(duration_s) / duration_s.sum()])
+        edges_s = start_s + (end_s - start_s) * fraction
         times_s[group.syllables] = np.stack([edges_s[:-1], edges_s[1:]], axis=1)
     return times_s
 

@@ -84,7 +84,7 @@ class ClosingPhones:
         self._silence = inventory.silence
         self._vowels = inventory.vowels
         self._symbols = {
-            symbol for symbol, shares in inventory.visemes.items() if shares[0][0] == viseme
+            symbol for symbol, visemes in inventory.visemes.items() if visemes[0][0] == viseme
         }
         self._phones: dict[int, tuple[Phone, float]] = {}  # by index, with the time they were known
 
@@ -134,8 +134,8 @@ class ClosingPhones:
         subtracted = min(log_odds, self._rule.other)
         if phone.symbol in self._vowels and self._is_between_closures(phone):
             from_middle = abs((time_s - phone.onset_s) / phone.duration_s - 0.5)
-            share = max(0.0, 1.0 - from_middle / _MIDDLE)
-            subtracted = max(subtracted, self._rule.vowel * log_odds * share)
+            weight = max(0.0, 1.0 - from_middle / _MIDDLE)
+            subtracted = max(subtracted, self._rule.vowel * log_odds * weight)
         return subtracted
 
     def _is_between_closures(self, phone: Phone) -> bool:
@@ -158,19 +158,19 @@ def log_odds_of(probability: float) -> float:
     return math.log(clipped / (1.0 - clipped))
 
 
-def closure_share(log_odds: float, doubt: float) -> float:
+def closure_amount(log_odds: float, doubt: float) -> float:
     """Return how far lips move to their closure, from 0 (unchanged) to 1 (closed)."""
     return smooth_step(0.5 + 0.5 * log_odds / doubt)
 
 
-def close_lips(faps: Array, share: float) -> None:
+def close_lips(faps: Array, amount: float) -> None:
     """Move both lips, FAPs (num_mouth_faps,), towards their closure, in place."""
-    _move_to_rest(faps, share, _INNER, _OUTER)
+    _move_to_rest(faps, amount, _INNER, _OUTER)
 
 
-def lip_to_teeth(faps: Array, share: float) -> None:
+def lip_to_teeth(faps: Array, amount: float) -> None:
     """Move the lower lip towards the upper teeth, in place."""
-    _move_to_rest(faps, share, _LOWER, _LOWER_OUTER)
+    _move_to_rest(faps, amount, _LOWER, _LOWER_OUTER)
 
 
 def separate_lips(faps: Array) -> None:
@@ -181,10 +181,10 @@ def separate_lips(faps: Array) -> None:
 
 
 def _move_to_rest(
-    faps: Array, share: float, inner: NDArray[np.intp], outer: NDArray[np.intp]
+    faps: Array, amount: float, inner: NDArray[np.intp], outer: NDArray[np.intp]
 ) -> None:
     """Move inner lips towards rest, and the outer lips by the same distance."""
-    if share > 0.0:
-        moved = share * faps[inner]
+    if amount > 0.0:
+        moved = amount * faps[inner]
         faps[inner] -= moved
         faps[outer] -= moved

@@ -30,7 +30,7 @@ from kouxing.services.synthesizer.lips.learnt.closures import (
     ClosingPhones,
     ClosureRule,
     close_lips,
-    closure_share,
+    closure_amount,
     lip_to_teeth,
     log_odds_of,
     separate_lips,
@@ -57,7 +57,7 @@ _REST_S = 0.15  # duration of the way to rest without sound
 _FLUSHED_S = 0.3  # audio whose lip frames may arrive after an interruption
 _MEMORY_S = 0.5
 _TEETH_LOG_ODDS = 1.0  # threshold for a phone f
-_CLOSED_SHARE = 0.5  # lips count as closed from this fraction of the way to a closure
+_CLOSED_FRACTION = 0.5  # lips count as closed from this fraction of the way to a closure
 _JITTER = 10.0  # FAP units: changes of this size are halved, smaller changes are reduced further
 _MAX_FAP = 4000.0  # FAP units; larger values are invalid
 _EPSILON = 1e-6  # FAP units, and FAP units per second
@@ -107,7 +107,7 @@ class LearntStream:
         self._queue: deque[LipPositions] = deque()  # not due yet
         self._newest_s = -np.inf  # time of the newest lip frame
         self._stable = self._neutral  # the last lip frame, stabilized
-        self._shares = (0.0, 0.0)  # closure fractions of the last two lip frames
+        self._closing = (0.0, 0.0)  # closure fractions of the last two lip frames
         self._has_lip_frames = False
         self._is_speaking = False
         self._flushed_until_s = -np.inf  # ignore lip frames of the audio up to here
@@ -170,7 +170,7 @@ class LearntStream:
             step_s = max(time_s - self._time_s, 1e-3)
             self._mouth = FapState(visemes.faps, (visemes.faps - self._mouth.value) / step_s)
             self._rest = None
-        self._ajar = self._resting.share_at(time_s)
+        self._ajar = self._resting.amount_at(time_s)
         self._time_s = time_s
         return self._frame(visemes.articulation)
 
@@ -222,7 +222,7 @@ class LearntStream:
             change = faps - self._stable
             faps = self._stable + change**3 / (change**2 + _JITTER_SQUARED)
         else:
-            self._shares = (0.0, 0.0)
+            self._closing = (0.0, 0.0)
         self._stable = faps
         faps = faps.copy()
         separate_lips(faps)
@@ -231,13 +231,13 @@ class LearntStream:
         phones = self._bilabials.log_odds(frame.time_s)
         closure = rule.log_odds(faps, log_odds_of(frame.closure), phones)
         closure -= self._resting.doubt_at(frame.time_s, frame.closure, phones)
-        lip_to_teeth(faps, closure_share(teeth, rule.doubt))
-        share = closure_share(closure, rule.doubt)
-        before, newest = self._shares
-        if before < _CLOSED_SHARE <= newest:  # a new closure lasts at least two frames
-            share = max(share, newest)
-        self._shares = (newest, share)
-        close_lips(faps, share)
+        lip_to_teeth(faps, closure_amount(teeth, rule.doubt))
+        closing = closure_amount(closure, rule.doubt)
+        before, newest = self._closing
+        if before < _CLOSED_FRACTION <= newest:  # a new closure lasts at least two frames
+            closing = max(closing, newest)
+        self._closing = (newest, closing)
+        close_lips(faps, closing)
         return faps
 
     def _frame(self, articulation: Articulation) -> MouthFrame:

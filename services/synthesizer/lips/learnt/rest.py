@@ -123,8 +123,8 @@ class RestingLips:
             return math.inf
         return _DOUBT if is_silent else 0.0
 
-    def share_at(self, time_s: float) -> float:
-        """Return the share at the time of a frame."""
+    def amount_at(self, time_s: float) -> float:
+        """Return the amount at the time of a frame."""
         next_s = self._next_sound_s()
         soon_s = time_s + LEAD_S
         if self._has_ended:
@@ -139,13 +139,13 @@ class RestingLips:
             self._set_goal(1.0, PART_S)
         self._elapsed_s += max(time_s - self._time_s, 0.0)
         self._time_s = time_s
-        return self._share()
+        return self._amount()
 
     def relax(self, step_s: float) -> float:
-        """Return the share one step closer to rest while media time does not advance."""
+        """Return the amount one step closer to rest while media time does not advance."""
         self._set_goal(0.0, _RELAX_S)
         self._elapsed_s += step_s
-        return self._share()
+        return self._amount()
 
     def _is_sound(self, level_db: float) -> bool:
         return self._is_voice and level_db >= self._loudest_db - _RANGE_DB
@@ -156,19 +156,19 @@ class RestingLips:
     def _set_goal(self, goal: float, duration_s: float) -> None:
         if goal != self._goal:
             velocity = float(self._transition.at(self._elapsed_s).velocity[0])
-            self._transition = _transition_to(goal, self._share(), velocity, duration_s)
+            self._transition = _transition_to(goal, self._amount(), velocity, duration_s)
             self._goal, self._elapsed_s = goal, 0.0
 
-    def _share(self) -> float:
+    def _amount(self) -> float:
         return self._goal + float(self._transition.value_at(self._elapsed_s)[0])
 
 
-def _transition_to(goal: float, share: float, velocity: float, duration_s: float) -> Transition:
-    """Return the transition from a share and its velocity to a goal."""
-    difference = FapState(np.array([share - goal]), np.array([velocity]))
+def _transition_to(goal: float, amount: float, velocity: float, duration_s: float) -> Transition:
+    """Return the transition from an amount and its velocity to a goal."""
+    difference = FapState(np.array([amount - goal]), np.array([velocity]))
     return Transition(difference, np.array([duration_s]))
 
 
-def part_lips(faps: NDArray[np.float64], share: float) -> None:
+def part_lips(faps: NDArray[np.float64], amount: float) -> None:
     """Move the mouth, FAPs (num_mouth_faps,), toward the ajar one, in place."""
-    faps += share * (AJAR - faps)
+    faps += amount * (AJAR - faps)
