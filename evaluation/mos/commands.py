@@ -96,22 +96,18 @@ def serve(
 @app.command()
 def report(
     folder: Folder,
-    picture: Annotated[Path | None, typer.Option(help="File for box plots (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Print mean opinion scores with 95 % confidence intervals, with and without outliers."""
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.mos.report import draw_boxes, make_report, print_report
+    from kouxing.evaluation.mos.report import make_report, print_report
     from kouxing.evaluation.mos.store import read_answers
     from kouxing.evaluation.mos.study import load_study
 
-    check_output(picture, json_file, force=force)
-    study, answers = load_study(folder), read_answers(folder)
-    results = make_report(study, answers)
+    check_output(json_file, force=force)
+    study = load_study(folder)
+    results = make_report(study, read_answers(folder))
     print_report(study, results, Console())
-    if picture is not None:
-        save_figure(draw_boxes(study, answers), picture)
     write_json(json_file, {"opinions": [asdict(opinion) for opinion in results]})
 
 

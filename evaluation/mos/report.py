@@ -1,8 +1,8 @@
-"""The report of a study: mean opinion scores and box plots.
+"""The report of a study: mean opinion scores.
 
-Li et al. 2011, section 3.3, draw box plots (figures 7 and 8), remove the outliers and take the mean
-(table 2). They do not define the fences; these are Tukey's. An interval of scores without outliers
-is too narrow, so the report also has the mean of all scores.
+Li et al. 2011, section 3.3, remove the outliers and take the mean (table 2). They do not define the
+fences; these are Tukey's. An interval of scores without outliers is too narrow, so the report also
+has the mean of all scores.
 """
 
 import csv
@@ -10,14 +10,12 @@ import io
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from scipy import stats
 
-from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.mos.store import Answer
 from kouxing.evaluation.mos.study import SCALES, Study
 from kouxing.shared.errors import UserError
@@ -132,16 +130,3 @@ def to_csv(study: Study, answers: Iterable[Answer]) -> str:
         role = "practice" if answer.place < 0 else roles.get(answer.condition, "")
         writer.writerow([*asdict(answer).values(), role])
     return table.getvalue()
-
-
-def draw_boxes(study: Study, answers: Iterable[Answer]) -> Any:
-    """Return a figure with a box plot of every condition's scores, for each scale."""
-    groups = group_scores(study, answers)
-    figure = new_figure(4.0 + 1.2 * len(study.conditions), 4.5)
-    for axes, scale in zip(figure.subplots(1, len(SCALES), sharey=True), SCALES, strict=True):
-        of_scale = {key[1]: [*scores.values()] for key, scores in groups.items() if key[0] == scale}
-        axes.boxplot([*of_scale.values()], whis=WHISKERS)
-        axes.set_xticks(range(1, len(of_scale) + 1), of_scale, rotation=30, ha="right")
-        axes.set(title=scale, ylim=(0.8, 5.2), yticks=range(1, 6))
-    figure.axes[0].set_ylabel("score")
-    return figure

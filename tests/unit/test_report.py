@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.report import lip_tables, recognition_table, run, system_tables
 from kouxing.evaluation.report.code_hash import code_hash
@@ -166,10 +165,6 @@ def test_the_page_starts_with_what_others_do_better() -> None:
 
 
 def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
-    try:
-        new_figure(1.0, 1.0)
-    except UserError:
-        pytest.skip("matplotlib is not installed")
     results = {
         "rivals": rivals(),
         "lookahead": faces(**{"learnt, 0 ms": SCORES, "learnt, 60 ms": BETTER}),
@@ -187,7 +182,6 @@ def test_the_page_has_a_table_for_each_measured_part(tmp_path: Path) -> None:
     assert "`kouxing x`: m, 2026-01-01, commit c, 3 s (2 s of processor time), load 0.5" in text
     assert 'make report STEPS="faults"' in text
     assert '- Not measured yet: `make report STEPS="conversation disturbed languages"`' in text
-    assert (tmp_path / "lookahead.png").stat().st_size > 1000
 
 
 def test_the_table_of_languages_has_a_row_per_recognizer() -> None:
