@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from kouxing.evaluation.report.page import TABLES, read_results
+from kouxing.evaluation.report.page import read_results, write_page
 from tests.system import ROOT
 
 RESULTS = read_results(ROOT / "docs" / "results")
@@ -73,9 +74,7 @@ def test_the_errors_by_language_are_those_of_the_report(file: str, text: str, to
     assert text.format(**ranges) in (ROOT / file).read_text("utf-8")
 
 
-def test_the_page_was_written_from_these_results() -> None:
-    text = (ROOT / "docs" / "results.md").read_text("utf-8")
-    for step in RESULTS.values():
-        assert f"{step['date']}, commit {step['commit']}" in text
-        assert step["commands"][-1] in text
-    assert text.count("\n| --- |") <= len(TABLES) <= 10
+def test_the_page_was_written_from_these_results(tmp_path: Path) -> None:
+    write_page(ROOT / "docs" / "results", tmp_path / "results.md")
+    page = (ROOT / "docs" / "results.md").read_text("utf-8")
+    assert (tmp_path / "results.md").read_text("utf-8") == page

@@ -23,7 +23,6 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
 from tests.e2e.following import Stream
-from tests.raw_bytes import connected, pour
 from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
 
 M = TypeVar("M", bound=Message)
@@ -265,21 +264,6 @@ def test_limits_the_damage_of_an_attack(
     attack.run(system.endpoints()[target], source, SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB[attack.has_key]
     assert memory.wait_until_kept(MAX_KEPT_MB, 60.0), memory.kept_mb
-
-
-@pytest.mark.parametrize(
-    ("target", "kind"), [("commands", "DEALER"), ("audio", "DEALER"), ("faps", "SUB")]
-)
-def test_rejects_a_handshake_without_a_key(system: System, target: str, kind: str) -> None:
-    port = int(system.endpoints()[target].partition(" ")[0].rpartition(":")[2])
-    with pytest.raises(OSError, match=r".+"):
-        connected(port, kind, "127.0.2.1")
-
-
-def test_survives_random_bytes_at_every_port(system: System, witness: Session) -> None:
-    for port in system.ports:
-        pour(port, SECONDS / 4)
-    system.assert_all_alive()
 
 
 def test_very_many_false_services_leave_the_status_readable(tmp_path: Path) -> None:
