@@ -18,7 +18,6 @@ Corpora = Annotated[
 ]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")]
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
-Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same model.")]
 Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
 PhoneLm = Annotated[
     Path | None,
@@ -77,7 +76,6 @@ def phone_lm(
         Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, with the words of --ngrams.")
     ] = None,
     language: Language = DEFAULT_LANGUAGE,
-    seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Train a phone language model on texts."""
@@ -91,7 +89,7 @@ def phone_lm(
     inventory = load_inventory(language)
     drawn = None
     if ngrams and dictionary:
-        drawn = draw_phones(ngrams, dictionary, inventory, seed=seed)
+        drawn = draw_phones(ngrams, dictionary, inventory)
     train_phone_lm(corpus or [], text or [], output, inventory, drawn=drawn)
 
 
@@ -101,7 +99,6 @@ def gmm(
     output: Model,
     phone_lm: PhoneLm = None,
     language: Language = DEFAULT_LANGUAGE,
-    seed: Seed = 0,
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
@@ -114,7 +111,6 @@ def gmm(
         output,
         load_inventory(language),
         phone_lm=phone_lm,
-        seed=seed,
         shipping=not any_license,
     )
 
@@ -130,7 +126,6 @@ def blocks(
         list[Path] | None,
         typer.Option(help="Folder of music and noise for the background; repeatable."),
     ] = None,
-    seed: Seed = 0,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of steps, each with 256 s of audio.")
     ] = 1000,
@@ -151,7 +146,6 @@ def blocks(
         start=start_from,
         untranscribed=untranscribed or [],
         sounds=sounds or [],
-        seed=seed,
         num_steps=steps,
         shipping=not any_license,
     )
@@ -170,7 +164,6 @@ def universal(
         typer.Option(help="Corpus with a column of languages; repeatable."),
     ] = None,
     clips: Annotated[Path | None, typer.Option(help="Folder of clips of GRID.")] = None,
-    seed: Seed = 0,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of steps, each with 19 s of audio.")
     ] = 2000,
@@ -189,7 +182,6 @@ def universal(
         learners=learners or [],
         languages=languages or [],
         clips=clips,
-        seed=seed,
         num_steps=steps,
     )
 
@@ -202,7 +194,6 @@ def encoder(
     sounds: Sounds,
     clips: Clips,
     untranscribed: Untranscribed = None,
-    seed: Seed = 0,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of batches, each with 140 s of audio.")
     ] = 7000,
@@ -223,7 +214,6 @@ def encoder(
         clips=clips,
         untranscribed=untranscribed or [],
         sounds=sounds,
-        seed=seed,
         num_steps=steps,
         shipping=not any_license,
     )
@@ -249,7 +239,6 @@ def lips(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
     ] = Path("services/recognizer/models/lips.npz"),
-    seed: Seed = 0,
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
@@ -257,7 +246,7 @@ def lips(
     with _neural_training(output, force=force):
         from kouxing.training.lips.recipe import train_lips
 
-    train_lips(clips, output, seed=seed, any_license=any_license)
+    train_lips(clips, output, any_license=any_license)
 
 
 @app.command()
@@ -282,7 +271,6 @@ def traits(
     ],
     sounds: Sounds,
     output: Model,
-    seed: Seed = 0,
     any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
@@ -290,7 +278,7 @@ def traits(
     from kouxing.training.traits import train_traits
 
     check_output(output, force=force)
-    train_traits(recordings, sounds, output, seed=seed, shipping=not any_license)
+    train_traits(recordings, sounds, output, shipping=not any_license)
 
 
 @app.command()
