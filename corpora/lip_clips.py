@@ -47,13 +47,13 @@ _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separ
 # Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
 # name of MakeHuman's face (CC0), both sides of a pair together. The rig's jaw opens wider than a
 # speaker's, so it is scaled to the opening of filmed speakers. Pursed lips are scaled to half a
-# centimeter. Real pursed lips nearly touch, unlike those of the shapes, so their heights are those
-# of the filmed speakers' u. The head adds the backward swing of the jaw.
+# centimeter. Real pursed lips nearly touch, but the shapes' lips do not, so their heights come from
+# the filmed speakers' u. The head adds the backward swing of the jaw.
 _RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _DEPTH_FAPS = (16, 17)
-_RIG_DELAY_S = 0.04  # lag of its lips behind those of filmed speakers
+_RIG_DELAY_S = 0.04  # lag of its lips behind filmed speakers' lips
 _RIG = {
     "mouth_stretch_c": [
         _JAW_SCALE * value

@@ -118,7 +118,7 @@ def is_emitted(phone: Phone, after: StreamOutput | None) -> bool:
 def first_hypothesis(events: Sequence[StreamOutput], known: set[int]) -> list[Phone]:
     """Return each phone as first emitted, by the rule or along with the next one.
 
-    ``known`` are indices of the phones emitted before; those of ``events`` are added.
+    ``known`` are indices of the phones emitted before; the indices of ``events`` are added.
     """
     first = []
     for event, after in zip_longest(events, events[1:]):

@@ -42,7 +42,7 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
         manifest = folder / "manifest.tsv"
         rows = read_rows(manifest, ("path", "kind", "licence"))
         if not rows:
-            raise UserError(f"{manifest} lists no sounds; add some, or use another folder")
+            raise UserError(f"{manifest} lists no sounds")
         try:
             for row in rows:
                 if may_ship(row["licence"]) or not shipping:

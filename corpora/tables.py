@@ -22,7 +22,7 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     known = set(table.fieldnames or ())
     missing = [column for column in columns if known.isdisjoint(column.split(" or "))]
     if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; add them")
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}")
     rows: list[dict[str, str]] = []
     for row in table:
         if len(rows) == _MAX_ROWS:

@@ -3,7 +3,7 @@
 usage: check_wheel.py WHEEL
 
 It renders a sample sentence, starts ``kouxing run``, and loads the page with its heads and all of
-its JavaScript modules. Its packages are those of requirements.lock.
+its JavaScript modules. Its packages come from requirements.lock.
 """
 
 import os

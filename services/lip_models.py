@@ -2,7 +2,7 @@
 
 Each lip model is a package whose ``__init__`` defines ``LIP_MODEL``, a ``LipModelInfo``. Packages
 in the synthesizer's folder ``lips`` are built in. Other distributions add lip models by entry
-points of the group ``kouxing.lip_models``: the entry point's name is that of the lip model, its
+points of the group ``kouxing.lip_models``: the entry point has the name of the lip model, and its
 value is the package.
 """
 

@@ -4,7 +4,7 @@
           -> lip frames with the longest delay
           -> face
 
-The face is that of the live chain (``FaceAnimator``), with the same lip models and modifiers. It
+The live chain's ``FaceAnimator`` makes the face, with the same lip models and modifiers. It
 has the longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes
 blend all visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small to see.
 With learnt lips, phones also decide where the lips do not close. In the live chain, they arrive too
@@ -83,7 +83,7 @@ def analyze_recording(
     lip_predictor
         The network that predicts learnt lips, if any.
     is_text_known
-        Whether the phones are those of a known text.
+        Whether the phones come from a known text.
     with_progress
         Shows the progress.
     """

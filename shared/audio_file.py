@@ -115,7 +115,7 @@ def _open_file(
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     if num_bytes == 0:
-        raise UserError(f"{path}: the file is empty; record it again")
+        raise UserError(f"{path}: the file is empty")
     begin = file.read(NUM_BEGIN_BYTES)
     if num_parts(file) > 1:  # FFmpeg reads one of them
         if wav := pcm_of_wav(begin):
@@ -236,7 +236,7 @@ def limited_blocks(
 
 
 def read_duration_s(path: Path) -> float:
-    """Return the duration that a file states or, if it states none, that of its samples.
+    """Return the duration from a file's header or, if missing, from its samples.
 
     Raises ``UserError`` as ``open_audio``.
     """

@@ -205,7 +205,7 @@ class Settings:
     """The values of all keys of all services, from every source.
 
     ``types`` has the configuration class of each service. ``assignments`` are the values from the
-    command line, by ``service.key``. ``environment`` is by default that of this process.
+    command line, by ``service.key``. ``environment`` defaults to the environment of this process.
 
     Raises ``UserError`` if the file cannot be read, or a table, key or variable is unknown.
     """

@@ -127,7 +127,7 @@ class Connection:
                 self.disconnect("it sends too many useless messages", PENALTY_S)
 
     def update(self, traffic: Traffic, now_s: float) -> None:
-        """Update the figures; disconnect a peer whose message does not end."""
+        """Update the figures; disconnect a peer that sends an endless message."""
         self.num_checks += 1
         if self.num_delivered != self._delivered_before:
             self._delivered_before, self._read_before = self.num_delivered, traffic.read
@@ -146,7 +146,7 @@ class Connection:
         self._acknowledged, self._had_unsent = traffic.acknowledged, traffic.unsent > 0
         limits = self.socket.limits
         if self.incomplete > limits.message_bytes or self.undelivered > limits.undelivered_bytes:
-            self.disconnect("its message does not end", LONG_PENALTY_S)
+            self.disconnect("it sent an endless message", LONG_PENALTY_S)
 
     def is_stalled(self, now_s: float) -> bool:
         """Return whether the peer has read nothing for a while, though data waits for it."""
@@ -240,7 +240,7 @@ class LimitedSocket:
 class ConnectionLimiter:
     """Watches the connections to all bound sockets of a process.
 
-    ``is_service`` and ``extra_connections`` are those of ``PeerQuota``.
+    For ``is_service`` and ``extra_connections``, see ``PeerQuota``.
     """
 
     def __init__(self, is_service: Callable[[str], bool], extra_connections: int = 0) -> None:
@@ -303,13 +303,13 @@ class ConnectionLimiter:
             connection.budget = Budget(max(MIN_BUDGET, kept.left))
 
     def save_budget(self, connection: Connection) -> None:
-        """Keep what is left of a connection's budget for its owner's next connections."""
+        """Save the rest of a connection's budget for its owner's next connections."""
         saved = self._budgets.get(connection.owner)
         if connection.budget.left < (BUDGET if saved is None else saved.left):
             self._budgets[connection.owner] = connection.budget
 
     def limit_topics(self, num_bytes: int) -> None:
-        """Keep the size of all subscriptions below its limit after ``num_bytes`` more."""
+        """Count a subscription; above the total limit, disconnect the largest subscribers."""
         self._topic_bytes += num_bytes
         if self._topic_bytes > MAX_ALL_TOPICS:
             self._topic_bytes = _disconnect_heaviest(

@@ -79,7 +79,7 @@ class Metrics:
 
 
 def percentile(ordered: Sequence[float], percent: int) -> float:
-    """Return a percentile of rising values, at least one; it is one of the values."""
+    """Return the nearest-rank percentile of sorted values, at least one."""
     return ordered[percent * (len(ordered) - 1) // 100]
 
 
@@ -96,8 +96,8 @@ def memory_mb() -> float:
 def use_single_malloc_arena() -> None:
     """Let all threads share one glibc arena. Call this before starting threads.
 
-    ``trim_heap`` cannot release memory at the end of further arenas, such as those of
-    ZeroMQ's threads.
+    ``trim_heap`` cannot release memory at the end of further arenas, such as the arenas of ZeroMQ's
+    threads.
     """
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)

@@ -1,4 +1,4 @@
-"""The overload policy: what a live session gives up on a busy machine to stay live.
+"""Overload policy: how live sessions degrade under load.
 
 First, the block network runs less often for all sessions, so that phones are emitted and corrected
 later (:class:`NetworkPace`). Then a session uses the light acoustic model, and last it skips audio

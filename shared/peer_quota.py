@@ -35,7 +35,7 @@ class PeerQuota:
         """Yield the connections that must end, with the reason.
 
         ``connections`` start with the oldest one. Silent connections end first, and among them
-        those of the owner with the most connections. An owner first loses its oldest silent
+        connections of the owner that has the most. An owner first loses its oldest silent
         connection, then its newest one.
         """
         if len(connections) <= MAX_KEY_SHARE * self.max_clients:

@@ -96,7 +96,7 @@ class ReliableReceiver:
         self._peer = NO_PEER
 
     def receive(self, message: Message, sender: Peer) -> bool:
-        """Return whether a message is the next one; all others must be ignored.
+        """Return whether a message is the next one. The caller must drop all others.
 
         The first message of a greater epoch sets the number from which the epoch is counted.
         """

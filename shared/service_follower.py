@@ -18,7 +18,7 @@ class ServiceFollower(Follower):
 
     Control is notified when the subscriptions are in effect. ``session_start`` is control's newest
     message about the session. ``handlers`` has functions by class of message; these classes are
-    subscribed to. ``on_new_epoch`` is that of ``Follower``.
+    subscribed to. For ``on_new_epoch``, see ``Follower``.
     """
 
     def __init__(

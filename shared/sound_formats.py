@@ -72,7 +72,7 @@ _OTHER = {
 
 
 def is_sound(begin: bytes) -> bool:
-    """Return whether the first bytes are those of a sound or video format."""
+    """Return whether a sound or video format starts with these bytes."""
     return (
         any(begin.startswith(mark, offset) for offset, mark in (*_SOUND, *_UNPROBED.values()))
         or (begin.startswith(b"\x80\0") and b"(c)CRI" in begin)  # ADX
@@ -115,7 +115,7 @@ def needs_more(begin: bytes) -> bool:
 
 
 def non_audio_kind(begin: bytes) -> str:
-    """Return what a file is that is not sound, and what to do; empty if unknown."""
+    """Describe a file without sound, with a remedy; empty if the type is unknown."""
     for mark, kind in _OTHER.items():
         if begin.startswith(mark):
             return kind

@@ -119,7 +119,7 @@ def load_examples(
 def read_utterances(
     corpus: Path, errors: RowErrors, inventory: PhoneInventory, *, split: str, shipping: bool
 ) -> list[Utterance]:
-    """Read the list of a corpus; the arguments are those of :func:`load_examples`."""
+    """Read the list of a corpus. For the arguments, see :func:`load_examples`."""
     rows = read_corpus(corpus, errors, inventory, split=split)
     for row in rows:
         if shipping and not may_ship(row.license):

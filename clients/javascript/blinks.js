@@ -1,4 +1,4 @@
-// Blinks of a face without a server, like those of shared/face/idle_motion.py.
+// Blinks of a face without a server, as in shared/face/idle_motion.py.
 
 const MEDIAN_S = 3;
 const LOG_SD = 0.5;

@@ -77,7 +77,7 @@ export interface SpeakerOptions {
   ahead?: boolean;
   /** the speaker's mouth profile, base64 */
   mouthProfile?: string;
-  /** language of the speech: "auto", or a code such as "zh" or "de"; default: that of the recognizer */
+  /** language of the speech: "auto", or a code such as "zh" or "de"; default: the recognizer's language */
   language?: string;
   token?: string;
   /** called when the session has ended; null: without an error */

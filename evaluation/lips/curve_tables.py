@@ -61,7 +61,7 @@ def read_tables(
     """Read ``CLIP.csv`` of all held-out clips, and of those training clips that have one.
 
     Raises UserError if a held-out clip has no table, a table cannot be read, or its columns differ
-    from those of the first one.
+    from the first one's columns.
     """
     paths = {clip.name: folder / f"{clip.name}.csv" for clip in (*held_out, *training)}
     missing = [paths[clip.name] for clip in held_out if not paths[clip.name].is_file()]
@@ -75,7 +75,7 @@ def read_tables(
     for name, table in tables.items():
         if table.names != names:
             raise UserError(
-                f"{paths[name]}: its columns differ from those of {held_out[0].name}.csv"
+                f"{paths[name]}: its columns differ from the columns of {held_out[0].name}.csv"
             )
     return tables
 

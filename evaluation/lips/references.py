@@ -128,8 +128,8 @@ def clips_to_score(
 ) -> list[LipClip]:
     """Read the held-out clips of a folder that no viseme parameters were trained on.
 
-    ``parameters`` are files; those of the package are always included. Clips with sound out of sync
-    are left out. Raises UserError if no clip is left.
+    ``parameters`` are files; the package's own file is always included. Clips with sound out of
+    sync are left out. Raises UserError if no clip is left.
     """
     return _held_out(folder, read_clips(folder, language=language), parameters)
 

@@ -11,8 +11,8 @@ same sentence. Our clips share no sentences, but phones repeat: the mean mouth o
 over all its onsets.
 
 Two deviations: each speaker's displacements are scaled so that the widest opening (98th percentile)
-is that of R = 5. And the other rates are the same recording, time-scaled at constant pitch, so that
-the real lips are known.
+equals R = 5. The other rates are the same recording, time-scaled at constant pitch, so that the
+real lips are known.
 
 If a clip's transcript is not known, the recognized syllables serve as the text, as in the paper.
 """

@@ -14,7 +14,7 @@ disturbed speech (:mod:`~kouxing.evaluation.recognizer.disturbances`):
 
 A live recognizer has two hypotheses. The first hypothesis holds each phone as first emitted, by the
 rule or, unlike in the paper, along with the next phone. The final hypothesis holds the corrected
-phones, which are also those of a whole recording. Every recording is a separate session, so the
+phones, which equal the phones of a whole recording. Every recording is a separate session, so the
 live mean starts from the prior each time.
 """
 

@@ -10,7 +10,7 @@ hama    hama, whole recordings of English only
 ======  ============================================================================================
 
 All recognizers get the same recordings. The measures are phonetic feature errors, phone
-errors and viseme errors. The final hypothesis is that of an offline search.
+errors and viseme errors. The final hypothesis equals an offline search.
 """
 
 import subprocess

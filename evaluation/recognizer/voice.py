@@ -103,7 +103,7 @@ def evaluate_voice(
 
     The figures contain the seconds with and without a voice, and the fraction of each with voice
     activity. Without such audio, the share is missing: None. The shares with laughter and with
-    breath are those of the whole time.
+    breath refer to the whole time.
     """
     results: dict[str, dict[str, Any]] = {name: {} for name in models}
     for material in track(materials, "voice activity", console=CONSOLE, transient=True):

@@ -26,7 +26,7 @@ _COMPARED = {  # compared measures, and whether higher is better
     "precision_pause": ("precision of closures in pauses", True),
     "mtm_ms": ("MTM", False),
 }
-_LIKE_REAL = {  # measures that are best when they equal those of real lips
+_LIKE_REAL = {  # measures that are best when they equal the value of real lips
     "slcc": "SLCC",
     "effort_correlation": "effort",
     "rest_opening": "opening at rest",

@@ -122,8 +122,8 @@ def measure(
 ) -> Busy:
     """Start all services, and speak while each number of busy programs runs.
 
-    ``language`` is that of the speech, or None for the recognizer's. Raises ``UserError`` if a file
-    is not audio, or the services cannot start.
+    ``language`` is the language of the speech. If None, it is the recognizer's. Raises
+    ``UserError`` if a file is not audio, or the services cannot start.
     """
     text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]

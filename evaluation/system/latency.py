@@ -47,7 +47,7 @@ class Latency:
 def measure(path: Path, num_repeats: int, console: Console, language: str | None = None) -> Latency:
     """Start the services, stream the file and return the figures; UserError if that fails.
 
-    ``language`` is that of the speech, or None for the recognizer's.
+    ``language`` is the language of the speech. If None, it is the recognizer's.
     """
     sound = to_16_khz(*read_audio(path))
     delay_s = SynthesizerConfig().delay_ms / 1e3

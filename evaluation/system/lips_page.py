@@ -1,12 +1,12 @@
 """Compares lip sync in headless Chromium: ``kouxing-lips`` and three packages of npm.
 
-No head is drawn. The microphone plays a recording in a loop. The processor time is that of the
-page's process: page, worker and audio thread. It is also measured without lip sync, with the same
-audio context, microphone and animation frames. All packages have their default settings.
+No head is drawn. The microphone plays a recording in a loop. The processor time covers the page's
+process: page, worker and audio thread. It is also measured without lip sync, with the same audio
+context, microphone and animation frames. All packages have their default settings.
 
 With clips, one page plays each held-out clip to all packages at the same time, and samples their
 faces. The lag of a package is the one with the highest correlation of the opening. Correlation and
-closures are those of a face whose sound is delayed by this lag.
+closures are computed for a face whose sound is delayed by this lag.
 
 Weights of visemes become an opening by kouxing's visemes. wLipSync needs a profile, made from the
 samples, or from clips for training.
@@ -139,7 +139,7 @@ class LipsPage:
     loaded_ms: float  # from a local server
     first_movement_ms: float  # from loading to the first motion of the mouth; the microphone speaks
     delay_ms: dict[str, float] | None  # from the sound to its weights: p50, p95; only kouxing-lips
-    processor_share: float  # fraction of one core, including that of the page itself
+    processor_share: float  # fraction of one core, including the page itself
     page_share: float  # fraction of one core that the page needs without lip sync
     num_clips: int = 0
     lag_ms: float | None = None  # lag of the opening behind the real lips, with the page's delay

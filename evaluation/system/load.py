@@ -107,9 +107,9 @@ def measure(
 ) -> Load:
     """Start all services, put them under load, return the figures.
 
-    The last step has ``num_sessions``; each is measured for ``step_s``. ``language`` is that of
-    the speech, or None for the recognizer's. Raises UserError if a file is not audio or the
-    services cannot start.
+    The last step has ``num_sessions``; each is measured for ``step_s``. ``language`` is the
+    language of the speech. If None, it is the recognizer's. Raises UserError if a file is not audio
+    or the services cannot start.
     """
     text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]

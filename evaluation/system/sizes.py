@@ -1,9 +1,9 @@
 """Sizes of models and messages, and the physical floor of the recognizer's processor time.
 
 The floor is the number of multiplications and additions of the networks in a second of speech,
-divided by the rate of one core. This rate is four times that of a float32 matrix product, because
-the weights have 8 bits. The block network processes its block and its right context in each run,
-the audio encoder each position once.
+divided by the rate of one core. This rate is four times the rate of a float32 matrix product,
+because the weights have 8 bits. The block network processes its block and its right context in each
+run, the audio encoder each position once.
 """
 
 import time

@@ -105,7 +105,7 @@ def animate(
     """Animate a face from a sound file.
 
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
-    are those of the live services with their default settings. Otherwise the whole
+    equal the live services' frames with default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
     it, if given. ``language`` is the language of the speech. With ``text_may_differ``, a text that
     cannot be read or does not fit the sound is reported and ignored.

@@ -217,8 +217,8 @@ def express(
         list[str] | None,
         typer.Argument(
             metavar="[SESSION] [NAME=STRENGTH]...",
-            help="Session name. Default: the face at rest and every session. Expressions with"
-            f" strengths from 0 to 1: {', '.join(ExpressionName)}.",
+            help="Session (default: all faces), then expressions with strengths from 0 to 1, such"
+            f" as joy=0.4: {', '.join(ExpressionName)}.",
         ),
     ] = None,
     hold: Annotated[
@@ -322,7 +322,7 @@ def _is_drop_counter(name: str) -> bool:
 def control_address(address: str) -> str:
     """Return the address of control, followed by its public key unless connections are insecure.
 
-    Without ``address`` and without a setting, it is that of the user's newest system.
+    Without ``address`` and a setting, it is the address of the user's newest system.
     """
     running, config = find_system(address)
     return running or control_endpoint(config.control, insecure=config.insecure)

@@ -44,7 +44,7 @@ _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Frames to write, as they arrive."""
+    """The frames of a face, written as they arrive."""
 
     rows: Iterable[Row]
     frame_rate_hz: float | None = None  # None: estimated from the times of the frames

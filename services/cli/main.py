@@ -25,7 +25,7 @@ from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.terminal import CONSOLE
 
 SERVICES = "A single service (run starts all of them)"
-ENTRY_POINTS = "kouxing.commands"  # such as those of training and evaluation
+ENTRY_POINTS = "kouxing.commands"  # such as training and evaluation
 _VALUE_NAMES = {"bool": "", "str": "TEXT", "path": "PATH", "int": "NUMBER", "float": "NUMBER"}
 _PYTHON_TYPE = re.compile(r"<(?:list\[)?(\w+)(?: range)?\]?>")
 

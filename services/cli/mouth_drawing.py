@@ -1,6 +1,6 @@
 """``kouxing lips``: the 2-D mouth of a sound, as a video, a picture of key frames, or a table.
 
-The method is that of Zhang et al. 2021. A text and its timing give key frames of the opening R.
+Method: Zhang et al. 2021. A text and its timing give key frames of the opening R.
 Interpolation gives R(t), and R(t) gives the contour. The paper's mouth has one width. Here, another
 lip model gives the width, so that the mouth is round for u, ü and o.
 """

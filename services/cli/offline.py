@@ -198,7 +198,7 @@ def render(
                     language=language or DEFAULT_LANGUAGE,
                 )  # fmt: skip
             if not motion.frames:
-                raise UserError(f"{source}: the file contains no frames; export it again")
+                raise UserError(f"{source}: the file contains no frames")
             count = exporter.export(motion, progress)
         if motion.phones == []:
             print_message(f"{source}: no speech was found; the mouth stays closed")

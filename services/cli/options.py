@@ -114,7 +114,7 @@ class Timing(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportOptions:
-    """How ``kouxing render`` shows and writes a face. The defaults are those of its options."""
+    """How ``kouxing render`` shows and writes a face. The defaults match its options."""
 
     lips: tuple[str, ...] = (DEFAULT_LIP_MODEL,)
     form: CurveForm | None = None  # None: the first one of the format

@@ -23,7 +23,7 @@ _TOLERANCE_S = 0.05  # two opening times that differ less are equal
 
 
 def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_seed: int) -> None:
-    """Send the frames of a session; without a name, those of the newest session at any time.
+    """Send the frames of a session; without a name, always of the newest session.
 
     While there are no frames, the face's idle motion is sent, which the seed determines. Raises
     ``UserError`` if control does not answer, or there are too many targets.

@@ -24,7 +24,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
 
     ``environment`` is complete except for two variables. A loop counts as hung if it sends no
     heartbeat for ``hang_limit_s``. The limit is 0.75 s longer after ``IDLE_PULSE``. Other options
-    are those of ``subprocess.Popen``.
+    have the types of ``subprocess.Popen``.
     """
 
     def __init__(

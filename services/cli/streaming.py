@@ -48,7 +48,7 @@ def stream(
 ) -> StreamSummary:
     """Stream a source through a running system and wait for its last FAP frame.
 
-    ``mouth_profile`` is the speaker's, if any, and ``language`` that of the speech. Raises
+    ``mouth_profile`` is the speaker's, if any. ``language`` is the language of the speech. Raises
     ``UserError`` if the system does not answer, refuses the session or stops answering.
     """
     with connect(control) as client:

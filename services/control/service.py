@@ -112,7 +112,7 @@ class ControlService(Service):
         self.register(self._events, {})
 
     def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Register control itself, as any other service."""
+        """Register control like any other service."""
         self._registry.add(heartbeat, NO_PEER, time.monotonic())
 
     def gauges(self) -> dict[str, float]:

@@ -105,7 +105,7 @@ class SessionRecord:
         )
 
     def moved_message(self) -> SessionMoved:
-        """Return the message to its client and its followers after it was placed again."""
+        """Return the ``session-moved`` message for the client and the subscribers."""
         return SessionMoved(
             session=self.name,
             epoch=self.epoch,

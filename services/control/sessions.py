@@ -70,7 +70,7 @@ class Sessions:
         if not secrets.compare_digest(record.token.encode(), token.encode()):
             raise Refusal(
                 ErrorCode.BAD_TOKEN,
-                f"this is not the token of session {name!r}; use that of session-opened",
+                f"wrong token for session {name!r}; use the token of session-opened",
             )
         return record
 

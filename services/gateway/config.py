@@ -9,7 +9,7 @@ from kouxing.shared.config import BoundHost, BoundPort, HostNames, Switch, Texts
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
-ADDRESS_SHARE = 0.75  # fraction of each quota for one address, which may be that of a proxy
+ADDRESS_SHARE = 0.75  # fraction of each quota for one address, which may be a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
 
 
@@ -69,7 +69,7 @@ class GatewayConfig(FaceConfig):
     """Serve unencrypted http at an address that other machines can reach. Use this only behind an
     encrypting proxy, or for a port that is published only to this machine."""
     names: HostNames = ()
-    """Additional host names of the page, such as that of a proxy."""
+    """Additional host names of the page, such as a proxy's."""
     allowed_origins: Origins = ()
     """Origins of other pages that may connect to the gateway's sessions."""
     frame_ancestors: Origins = ()

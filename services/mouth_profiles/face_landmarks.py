@@ -1,6 +1,6 @@
 """Compute the mouth's FAPs from the landmarks of a face, without the motion of the head.
 
-The landmarks are those of MediaPipe's face mesh (Kartynnik et al. 2019, "Real-time facial surface
+The landmarks come from MediaPipe's face mesh (Kartynnik et al. 2019, "Real-time facial surface
 geometry from monocular video on mobile GPUs"), in pixels: x to the right, y down, z away from the
 camera in the same unit (MediaPipe's x and z times the image width, y times its height). Left and
 right are the person's.

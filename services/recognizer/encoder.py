@@ -81,7 +81,7 @@ class AudioEncoder:
         )
         for width in (self.state_width, self.num_features, self.num_phones):
             if not (isinstance(width, int) and 1 <= width <= _MAX_WIDTH):
-                raise ValueError(f"its network has the widths {widths}")
+                raise ValueError(f"its network has widths {widths}, not 1 to {_MAX_WIDTH}")
         values = self.run(
             np.zeros((1, FRAMES_PER_POSITION, NUM_MELS), np.float32),
             np.zeros((1, self.state_width), np.float32),

@@ -44,7 +44,7 @@ class LipFrameModel(Protocol):
 
     @property
     def delays_s(self) -> Sequence[float]:
-        """Delays that it offers, seconds, rising."""
+        """Available delays in seconds, ascending."""
 
     def create_stream(self, delays_s: Sequence[float]) -> LipFrameStream:
         """Create a session's stream with some of the delays."""

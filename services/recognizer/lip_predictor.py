@@ -16,8 +16,8 @@ y        for each delay the FAPs, and log odds of closure and of      (delays, 1
 
     y = A f + B [h, u] + c
 
-A contains the encoder's own lips, the last of its features. They come from many voices, so they
-follow unseen speakers better, and contribute most to the FAPs. A also contains linear regressions
+The last features are the encoder's own estimate of the lips. This estimate was learned from many
+voices, so it generalizes best and contributes most to the FAPs. A also contains linear regressions
 to the lips of filmed speakers. B [h, u] follows these speakers more closely.
 
 There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen
@@ -67,7 +67,7 @@ _COLUMNS, _ONES, _OTHERS = (
 class LipPredictor:
     """A trained lip predictor, shared by any number of streams."""
 
-    delays: Floats  # (delays,) seconds, rising; a negative one is a forecast
+    delays: Floats  # (delays,) seconds, ascending; a negative delay is a forecast
     feature_mean: Floats  # (features,)
     projection: Floats  # (features, components)
     entry_weights: Floats  # (components, units): U
@@ -76,13 +76,13 @@ class LipPredictor:
     input_bias: Floats  # (3 units,)
     state_weights: Floats  # (units, 3 units)
     state_bias: Floats  # (3 units,)
-    lip_weights: Floats  # (last features, delays, 17): A; those of the others are 0
+    lip_weights: Floats  # (last features, delays, 17): A; the weights of all other features are 0
     output_weights: Floats  # (2 units, delays, 17): B
     output_bias: Floats  # (delays, 17): c
 
     @cached_property
     def delays_s(self) -> tuple[float, ...]:
-        """Delays that it offers, seconds, rising."""
+        """Available delays in seconds, ascending."""
         return tuple(round(float(delay_s), 6) for delay_s in self.delays)
 
     @cached_property
@@ -239,7 +239,7 @@ def _lip_predictor_from(archive: Archive) -> LipPredictor:
     _, units = _sizes(archive, "entry_weights", 2)
     num_lips = _sizes(archive, "lip_weights", 3)[0]
     if num_features != FRAMES_PER_POSITION * NUM_MELS + load_encoder().num_features:
-        raise ValueError("it was trained for another encoder")
+        raise ValueError("it was trained with another encoder.npz; run kouxing train lips")
     if num_lips > num_features:
         raise ValueError(f"it reads {num_lips} lip values from {num_features} features")
     outputs = (len(delays), NUM_OUTPUTS)

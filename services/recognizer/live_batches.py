@@ -110,7 +110,7 @@ class LiveBatches:
         self._on_decoded(sessions)
 
     def _waits_for_network(self, session: RecognizerSession) -> bool:
-        """Let a session wait for the block network if it needs it; under load, send its lips."""
+        """Queue a session for the block network if needed; under load, send its lips first."""
         if not self._recognizer.needs_network(session.stream):
             return False
         if self._pace.hop > 1:

@@ -42,8 +42,8 @@ class LiveDecoder:
     """Recognizes phones in score events.
 
     A phone is first emitted with ``final`` false and its mean duration, as soon as the output rule
-    allows (Li 2011, eq. 4). There is a mean after a pause and one inside a phrase. At that time
-    nobody can tell whether the phone is the last before a pause, and therefore longer.
+    allows (Li 2011, eq. 4). There is a mean after a pause and one inside a phrase. It is still
+    unknown whether a pause follows, which would lengthen the phone.
 
     The paper never corrects an emitted phone. Here, whenever a phone is emitted, the best string
     corrects the earlier ones. Such a phone is emitted again under its ``index``, with the measured
@@ -52,7 +52,7 @@ class LiveDecoder:
     within speech is a phone like any other.
 
     A phone is final when all paths of the search over settled scores share it, or speech has ended.
-    The final phones therefore equal those of a full traceback. Their confidence is the mean over
+    The final phones therefore equal offline decoding. Their confidence is the mean over
     their frames. The output rule and the provisional scores affect neither.
 
     If the model has provisional scores, the search continues over them. When the next scores come,

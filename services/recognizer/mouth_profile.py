@@ -62,7 +62,7 @@ def parse_mouth_profile(
 ) -> MouthProfile:
     """Parse a profile from an untrusted source, for the lip model with this SHA-256.
 
-    ``shape`` is that of the residual with this model.
+    ``shape`` is the shape of this model's residual.
 
     Raises ``UserError`` if it is not a profile, fits another model, or its values are out of
     bounds.

@@ -1,6 +1,6 @@
 """The recognizer: live audio in, phones, lip frames and speech events out.
 
-The five verbs are those of sherpa-onnx: create_stream, accept_waveform, is_ready, decode_streams
+The five verbs come from sherpa-onnx: create_stream, accept_waveform, is_ready, decode_streams
 and get_result.
 """
 
@@ -75,7 +75,7 @@ class Recognizer:
             time for the face.
         speech_time
             Media time at which current speech started, samples at 16 kHz, if another recognizer
-            processed its start. The networks' blocks then align with those of the other one.
+            processed its start. The networks' blocks then align with the other recognizer's.
         language
             Name of the language of the phones, as for :meth:`model_of`.
 

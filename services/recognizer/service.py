@@ -189,7 +189,7 @@ class RecognizerService(Service):
                 self._live.decode_all([flushed])
             flushed.audio.clear()
             flushed.link.forget()
-            flushed.without_audio_s = 0.0  # so that the face learns of a stalled client again
+            flushed.without_audio_s = 0.0  # so that a stalled client is reported again
             flushed.stream.flush()
             self._send_results(flushed)
             if flushed.end is not None:

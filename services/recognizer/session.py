@@ -77,7 +77,7 @@ class RecognizerSession:
         if start.mouth_profile is not None:
             try:
                 if lip_predictor is None:
-                    raise UserError("this recognizer has no lip predictor")
+                    raise UserError("this recognizer runs without a lip predictor")
                 lip_predictor = lip_predictor.with_mouth_profile(start.mouth_profile)
             except UserError as error:
                 self.mouth_profile_error = f"the mouth profile is not used: {error}"
@@ -157,7 +157,7 @@ class RecognizerSession:
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``AudioRejected`` if the sender may not send this message here."""
         if not secrets.compare_digest(self.start.token.encode(), message.token.encode()):
-            text = f"this is not the token of session {self.name!r}; use that of session-opened"
+            text = f"wrong token for session {self.name!r}; use the token of session-opened"
             raise AudioRejected(ErrorCode.BAD_TOKEN, text)
         if socket is not self.socket:
             text = f"send the audio of session {self.name!r} to the endpoint in session-opened"
@@ -202,7 +202,7 @@ class RecognizerSession:
     def accept_waveform(self, max_s: float, now_s: float, hop: int) -> None:
         """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old.
 
-        ``hop`` is that of the block network, in blocks.
+        ``hop`` is the hop of the block network, in blocks.
         """
         self.accepted_s = now_s
         self.stream.set_hop(hop)
@@ -291,7 +291,7 @@ class _AheadLimit:
         self._end_s: float | None = None  # media time of the end of the newest audio
 
     def allows(self, begin_s: float, duration_s: float, now_s: float) -> bool:
-        """Return whether audio, with the gap before it that frames fill, is not too early."""
+        """Return whether audio is within the allowed lead, including the gap before it."""
         gap_s = 0.0 if self._end_s is None else max(0.0, begin_s - self._end_s)
         passed_s = (now_s - self._updated_s) * _CLIENT_CLOCK_RATE
         lead_s = max(self._lead_s - passed_s, -MAX_LEAD_S) + duration_s

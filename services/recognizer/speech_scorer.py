@@ -71,7 +71,7 @@ class SpeechScorer:
     ``score_streams`` scores the speech, together with other sessions' audio. ``get_events`` returns
     the results in order.
 
-    The parameters besides the model are those of :class:`SpeechSegmenter`.
+    For the other parameters, see :class:`SpeechSegmenter`.
     """
 
     def __init__(

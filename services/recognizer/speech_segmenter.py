@@ -74,8 +74,8 @@ class SpeechSegmenter:
         Predicts lip frames during speech, if any.
     start_frame
         Frame at which speech started, if another recognizer processed its start; negative before
-        the audio. The first speech then starts where the network's blocks align with those of the
-        other recognizer.
+        the audio. The first speech then starts where the network's blocks align with the other
+        recognizer's.
     """
 
     def __init__(

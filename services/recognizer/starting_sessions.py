@@ -30,7 +30,7 @@ class StartingSessions:
         self._starts: dict[str, StartSession] = {}  # by session
 
     def add(self, start: StartSession) -> bool:
-        """Let a session wait, if its model is not loaded yet; return whether it waits.
+        """Queue a session whose model is not loaded yet; return whether it was queued.
 
         Raises ``UserError`` if no model has the language.
         """
@@ -47,16 +47,16 @@ class StartingSessions:
         return True
 
     def remove(self, session: str) -> None:
-        """Forget a session, if it waits."""
+        """Remove a session from the queue, if it is queued."""
         self._starts.pop(session, None)
 
     def set_face(self, session: str, face: FaceSettings) -> None:
-        """Change the face of a session, if it waits."""
+        """Change the face of a session, if it is queued."""
         if (start := self._starts.get(session)) is not None:
             self._starts[session] = replace(start, face=start.face.merged_with(face))
 
     def take_ready(self) -> list[StartSession]:
-        """Return the sessions whose model is now loaded; they wait no longer."""
+        """Remove and return the sessions whose model is loaded."""
         ready = [
             start
             for start in self._starts.values()

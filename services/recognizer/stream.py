@@ -106,7 +106,7 @@ class SpeechStream:
     def accept_waveform(self, samples: Floats, media_time: int | None = None) -> None:
         """Queue samples, (n,) or (n, channels), in [-1, 1], for decoding.
 
-        ``media_time`` is that of the first sample, samples at 16 kHz. None: there is no gap.
+        ``media_time`` is the time of the first sample, samples at 16 kHz. None: no gap.
 
         Raises ``UserError`` if the samples have another shape or are not finite.
         """

@@ -48,7 +48,7 @@ _LAUGH_POSITIONS = 50  # laughter ends after this many positions without a laugh
 
 
 class VoiceTraits(NamedTuple):
-    """Traits of a voice; the fields are those of ``Progress``."""
+    """Traits of a voice; the fields match ``Progress``."""
 
     arousal: float = 0.0
     valence: float = 0.0

@@ -2,7 +2,7 @@
 
 A tracker such as VSeeFace, or Live Link Face on an iPhone, sends its packets to a port of this
 machine instead of the program with the avatar. Each packet is forwarded on arrival. Its mouth is
-replaced with that of the session's newest frame, and everything else stays. While the tracker
+replaced with the mouth of the session's newest frame. Everything else stays. While the tracker
 sends, the session's own frames are not sent. Malformed packets are dropped.
 """
 

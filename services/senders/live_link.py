@@ -4,7 +4,7 @@ Layout, big-endian: u8 version; i32 length and device id; i32 length and subject
 f32 sub-frame, i32 frames per second, i32 denominator; u8 number of values; that number of f32. The
 values are ARKit's 52 weights, 0 to 1, then yaw, pitch and roll of the head and of each eye.
 
-Angles are those of ARKit's face anchor: radians to the subject's left, down, and tilted to its
+Angles follow ARKit's face anchor: radians to the subject's left, down, and tilted to its
 right. Unreal passes them on unchanged. In the app's own recordings each eye has roll = yaw *
 tan(pitch), as radians would; ``eyeLookDown`` has a positive pitch, ``eyeLookInRight`` a positive
 yaw. (Unreal's own ARKit plugin on the phone sends degrees / 180 instead.)

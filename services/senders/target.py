@@ -17,7 +17,7 @@ class Target:
     protocol: str  # one of ``protocols.PROTOCOLS``
     host: str
     port: int
-    options: Mapping[str, str]  # those of the protocol
+    options: Mapping[str, str]  # options of the protocol
     delay_s: float = 0.0  # additional delay of each frame
 
     @property

@@ -2,7 +2,7 @@
 
 The API is JSON over a WebSocket. The first time, the user allows kouxing in a VTube Studio window,
 which issues a token for later connections. Then kouxing requests the list of tracking parameters
-and sets those of ``tracking_parameters`` that exist in every frame. The model's own settings define
+and sets the ``tracking_parameters`` that exist, in every frame. The model's own settings define
 what they move.
 """
 

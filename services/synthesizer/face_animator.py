@@ -3,7 +3,7 @@
     events -> lip model -> modifiers -> frames
 
 Frames are clocked by media time, so they do not depend on the arrival times of events. The caller
-decides when a stream has stalled and requests frames that lead to rest (`FaceAnimator.relax`).
+decides when a stream has stalled and requests frames that return to rest (`FaceAnimator.relax`).
 
 The face moves continuously when another recognizer takes over (`change_recognizer`), when this face
 replaces the one of another process (`resume`), and when the lip model changes (`set_lip_model`). A
@@ -46,7 +46,7 @@ Faps: TypeAlias = NDArray[np.float64]  # (68,)
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
 MAX_DELAY_S = 1.5  # at most 0.3 live; a viseme further ahead has no visible weight
-REST_S = 0.3  # duration of the frames that lead to rest after the end of the sound
+REST_S = 0.3  # duration of the return to rest after the end of the sound
 _RECENT_S = 2.0  # events that a new lip model receives
 _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
 # Frames of a resumed face before it is shown. Older levels all act in the first of them. A brow or
@@ -138,7 +138,7 @@ class FaceAnimator:
         """Process an event; return the frames that are now due.
 
         After a gap of more than ``MAX_GAP_S`` the face starts again after the gap. The end of the
-        sound returns all remaining frames and those that lead to rest.
+        sound returns all remaining frames and the return to rest.
         """
         return list(self.iter_frames(event))
 
@@ -195,9 +195,9 @@ class FaceAnimator:
         self._shown = None if shown is None else shown.astype(np.float64)
 
     def relax(self, num_frames: int) -> list[Frame]:
-        """Return frames that lead to rest while no sound arrives.
+        """Return frames that return to rest while no sound arrives.
 
-        Their media time is that of the last frame. The face continues from its pose when sound
+        They all have the media time of the last frame. The face continues from its pose when sound
         arrives again.
         """
         step_s = 1.0 / self._frame_rate_hz
@@ -207,7 +207,7 @@ class FaceAnimator:
         return [self._make_frame(self._lip_stream.relax(step_s)) for _ in range(num_frames)]
 
     def flush(self) -> None:
-        """Drop the known events (an interruption); the next frames lead to rest."""
+        """Drop the known events (an interruption); the next frames return to rest."""
         self._recent.clear()
         self._lip_stream.flush()
 

@@ -4,9 +4,9 @@ Reacts to: results, phone, lip-positions, speech, progress (recognizer), start-s
 close-session, flush-session, set-face (control).
 Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
 
-Processed audio clocks the frames. A system under load therefore makes the same frames late. Audio
-faster than real time also gives the same frames. The wall clock leads the face to rest only while a
-live stream is stalled.
+Processed audio, not the wall clock, drives the frames. Load, or audio faster than real time,
+therefore changes only when frames appear. Only a stalled live stream uses the wall clock, to return
+the face to rest.
 """
 
 import itertools
@@ -141,7 +141,7 @@ class SynthesizerService(Service):
             self._end(stopped)
 
     def flush_session(self, session: str) -> None:
-        """Drop queued phones and lip frames; the next frames lead to rest."""
+        """Drop queued phones and lip frames; the next frames return to rest."""
         flushed = self._sessions.get(session)
         if flushed is not None:
             flushed.queue = deque(
@@ -187,7 +187,7 @@ class SynthesizerService(Service):
         )
 
     def on_tick(self, now_s: float) -> float:
-        """Acknowledge, lead faces of stalled live streams to rest, drop old frames."""
+        """Acknowledge messages, relax the faces of stalled live streams, and drop old frames."""
         if not self._sessions:
             return math.inf
         if now_s >= self._checked_s + CHECK_INTERVAL_S:

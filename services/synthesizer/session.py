@@ -22,7 +22,7 @@ from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame
 
-RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
+RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports for silent clients
 
 
 class SynthesizerSession:

@@ -1,7 +1,7 @@
 """Requested expressions, on a speaking face or on one at rest.
 
 Expressions ease in, stay for a time and fade, smoothed by a two-pole filter. Brows, lids, cheeks
-and mouth corners are added to those of speech. Lips that are closed for speech stay closed:
+and mouth corners are added to the speech. Lips that are closed for speech stay closed:
 
 ======  ====================================================  ========  =====
 symbol  meaning                                               unit      shape

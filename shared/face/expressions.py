@@ -13,7 +13,7 @@ DEFAULT_HOLD_S = 3.0  # expressions fade after this time
 class ExpressionName(StrEnum):
     """Expressions that the face can show in addition to speech."""
 
-    JOY = "joy"  # the first six are those of FAP 2, in its order
+    JOY = "joy"  # the first six are FAP 2's expressions, in its order
     SADNESS = "sadness"
     ANGER = "anger"
     FEAR = "fear"

@@ -1,4 +1,4 @@
-"""Values about lips that services and clients share."""
+"""Lip-model constants for services and clients."""
 
 import re
 

@@ -1,6 +1,6 @@
 """Nine drawn mouths (A to H and X) and the Oculus visemes as cues: one mouth at a time.
 
-The letters are those of Rhubarb Lip Sync (D. S. Wolf, README, "Mouth shapes"), after the studio
+The letters follow Rhubarb Lip Sync (D. S. Wolf, README, "Mouth shapes"), after the studio
 Hanna-Barbera: A closed, B slightly open, C open, D wide open, E slightly rounded, F puckered, G
 lower lip at the upper teeth, H tongue behind the upper teeth, X rest. They are computed from the
 FAPs of the face, so they match its lips in any language. Thresholds are FAP units, chosen for the
@@ -63,7 +63,7 @@ def oculus_viseme(faps: Float32) -> str:
 def mouth_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
     """Yield a cue for each change of the drawn mouth, as soon as it is certain.
 
-    ``frames`` are times in seconds and FAPs (68,). The first cue is that of the first frame. Closed
+    ``frames`` are times in seconds and FAPs (68,). The first cue starts at the first frame. Closed
     lips are A, and after 0.2 s X.
     """
     closed_since_s = -np.inf

@@ -1,7 +1,7 @@
 """The phones of a language, loaded from the language's package.
 
 A language is a package of tables (``table_language``), if it has ``language.toml``. Its phones are
-those of the universal inventory.
+phones of the universal inventory.
 
 A language with its own phones is a Python package with ``phones.tsv`` and a function
 ``pronounce``. It may also have:

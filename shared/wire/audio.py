@@ -8,7 +8,7 @@ from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message, Name
 
 
 class AudioChunk(Message, frozen=True, kw_only=True):
-    """PCM in the session's encoding; media_time is that of its first sample."""
+    """PCM in the session's encoding; media_time is the time of its first sample."""
 
     token: Name
     pcm: Annotated[bytes, Meta(max_length=MAX_AUDIO_BYTES)] = b""  # interleaved, little-endian

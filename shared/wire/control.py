@@ -53,7 +53,7 @@ class SessionInput(Struct, frozen=True, kw_only=True):
     """How far a service has processed the input of one session."""
 
     idle_s: Seconds = 0.0  # since its last input
-    sequence: Count = 0  # newest audio message that a recognizer in its place would not need
+    sequence: Count = 0  # last audio message that a replacement recognizer does not need
     media_time: Samples = 0  # the session's phones are final up to here
     lateness: Lateness | None = None  # lateness of a synthesizer's frames; None: no live frames
     skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service

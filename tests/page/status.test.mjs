@@ -135,7 +135,7 @@ test("texts of the gateway are translated with their values", () => {
     toChinese("a b.mp3: cannot read audio: this is text, not sound: 'x'"),
     "a b.mp3：无法读取声音：这是文本，不是声音：'x'",
   );
-  assert.equal(toChinese("a.wav: the file is empty; record it again\n1: unknown: why"), "a.wav：文件是空的，请重新录制\n1：unknown：why");
+  assert.equal(toChinese("a.wav: the file is empty\n1: unknown: why"), "a.wav：文件是空的\n1：unknown：why");
   assert.equal(toChinese("ARKit shapes of the mouth"), "嘴部的ARKit 形状");
 });
 

@@ -71,7 +71,7 @@ def test_rejects_a_predictor_for_another_encoder(tmp_path: Path) -> None:
     wider = np.pad(MODEL.projection, ((0, 2), (0, 0)))
     mean = np.pad(MODEL.feature_mean, (0, 2))
     write_archive(path, {**arrays_of(MODEL), "projection": wider, "feature_mean": mean})
-    with pytest.raises(UserError, match="trained for another encoder"):
+    with pytest.raises(UserError, match="trained with another encoder"):
         load_lip_predictor(path)
 
 

@@ -1,6 +1,6 @@
 """Batches for the block network: clean speech for the teacher, disturbed speech for the network.
 
-The disturbances are those of :mod:`kouxing.training.networks.augmentation`, plus background music
+The disturbances come from :mod:`kouxing.training.networks.augmentation`, plus background music
 and voices, clipping and lossy coding.
 
 An excerpt is cut from the concatenated recordings, at a random speed. The teacher gets it clean,

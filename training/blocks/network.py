@@ -15,7 +15,7 @@ cached. The right context is computed again as a part of later blocks.
 
 For training, all blocks of a recording are computed at once: first its positions, then a copy of
 each block's right context, with an attention mask. Both ways give the same results. Outputs of a
-block's own positions are final, those of its right context provisional. The network does not depend
+block's own positions are final, and its right context is provisional. The network does not depend
 on ``B``, so live use may choose another ``B`` than training.
 
     z = clip((concat(h_4, h_5, h_6) - mean) / deviation, -6, 6)

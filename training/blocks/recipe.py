@@ -2,7 +2,7 @@
 
 A trained acoustic model aligns the recordings with their texts, and a teacher labels all recordings
 (:mod:`kouxing.training.networks.labels`). Some recordings get a sung copy. Then encoder and readout
-are tuned in blocks. The HMMs are estimated from the alignment; the phone language model is that of
+are tuned in blocks. The HMMs are estimated from the alignment; the phone language model comes from
 the acoustic model.
 
 Training can be interrupted. Labels and checkpoint are stored next to the output, as ``.labels.npz``

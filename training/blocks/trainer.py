@@ -11,7 +11,7 @@ targets); Romero et al. 2015, "FitNets: hints for thin deep nets" (hidden layers
 symbol   meaning                                                       shape
 ======== ============================================================= ==================
 h        positions of the network after the layers that are read       (n, 3 width)
-h_whole  those of the unchanged encoder, which sees the whole clean    (n, 3 width)
+h_whole  output of the unchanged encoder, which sees the whole clean    (n, 3 width)
          audio
 H        mean cross-entropy with the target states, nats a frame       1
 ======== ============================================================= ==================

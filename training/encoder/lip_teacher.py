@@ -148,7 +148,7 @@ def train_lip_teacher(
     phones: Mapping[str, Sequence[Phone]],
     seed: int,
 ) -> LipTeacher:
-    """Train the teacher on filmed clips; ``phones`` has those of clips in its language, by name."""
+    """Train the teacher on filmed clips; ``phones`` has phones by clip name."""
     projection = Projection.of(np.concatenate([one.whisper for one in features]))
     closed_at = closed_below(clips)
     targets = []

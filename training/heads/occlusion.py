@@ -161,7 +161,7 @@ def _shown(triangles: NDArray[np.int64], visible: NDArray[np.bool_]) -> NDArray[
 
 
 def _outward(piece: HeadPiece) -> Float:
-    """Return normals (V, 3); those of hair point away from the skull."""
+    """Return normals (V, 3). Normals of hair point away from the skull."""
     points = _opened(piece)
     if piece.name != "hair":
         return subdivision.vertex_normals(points, piece.part.triangles)

@@ -143,7 +143,7 @@ def skin(
     jaw = np.interp(face.angle, [0.0, 0.8, 1.3, 1.5, 1.7, 2.0], [4.95, 5.05, 5.20, 5.28, 5.4, 6.0])
     weight = np.clip((face.y - jaw) / 0.15, 0, 1) * np.clip((6.45 - face.y) / 0.2, 0, 1)
     tones = 1 + (tones - 1) * weight[..., None]
-    # the nostrils of MakeHuman's skin are larger than those of the heads
+    # MakeHuman's skin has larger nostrils than the heads
     nose = np.clip(1.5 * _spot(face, 0.10, 5.38, 0.17, 0.13), 0, 1)[..., None]
     tones += (ndimage.gaussian_filter(np.maximum(tones, 0.85), (18, 18, 0)) - tones) * nose
     # its lips have other outlines, and its tear ducts are folded

@@ -1,6 +1,6 @@
 """The pieces of a head, and the file that ``services.driver.head.head`` reads.
 
-Eyeballs are made here, because those of MakeHuman's base mesh are too coarse.
+Eyeballs are made here, because MakeHuman's eyeballs are too coarse.
 
 All lengths are MakeHuman decimeters, y up, z toward the viewer, x to the subject's left.
 """

@@ -21,7 +21,7 @@ Floats = NDArray[np.float32]
 
 UNITS = 96
 _DROPOUT = 0.3
-_INPUT_NOISE = 0.1  # standard deviation; that of a component is 1
+_INPUT_NOISE = 0.1  # standard deviation; a component has 1
 _PIECE = 200  # positions
 _MIN_PIECE = 10
 _BATCH = 32  # pieces

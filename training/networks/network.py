@@ -38,7 +38,7 @@ PADDING_FRAMES = 2  # zeros before a segment's first frame
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shape:
-    """Sizes of a network; the defaults are those of Whisper base."""
+    """Sizes of a network; the defaults match Whisper base."""
 
     width: int = 512
     heads: int = 8
@@ -140,7 +140,7 @@ class Readout(nn.Module):
         self.dropout = nn.Dropout(shape.dropout)
 
     def standardize(self, features: Tensor) -> None:
-        """Set mean and deviation to those of features, (n, features)."""
+        """Set mean and deviation from features, (n, features)."""
         self.mean[:] = features.mean(dim=0)
         self.deviation[:] = features.std(dim=0) + 1e-3
 

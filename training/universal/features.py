@@ -60,7 +60,7 @@ class FeatureStore:
         self.mean = self.deviation = np.empty(0, np.float32)
 
     def standardize(self, recordings: Sequence[Utterance]) -> None:
-        """Set mean and deviation to those of some recordings, or read them."""
+        """Compute mean and deviation from some recordings, or read them."""
 
         def compute() -> dict[str, NDArray[np.float32]]:
             size = min(_NUM_STANDARDIZED, len(recordings))

@@ -1,6 +1,6 @@
 """Trains the universal readout on stored features.
 
-The readout is that of the block network (:mod:`kouxing.training.blocks.network`). Its loss is the
+The readout is defined in :mod:`kouxing.training.blocks.network`. Its loss is the
 cross-entropy with the aligned states, of a block's own positions and, with half the weight, of its
 right context. The encoder is not trained.
 """
@@ -49,7 +49,7 @@ def train_readout(
 ) -> BlockReadout:
     """Train a readout; return one with the running mean of its weights.
 
-    ``states`` are those of the frames of each recording, by its name. ``weights`` are the relative
+    ``states`` are the states of each recording's frames, by its name. ``weights`` are the relative
     sampling weights of the recordings.
     """
     probs = np.cumsum(weights) / np.sum(weights)

@@ -119,7 +119,7 @@ export class LearntLips {
   }
 }
 
-/** Return the log odds of a closure, from those of the sound and those that phones add. */
+/** Return the log odds of a closure: those from the sound, plus those that phones add. */
 function closureLogOdds(faps, sound, phones, rule, c) {
   const opening = -(faps[c.INNER_UPPER] + faps[c.INNER_LOWER]);
   const width = faps[c.LEFT_CORNER] + faps[c.RIGHT_CORNER];

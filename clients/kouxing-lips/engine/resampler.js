@@ -25,7 +25,7 @@ export class Resampler {
 
   /** Throws a RangeError if the rate is outside 8000 to 192000 Hz. */
   constructor(rateHz, { constants: { resample: c } }) {
-    // Browsers record up to 192 kHz. The server's limit is that of its clients.
+    // Browsers record up to 192 kHz. The server accepts up to 48 kHz.
     const highest = 4 * c.MAX_RATE_HZ;
     if (!(rateHz >= c.MIN_RATE_HZ && rateHz <= highest)) {
       throw new RangeError(`the sample rate ${rateHz} Hz is out of range; use ${c.MIN_RATE_HZ} to ${highest} Hz`);

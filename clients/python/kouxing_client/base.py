@@ -85,7 +85,7 @@ class BaseClient:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the client was closed, or has failed, such as for lack of file descriptors."""
+        """Whether ``close`` was called or a fatal error occurred, such as too many open files."""
         return not self._thread.is_running
 
     def _request(self, kind: str, session: str, fields: Fields) -> Future[Fields]:

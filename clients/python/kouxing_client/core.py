@@ -48,7 +48,7 @@ class _Request:
 class ClientCore:
     """Sends requests to control, and passes its messages to the sessions.
 
-    The parameters are those of ``ClientThread``; ``control`` includes control's public key.
+    For the parameters, see ``ClientThread``; ``control`` includes control's public key.
     """
 
     def __init__(

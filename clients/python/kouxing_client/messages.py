@@ -51,7 +51,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
     epoch: int = 0
     """placement of the session; it grows each time the session moves to another process"""
     sequence: int = 0
-    """number of the message among those of its publisher"""
+    """sequence number of the message, counted by its publisher"""
     media_time: int = 0
     """samples at 16 kHz since the session's first sample"""
 

@@ -100,7 +100,7 @@ def _turn_fractions(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
 
 
 def find_bones(glb: Glb) -> dict[int, str]:
-    """Return the bones by their nodes: those of a VRM, otherwise head, neck and jaw by name."""
+    """Return the bones by node: all bones of a VRM, otherwise head, neck and jaw by name."""
     extensions = glb.json.get("extensions", {})
     old_bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     new_bones = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})

@@ -86,7 +86,7 @@ def pack(
 ) -> dict[str, NDArray[Any]]:
     """Convert pieces (in the head's axes, m) to the arrays of a head file, see ``head.assemble``.
 
-    ``fields`` are those of each piece; the others are as in ``Head``.
+    ``fields`` has the fields of each piece. For the other parameters, see ``Head``.
     """
     first = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
     bounds = np.cumsum([0] + [len(piece.triangles) for piece in pieces])

@@ -48,7 +48,7 @@ def extension(
 ) -> dict[str, Any]:
     """Return the contents of the extension for an avatar.
 
-    ``nodes`` are those of the bones, ``bindings`` are the locations of the morph targets, and
+    ``nodes`` are the bones' nodes, ``bindings`` are the locations of the morph targets, and
     ``eyes`` is the offset from the head's pivot to the point between the eyes, m. An avatar that
     ``is_free`` is under CC0; otherwise only its author may use it.
     """

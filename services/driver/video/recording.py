@@ -117,7 +117,7 @@ class Recording:
 
 
 def interpolate(before: tuple[float, Faps], after: tuple[float, Faps], time_s: float) -> Faps:
-    """Return the FAPs at a time between two frames; outside, those of the nearer frame."""
+    """Interpolate the FAPs between two frames; outside, return the FAPs of the nearer frame."""
     (start_s, start), (end_s, end) = before, after
     if end_s <= start_s:
         return start

@@ -93,7 +93,7 @@ def open_writer(
 ) -> VideoWriter | PictureSequence:
     """Open a writer for a path: a video, or pictures in a folder or named like ``name%05d.png``.
 
-    The parameters are those of ``VideoWriter``; pictures are always overwritten.
+    For the parameters, see ``VideoWriter``. Pictures are always overwritten.
 
     Raises ``UserError`` if the path is not a valid output, or cannot be written.
     """
@@ -134,10 +134,10 @@ def picture_name(path: Path, number: int) -> Path:
 class VideoWriter:
     """A video that appears under its name when it is complete.
 
-    Width and height are even, the frame rate is 1 to 1000 Hz. ``sample_rate_hz`` is that of
-    the sound, or None for no sound; ``.webp`` never has sound. Pictures are ``transparent`` if
-    they have an alpha channel. Unless ``overwrite`` is set, ``close`` adds a number to the name of
-    an existing file.
+    Width and height are even, the frame rate is 1 to 1000 Hz. ``sample_rate_hz`` is the rate of the
+    sound, or None for no sound; ``.webp`` never has sound. Pictures are ``transparent`` if they
+    have an alpha channel. Unless ``overwrite`` is set, ``close`` adds a number to the name of an
+    existing file.
 
     Raises ``UserError`` if the file cannot be written or a value is not possible.
     """

@@ -1,8 +1,8 @@
 // Chinese for the texts of the gateway. {name} is a placeholder for a value, which is also translated.
 
 const CHINESE = {
-  // Files: the same texts as those of the commands
-  "the file is empty; record it again": "文件是空的，请重新录制",
+  // Files: the same texts as the commands print
+  "the file is empty": "文件是空的",
   "cannot read audio: this is {kind}": "无法读取声音：这是{kind}",
   "text, not sound: {text}": "文本，不是声音：{text}",
   "a zip archive; unpack it first": "zip 压缩包，请先解压",
@@ -23,7 +23,7 @@ const CHINESE = {
   "the file contains no samples; record it again": "文件里没有声音数据，请重新录制",
   "the sound is encrypted (DRM); use a copy without protection": "声音已加密（DRM），请用没有保护的副本",
   "the sound is damaged or encrypted; nothing can be decoded; export it again": "声音已损坏或加密，无法解码；请重新导出",
-  "the file has no audio, only {kinds}; record the sound": "文件里没有声音，请录制带声音的文件",
+  "the file has {kinds} but no audio track": "文件里没有声音轨道",
   "the codec of audio track {track} is unknown; export the sound as wav, flac, mp3 or m4a": "无法识别第 {track} 条音轨的编码，请导出为 wav、flac、mp3 或 m4a",
   "{codec} is not supported; export the sound as 16-bit PCM": "不支持 {codec}，请导出为 16 位 PCM",
   "{count} audio tracks: {tracks}. This reads track {track}; choose another with --track":

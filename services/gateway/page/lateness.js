@@ -13,7 +13,7 @@ const RECENT_MS = 1000; // window of the displayed lateness
 const IMAGES_MS = 3000; // window of the delays of images
 
 /**
- * The lateness of the face: that of the newest frame, and the delay until its image is visible. A live
+ * The lateness of the face: the lateness of the newest frame, plus the delay until its image is visible. A live
  * client sends audio in real time. The arrival of a frame minus its media time is therefore constant for
  * frames in time, and greater for late frames. Frames are compared with the earliest one of the last
  * 10 s, because clocks drift and a client may lose audio.

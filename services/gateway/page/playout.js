@@ -102,7 +102,7 @@ export class Playout {
     return this.offsetMs === null ? null : (nowMs - this.offsetMs) * SAMPLES_PER_MS;
   }
 
-  /** Record the arrival of a frame. Its media time must be greater than that of the frame before. */
+  /** Record the arrival of a frame. Its media time must be greater than the previous frame's. */
   frameArrived(nowMs, mediaTime) {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const outputMs = Math.max(this.imageDelayMs, this.outputLatencyMs);
@@ -132,7 +132,7 @@ export class Playout {
     const { percentile, marginMs, leapMs } = this.isAudible ? WITH_SOUND : WITHOUT_SOUND;
     let latestMs = this.frames.percentile(percentile) + this.imageDelayMs;
     if (this.isAudible && this.soundStarts.count) {
-      // The lateness of a long chunk of sound is that of its first sample.
+      // The lateness of a long chunk of sound is the lateness of its first sample.
       const soundMs = this.soundStarts.percentile(percentile) + this.outputLatencyMs;
       latestMs = Math.max(latestMs, soundMs);
     }

@@ -4,7 +4,7 @@ Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak su
 encoder); Shi et al. 2021, "Emformer: efficient memory transformer based acoustic model for low
 latency streaming speech recognition" (blocks with a cached past, whose right context is
 recomputed); Bourlard and Morgan 1994, "Connectionist speech recognition" (scores are posteriors
-divided by priors). HMMs, search and output rule are those of Li et al. 2011. The network is that of
+divided by priors). HMMs, search and output rule follow Li et al. 2011. The network is defined in
 :mod:`kouxing.training.blocks.network`.
 
 ============== ====================================================== ========================
@@ -330,7 +330,7 @@ class BlockStream(AcousticStream):
         self._num_due = min(num_due, MAX_POSITIONS - self._row)
 
     def take_final_scores(self) -> Floats:
-        """Return the new settled scores, (m, states); at the end those of all remaining frames."""
+        """Return the new final scores, (m, states); at the end, of all remaining frames."""
         rows = np.concatenate([self._empty_scores, *self._settled])
         self._settled = []
         self._num_settled += len(rows)
@@ -404,7 +404,7 @@ def model_of(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
     sizes = model.session.sizes
     past = NetworkState(np.zeros(sizes.state, np.float32), np.zeros(sizes.rings, np.float16))
     frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
-    num_kept = sizes.block + 1  # another number than that of the file
+    num_kept = sizes.block + 1  # differs from the number in the file
     outputs = model.session.run([Block(frames, 0, sizes.length, num_kept, num_kept, past)])
     new = (1, 2 * sizes.layers, sizes.heads, num_kept, sizes.head_size)
     check_outputs(outputs, [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new])

@@ -26,8 +26,8 @@ def model_of_language(language: str | None = None, acoustic: str | None = None) 
     """Return the acoustic model with the phones of a language; by default Mandarin.
 
     Mandarin has its own model. For other languages, the universal model is restricted to the phones
-    of the language. ``acoustic`` names another model, or its file. Without a language, the phones
-    are those of the model.
+    of the language. ``acoustic`` names another model, or its file. Without a language, all phones
+    of the model are used.
 
     Raises ``UserError`` if the language is not installed, or the model has other phones.
     """

@@ -1,7 +1,7 @@
 """Light model: the phones of the audio encoder, for weak or busy machines.
 
 The encoder runs on all audio, so these phones cost only their search. HMMs and phone language model
-are those of the block model.
+come from the block model.
 
 ======== ============================================================== ==================
 symbol   meaning                                                        shape
@@ -12,7 +12,7 @@ prior    prior of the phones, to a power below one                      (phones,
 
     log b(x) = acoustic_scale * (q - log prior), the same for all states of a phone
 
-The encoder's posteriors after frame ``t`` are those of frame ``t - PHONES_LAG_FRAMES``. At the end
+After frame ``t``, the encoder outputs the posteriors of frame ``t - PHONES_LAG_FRAMES``. At the end
 of a segment, the last ones are repeated.
 """
 
@@ -140,5 +140,5 @@ def light_model_from(archive: Archive) -> LightModel:
     topology = topology_from(archive)
     model = light_model(topology, archive.floats("log_prior", topology.num_states))
     if model is None:
-        raise ValueError("its phones differ from those of the audio encoder")
+        raise ValueError("its phones differ from the audio encoder's phones")
     return model

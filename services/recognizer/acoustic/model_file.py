@@ -212,5 +212,5 @@ def inventory_from(archive: Archive) -> PhoneInventory:
     """Load the inventory of the file's language, and check that the file has the same phones."""
     inventory = load_inventory(str(archive.array("language", ())))
     if tuple(archive.array("phones", None).tolist()) != inventory.phones:
-        raise ValueError(f"its phones are not those of the installed language {inventory.language}")
+        raise ValueError(f"its phones differ from the installed language {inventory.language}")
     return inventory

@@ -1,7 +1,7 @@
 """Universal phones: a second readout of the block network, for all languages.
 
 The file has an extension of the shipped block network instead of a network
-(:mod:`kouxing.training.universal.export`). Its phones are those of the universal inventory.
+(:mod:`kouxing.training.universal.export`). Its phones are the universal inventory.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ def universal_model_from(archive: Archive, network: NDArray[np.uint8]) -> BlockM
 
 
 def save_universal(path: Path, model: BlockModel, extension: NDArray[np.uint8]) -> None:
-    """Write a model whose network is that of the shipped block model, followed by an extension."""
+    """Write a model that extends the network of the shipped block model."""
     write_model(
         path,
         FORMAT,

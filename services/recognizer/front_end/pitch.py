@@ -52,7 +52,7 @@ class PitchTracker:
     def track(self, samples: NDArray[np.float32]) -> float:
         """Return the pitch in Hz after the next 20 ms, 16 kHz mono, shape (320,); 0 if unvoiced.
 
-        The pitch is that of about 10 ms before the end.
+        The pitch is measured about 10 ms before the end.
         """
         scaled = (samples * _FULL_SCALE).tolist()
         if self._num_slices % _REPLACE_AFTER == _REPLACE_AFTER - _START_BEFORE:

@@ -42,7 +42,7 @@ Only the Gaussian mixture model uses VTLN: the networks learned low voices from 
 tracker (:mod:`.pitch`) gives other values than this one, which would change the model's scores.
 
 Cost: about 1 ms per second of audio. A frame's pitch depends on the samples up to the frame's end,
-so VTLN adds no delay to that of the features. The sums run in a fixed order, so the result does not
+so VTLN adds no delay to the features. The sums run in a fixed order, so the result does not
 depend on the chunks.
 """
 

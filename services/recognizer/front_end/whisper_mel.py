@@ -1,7 +1,7 @@
 """The front end of the networks: Whisper's log-mel bands, live.
 
 Source: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision", section
-2.2; the mel scale and the bands are those of Slaney 1998, "Auditory toolbox".
+2.2; the mel scale and the bands follow Slaney 1998, "Auditory toolbox".
 
     m[t, k] = (log10(max(sum_f B[f, k] |X[t, f]|^2, 1e-7)) + 4) / 4
 

@@ -51,7 +51,7 @@ def utterance_graph(
 ) -> UtteranceGraph:
     """Lay out the states of an utterance, with an optional pause at each syllable boundary.
 
-    ``syllables`` are the numbers of phones; ``first_state`` is that of ``Topology``.
+    ``syllables`` contain phone indices; ``first_state`` comes from ``Topology``.
     """
     states: list[int] = []
     skip_from: list[int] = []

@@ -33,7 +33,7 @@ class MouthFrame(Record, frozen=True):
 
 
 class LipStream(Protocol):
-    """The lips of one session. Frame times rise."""
+    """The lips of one session. Frame times increase."""
 
     def add_event(self, event: SoundEvent) -> None:
         """Add an event; events that the lip model does not use are ignored."""
@@ -45,7 +45,7 @@ class LipStream(Protocol):
         """Return the mouth one step closer to rest while media time does not advance."""
 
     def flush(self) -> None:
-        """Drop the known events (an interruption); the next frames lead to rest."""
+        """Drop the known events (an interruption); the next frames return to rest."""
 
 
 class LipModel(Protocol):

@@ -39,7 +39,7 @@ def clip(state: FapState, lowest: Array, highest: Array) -> FapState:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """Leads the difference between two trajectories to zero along cubics, one duration per FAP."""
+    """Blends two trajectories: their difference decays along a cubic, with one duration per FAP."""
 
     difference: FapState
     duration_s: Array

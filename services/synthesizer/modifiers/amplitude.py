@@ -5,8 +5,8 @@ Louder speech opens jaw and lips further (Lombard speech; Schulman 1989), fast s
 
 The level is compared with the usual level of the current viseme, because open vowels are naturally
 louder than closed ones, and with the speaker's mean, so that microphone gain has no effect. Levels
-are known immediately, phones about 0.1 s later. With a short delay, a level above that of the known
-phone therefore predicts the next vowel.
+are known immediately, phones about 0.1 s later. With a short delay, a level above the known phone's
+therefore predicts the next vowel.
 
 The rate acts twice. Blending makes fast visemes miss their targets, which explains about half of
 the reduction in real lips; `_PER_RATE` is the other half (see docs/visemes.md).

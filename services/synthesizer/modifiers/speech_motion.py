@@ -38,7 +38,7 @@ from kouxing.shared.face.idle_motion import EYES_PITCH, EYES_YAW, IdleMotion, St
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # prominence of syllables with these movements
-_MAX_EXCESS = 1.2  # prominence above that of the weakest nod, of the largest one
+_MAX_EXCESS = 1.2  # prominence of the largest nod above the weakest nod
 _MIN_NOD_INTERVAL_S, _MIN_BROW_INTERVAL_S = 1.0, 2.5
 _MIN_SIZE = 0.5  # size of the weakest nod, relative to the largest one
 _STARTING_S = 0.9  # duration of speech after a pause

@@ -22,8 +22,8 @@ class DerivedViseme:
 
     name: str
     base: str
-    opening: float  # factor on that of the base
-    rounding: float  # factor on that of the base
+    opening: float  # factor on the opening of the base
+    rounding: float  # factor on the rounding of the base
     spread: float  # added to the width, FAP units
     tongue: str  # viseme with the same tongue, or the values of _TONGUE
 
@@ -60,7 +60,7 @@ def add_derived(arrays: Mapping[str, Array], index: Mapping[str, int]) -> dict[s
 
 
 def derived_targets(targets: Array, index: Mapping[str, int]) -> Array:
-    """Return the targets (num_derived, num_mouth_faps) from those of the trained visemes."""
+    """Return the targets (num_derived, num_mouth_faps) from the trained visemes' targets."""
     made = np.empty((len(derived_visemes()), len(MOUTH_FAPS)))
     opening, width, protrusion, tongue = (
         [MOUTH_FAPS.index(fap) for fap in faps] for faps in (_OPENING, _WIDTH, _PROTRUSION, _TONGUE)

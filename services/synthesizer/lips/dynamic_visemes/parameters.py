@@ -96,13 +96,13 @@ class VisemeParameters:
             if value.shape != shape:
                 raise UserError(
                     f"viseme parameters: {name} has shape {value.shape}, expected {shape}; "
-                    "restore the file, or train again"
+                    "reinstall kouxing, or train it with 'kouxing train visemes'"
                 )
             low, high = _LIMITS[name if name in _LIMITS else name.split("_")[0]]
             if not np.all((value >= low) & (value <= high)):
                 raise UserError(
                     f"viseme parameters: {name} is not between {low:g} and {high:g}; "
-                    "restore the file, or train again"
+                    "reinstall kouxing, or train it with 'kouxing train visemes'"
                 )
         of_visemes = (self.offset_s, np.log(self.alpha), self.theta_minus, self.theta_plus)
         object.__setattr__(self, "dominance", np.stack(of_visemes, axis=1))

@@ -218,7 +218,7 @@ class FergusonStream:
         return self._segments[-1].end_s if self._segments else -np.inf
 
     def _make_key_frames(self, phones: Sequence[Phone]) -> KeyFrames:
-        """Return the key frames of the known audio, followed by those of an expected phone."""
+        """Return the key frames of the known audio, followed by an expected phone's."""
         silence, opening = self._model.inventory.silence, self._model.table.opening
         frames = [(time_s, opening[symbol]) for time_s, symbol in anchors_of(phones, silence)]
         expected: list[tuple[float, float]] = []

@@ -33,11 +33,11 @@ from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, Speec
 
 HOLD_S = 0.85  # lips stay ajar until this time after the last sound
 LEAD_S = 0.36  # lips part this long before voice activity, if it is known
-PART_S, CLOSE_S = 0.15, 0.4  # time to the ajar mouth, and back if the pause lasts
+PART_S, CLOSE_S = 0.15, 0.4  # time to open the mouth slightly, and to close it if the pause lasts
 CERTAIN = 0.98  # probability from which the lip predictor closes lips in a pause
-_YIELD_S = 0.06  # time back before a sound, and to lips that the predictor closes
-_END_S = 0.25  # time back after the end of the audio
-_RELAX_S = 0.12  # time back while no audio arrives
+_YIELD_S = 0.06  # closing time before a sound, or when the predictor closes the lips
+_END_S = 0.25  # closing time after the end of the audio
+_RELAX_S = 0.12  # closing time while no audio arrives
 _MIN_PAUSE_S = 0.12
 _RANGE_DB = 25.0
 _FADE_DB = 0.2  # per level; the loudest one fades, so a bang counts only for a short time
@@ -88,7 +88,7 @@ class RestingLips:
                 self._has_ended = True
 
     def flush(self) -> None:
-        """Drop the known events; the next frames lead to rest."""
+        """Drop the known events; the next frames return to rest."""
         self._levels.clear()
         self._changes.clear()
         self._is_voice, self._sound_s = False, -math.inf

@@ -1,8 +1,8 @@
 """A continuous mouth trajectory from lip frames.
 
-Lip frames are joined by cubic Hermite splines. The velocity at a frame is that of the line from the
-previous frame, so position and velocity are continuous without waiting for the next frame. If
-frames are missing, the mouth moves to rest and back.
+Lip frames are joined by cubic Hermite splines. The velocity at a frame is the slope of the line
+from the previous frame, so position and velocity are continuous without waiting for the next frame.
+If frames are missing, the mouth moves to rest and back.
 """
 
 from bisect import bisect_right
