@@ -196,7 +196,7 @@ def disturbed_lips(results: Results) -> list[str]:
 
 def lookahead(results: Results) -> Table:
     """Return the correlation of the opening and the F1 of closures by look-ahead."""
-    curves = _lookahead_curves(results)
+    curves = lookahead_curves(results)
     delays = sorted({delay for points in curves.values() for delay in points})
     rows = []
     for lips, points in curves.items():
@@ -205,6 +205,15 @@ def lookahead(results: Results) -> Table:
             rows.append([f"{lips}, {name}", *values])
     rows.append(["floor of the latency, ms", *(str(display_floor_ms(delay)) for delay in delays)])
     return ("lip model", *(f"{delay} ms" for delay in delays)), rows
+
+
+def lookahead_curves(results: Results) -> dict[str, dict[int, dict[str, Any]]]:
+    """Return the scores of all clips by lip model and delay, ms."""
+    curves: dict[str, dict[int, dict[str, Any]]] = {}
+    for face, groups in _clean_scores(results.get("lookahead", {})).items():
+        lips, _, delay = face.partition(", ")
+        curves.setdefault(lips, {})[int(float(delay.removesuffix(" ms")))] = groups[ALL]
+    return curves
 
 
 def schemes(results: Results) -> Table:
@@ -288,12 +297,3 @@ def _all_faces(results: Results) -> Iterator[tuple[str, dict[str, Any]]]:
         yield "real lips", faces[REAL][CLEAN][ALL]
     for face, groups in _clean_scores(faces).items():
         yield title_of(face), groups[ALL]
-
-
-def _lookahead_curves(results: Results) -> dict[str, dict[int, dict[str, Any]]]:
-    """Return the scores of all clips by lip model and delay, ms."""
-    curves: dict[str, dict[int, dict[str, Any]]] = {}
-    for face, groups in _clean_scores(results.get("lookahead", {})).items():
-        lips, _, delay = face.partition(", ")
-        curves.setdefault(lips, {})[int(float(delay.removesuffix(" ms")))] = groups[ALL]
-    return curves

@@ -1,4 +1,4 @@
-"""Writes the report page, docs/results.md, from the results of the steps.
+"""Writes the report page, docs/results.md, and its picture from the results of the steps.
 
 ``template.md`` has the text, with a line ``[[NAME]]`` for each table.
 """
@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from kouxing.corpora.figures import new_figure, save_figure
 from kouxing.evaluation.report import lip_tables, system_tables
 from kouxing.evaluation.report.markdown import Results, Table, bullets, markdown
 from kouxing.evaluation.report.recognition_table import better_recognizers, recognition
 from kouxing.evaluation.report.steps import STEPS
 
+PICTURE = "lookahead.png"
 _TEMPLATE = Path(__file__).with_name("template.md")
 
 
@@ -47,7 +49,7 @@ def read_results(folder: Path) -> dict[str, Any]:
 
 
 def write_page(folder: Path, page: Path) -> None:
-    """Write the page from the results in a folder."""
+    """Write the page and its picture from the results in a folder."""
     steps = read_results(folder)
     results = {name: step["result"] for name, step in steps.items()}
     better = [
@@ -60,6 +62,8 @@ def write_page(folder: Path, page: Path) -> None:
     )
     parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _part(match[1], steps, results), text)
     page.write_text(parts, encoding="utf-8")
+    if "lookahead" in results:
+        save_figure(_lookahead_figure(results), page.with_name(PICTURE))
 
 
 def _part(name: str, steps: Results, results: Results) -> str:
@@ -80,3 +84,18 @@ def _describe_measurement(step: Results) -> str:
     measured = f"{step['machine']}, {step['date']}, commit {step['commit']}"
     cpu = f" ({step['cpu_seconds']} s of processor time)" if "cpu_seconds" in step else ""
     return f"`{commands}`: {measured}, {step['seconds']} s{cpu}, load {step['load']:.1f}"
+
+
+def _lookahead_figure(results: Results) -> Any:
+    figure = new_figure(9.0, 3.6)
+    axes = figure.subplots(1, 2, sharex=True)
+    titles = {"r_opening": "correlation of the opening", "closure_f1": "F1 of closures"}
+    for lips, points in lip_tables.lookahead_curves(results).items():
+        for axis, (measure, title) in zip(axes, titles.items(), strict=True):
+            delays = sorted(points)
+            axis.plot(delays, [points[delay][measure] for delay in delays], "o-", label=lips)
+            axis.set_title(title, fontsize=9)
+            axis.set_xlabel("look-ahead, ms")
+            axis.set_ylim(0.0, 1.0)
+    axes[-1].legend(fontsize=8)
+    return figure

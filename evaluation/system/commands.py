@@ -112,6 +112,7 @@ def load(
         float, typer.Option(min=1.0, help="Duration of each of up to 9 steps, in seconds.")
     ] = 12.0,
     language: Language = None,
+    picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -119,12 +120,15 @@ def load(
 
     A single client process streams to all sessions, with different voices.
     """
-    from kouxing.evaluation.system.load import measure, show
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.system.load import draw, measure, show
 
-    check_output(json_file, force=force)
+    check_output(picture, json_file, force=force)
     paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
     figures = measure(paths, sessions, seconds, CONSOLE, language)
     show(figures, Console())
+    if picture is not None:
+        save_figure(draw(figures), picture)
     write_json(json_file, asdict(figures) | {"summary": figures.summary})
 
 

@@ -12,12 +12,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from kouxing_client import Client, FapFrame, Refused, Session
 from numpy.typing import NDArray
 from rich.console import Console
 
+from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.system.latency import percentiles
 from kouxing.evaluation.system.live import CHUNK, CHUNK_S
 from kouxing.evaluation.system.systems import LocalSystem
@@ -253,6 +255,32 @@ def show(load: Load, console: Console) -> None:
         f"{figures['recognizer_mb_per_session']:.1f} MB in the recognizer and "
         f"{figures['synthesizer_mb_per_session']:.1f} MB in the synthesizer."
     )
+
+
+def draw(load: Load) -> Any:
+    """Plot latency, CPU and memory over the number of requested sessions."""
+    requested = [step.num_asked for step in load.steps]
+    figure = new_figure(12.0, 4.0)
+    delay, cpu, memory = figure.subplots(1, 3)
+    for key in ("p50", "p95"):
+        values = [step.delay_ms.get(key, float("nan")) for step in load.steps]
+        delay.plot(requested, values, "o-", label=f"{key}, all sessions")
+    worst = [step.worst_p95_ms for step in load.steps]
+    delay.plot(requested, worst, "s--", label="p95, worst session")
+    delay.axhline(LIMIT_MS, color="grey", linestyle=":", label=f"limit, {LIMIT_MS:g} ms")
+    for name in load.steps[0].cpu_cores:
+        cores = [step.cpu_cores.get(name) for step in load.steps]
+        cpu.plot(requested, cores, "o-", label=name)
+    for name in load.steps[0].memory_mb:
+        memory_mb = [step.memory_mb.get(name) for step in load.steps]
+        memory.plot(requested, memory_mb, "o-", label=name)
+    delay.set(ylabel="latency without the delay, ms", yscale="log")
+    cpu.set(ylabel="cores busy", ylim=(0, None))
+    memory.set(ylabel="memory, MB", ylim=(0, None))
+    for axes in (delay, cpu, memory):
+        axes.set_xlabel("requested sessions")
+        axes.legend(fontsize=8)
+    return figure
 
 
 def voiced(text: NDArray[np.float32], number: int) -> NDArray[np.float32]:

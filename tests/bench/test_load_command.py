@@ -1,4 +1,4 @@
-"""The load command prints and writes its figures."""
+"""The load command prints, writes and plots its figures."""
 
 import json
 from pathlib import Path
@@ -11,11 +11,11 @@ from kouxing.services.kinds import KINDS
 from tests.system import VOWELS_FILE
 
 
-def test_prints_and_writes_the_same_figures(
+def test_prints_writes_and_plots_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.load.SETTLE_S", 1.0)
-    figures = tmp_path / "load.json"
+    figures, picture = tmp_path / "load.json", tmp_path / "load.png"
     arguments = [
         "load",
         str(VOWELS_FILE),
@@ -26,7 +26,9 @@ def test_prints_and_writes_the_same_figures(
         "--language",
         "auto",
     ]
-    result = CliRunner().invoke(app, [*arguments, "--json", str(figures)])
+    result = CliRunner().invoke(
+        app, [*arguments, "--json", str(figures), "--picture", str(picture)]
+    )
     assert result.exit_code == 0, result.output
     load = json.loads(figures.read_text(encoding="utf-8"))
     assert [step["num_asked"] for step in load["steps"]] == [1, 2]
@@ -36,3 +38,4 @@ def test_prints_and_writes_the_same_figures(
         assert set(step["cpu_cores"]) == {*KINDS, "client"}
         assert step["memory_mb"]["recognizer"] > 50
     assert f"{load['steps'][0]['delay_ms']['p50']:.1f}" in result.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
