@@ -3,17 +3,14 @@
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.blocks import batches, recipe
-from kouxing.training.blocks.batches import Material, block_batch
 from kouxing.training.blocks.recipe import train_blocks
 from kouxing.training.networks import optimizer, teacher
-from kouxing.training.networks.batches import Recording, Targets
 from kouxing.training.networks.network import ReadoutShape
 from tests.unit.test_block_model import HELLO, SMALL
 from tests.unit.test_encoder_training import write_sounds
@@ -77,24 +74,3 @@ def test_trains_resumes_and_writes_model_and_card(
 
 def interrupt(*_arguments: object) -> None:
     raise KeyboardInterrupt
-
-
-def recording(num_frames: int) -> Recording:
-    """Samples and targets that count up, so that each frame has its number as its target."""
-    samples = np.repeat(np.arange(num_frames + 2, dtype=np.int16), 160)[: 160 * num_frames + 240]
-    return Recording(samples=samples, targets=Targets.hard(np.arange(num_frames)), weight=1.0)
-
-
-def test_batches_of_a_step_have_one_shape_and_can_be_drawn_again() -> None:
-    noise = np.random.default_rng(0).integers(-999, 999, 16_000).astype(np.int16)
-    material = Material([recording(90), recording(700)], [noise])
-    step = [block_batch(material, 3, number) for number in range(8, 16)]
-    assert len({(one.frames.shape, one.block, one.start) for one in step}) == 1
-    assert not np.array_equal(step[0].frames, step[1].frames)
-    states = step[0].states.reshape(len(step[0].states), -1)
-    assert (np.diff(states) < 0).mean() < 0.05, "frames are in order, except where a recording ends"
-    again = block_batch(material, 3, 8)
-    for name in ("frames", "clean", "states", "probs"):
-        array = getattr(step[0], name)
-        np.testing.assert_array_equal(array, getattr(again, name))
-        assert np.isfinite(array).all()

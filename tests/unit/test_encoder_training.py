@@ -17,9 +17,8 @@ from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, targets
 from kouxing.training.encoder.batches import Material, batch_of, inputs_of
 from kouxing.training.encoder.export import onnx_of
-from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
-from kouxing.training.encoder.recipe import load_teachers, train_encoder
-from kouxing.training.encoder.singing import sing
+from kouxing.training.encoder.network import NUM_FEATURES, AudioEncoder
+from kouxing.training.encoder.recipe import train_encoder
 from kouxing.training.encoder.targets import PITCH, VOICE, Columns, Piece
 from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks import optimizer
@@ -53,44 +52,6 @@ def piece(samples: np.ndarray, voice: Voice = Voice.SPEECH) -> Piece:
     return Piece(as_integers(samples[: POSITION_SAMPLES * num_positions]), rows, 1.0)
 
 
-def test_teachers_hear_the_phones(whisper: Path) -> None:
-    networks, inventory = load_teachers(whisper)
-    outputs = networks.compute_targets(as_integers(HELLO))
-    num_positions = len(outputs.phones)
-    assert {len(getattr(outputs, name)) for name in outputs.__slots__} == {num_positions}
-    np.testing.assert_allclose(outputs.phones.sum(axis=1), 1, atol=1e-3)
-    assert {inventory.phones[phone] for phone in outputs.phones.argmax(axis=1)} >= {"n", "i", "h"}
-
-
-def test_sings_and_holds_speech() -> None:
-    copies = [sing(HELLO, 75, np.random.default_rng(seed)) for seed in range(4)]
-    melodies = [copy for copy in copies if copy and copy.is_sung.all()]
-    holds = [copy for copy in copies if copy and not copy.is_sung.all()]
-    assert melodies
-    assert holds
-    for copy in (*melodies, *holds):
-        assert (np.diff(copy.source) >= 0).all()
-        assert len(copy.samples) > len(HELLO)
-        assert abs(len(copy.samples) / POSITION_SAMPLES - len(copy.source)) < 2
-    held = holds[0].source[holds[0].is_sung]
-    assert len(held) >= 50
-    assert np.ptp(held) == 0
-
-
-def test_targets_move_with_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "NUM_EXCERPTS", 6)
-    monkeypatch.setattr(batches, "_PAUSE_PROB", 0.0)
-    monkeypatch.setattr(batches, "_ONLY_BACKGROUND_PROB", 0.0)
-    material = Material([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
-    inputs, rows = batch_of(material, 0, 1)
-    assert inputs.shape[:2] == rows.shape[:2] == (6, batches.NUM_POSITIONS)
-    again, _ = batch_of(material, 0, 1)
-    np.testing.assert_array_equal(inputs, again)
-    speeds = {round(float(np.diff(excerpt[100:200, PITCH]).mean()), 2) for excerpt in rows}
-    assert len(speeds) > 2
-    assert all(0.8 < speed < 1.2 for speed in speeds)
-
-
 def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 1)
     monkeypatch.setattr(batches, "_PAUSE_PROB", 0.0)
@@ -101,33 +62,6 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
     # A position's audio ends 45 ms after its start, and the target of row 0 is at 20 ms.
     np.testing.assert_allclose(lips, (0.045 - np.array(LIP_DELAYS_S)) / 0.02 - 1, atol=0.51)
-
-
-def test_pauses_have_no_voice_and_no_other_target(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "_PAUSE_PROB", 1.0)
-    monkeypatch.setattr(batches, "NUM_EXCERPTS", 3)
-    _, rows = batch_of(Material([piece(HELLO)], [as_integers(HELLO)], COLUMNS), 0, 0)
-    paused = np.isnan(rows[..., COLUMNS.whisper]).all(axis=-1)
-    assert paused.any()
-    assert (rows[..., VOICE][paused] == Voice.NONE).all()
-    assert (rows[..., VOICE][~paused] == Voice.SPEECH).all()
-
-
-def test_loss_leaves_out_unknown_targets() -> None:
-    encoder = AudioEncoder(NUM_PHONES, width=8)
-    inputs = torch.randn(2, 9, 160)
-    rows = torch.randn(2, 9, COLUMNS.lips.start + NUM_LIPS)
-    rows[..., VOICE] = 1
-    rows[:, 3:5, :VOICE] = rows[:, 3:5, VOICE + 1 :] = torch.nan
-    loss = encoder.loss(inputs, rows)
-    loss.backward()  # type: ignore[no-untyped-call]
-    assert loss.isfinite()
-    gradients = [weight.grad for weight in encoder.parameters()]
-    assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
-    changed = inputs.clone()
-    changed[:, -1] += 1  # the newest position affects only the targets of now
-    before, after = (encoder.split(encoder(values)) for values in (inputs, changed))
-    assert torch.equal(before.voice[:, :-1], after.voice[:, :-1])
 
 
 def test_exported_steps_follow_pytorch() -> None:

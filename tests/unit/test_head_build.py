@@ -3,10 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from kouxing.shared.errors import UserError
-from kouxing.training.heads import fitted, subdivision, textures
+from kouxing.training.heads import fitted, subdivision
 
 CUBE = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
@@ -27,19 +25,6 @@ def test_catmull_clark_of_a_cube() -> None:
     np.testing.assert_allclose(np.abs(fine[:8]), 5 / 9)
     np.testing.assert_allclose(sorted(np.abs(fine[8])), [0, 0.75, 0.75])
     np.testing.assert_allclose(sorted(np.abs(fine[-1])), [0, 0, 1])
-
-
-def test_strands_are_subdivided_across_the_seams_of_their_texture() -> None:
-    corners = CUBE_QUADS.ravel()  # each face has its own texture and vertices
-    own = np.arange(24).reshape(6, 4)
-    uv = np.tile([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], (6, 1))
-    welds = np.array([np.flatnonzero(corners == corner)[0] for corner in corners])
-    points, quads, fine_uv, fine_welds = subdivision.smooth_strands(CUBE[corners], own, uv, welds)
-    matrix, expected = subdivision.catmull_clark(CUBE_QUADS, 8)
-    np.testing.assert_allclose(points[quads], (matrix @ CUBE)[expected])
-    np.testing.assert_allclose(np.ptp(fine_uv[quads], axis=1), 0.5)  # a quarter of the texture
-    np.testing.assert_array_equal(points[fine_welds], points)
-    assert len(np.unique(fine_welds)) == 8 + 12 + 6
 
 
 OBJ = """v 0 0 0
@@ -82,30 +67,3 @@ def test_a_part_follows_the_head_that_it_is_fitted_to(tmp_path: Path) -> None:
     triangle = part.only(np.array([False, True, False]))
     assert len(triangle.triangles) == 1
     assert len(triangle.fit(head)) == 3
-
-
-def test_a_missing_part_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"hair\.obj is missing"):
-        fitted.read(tmp_path, "hair")
-
-
-def test_hair_keeps_strands_but_not_the_painted_light() -> None:
-    columns = np.arange(256)
-    strand = 0.1 * np.sin(columns)  # periods of six texels
-    light = np.linspace(0.2, 0.8, 256)[:, None] * (1 + strand)  # much brighter at the bottom
-    texture = np.dstack([light] * 3 + [np.ones_like(light)])
-    gray = textures.strands(texture, 1.0)[..., 0]
-    rows = gray.mean(axis=1)
-    assert rows[-40] / rows[40] < 1.4  # the painted light differs by a factor of 2.4
-    assert gray.max() < 1.0
-    assert np.corrcoef(gray[128], strand)[0, 1] > 0.9
-
-
-def test_samples_the_alpha_of_triangles() -> None:
-    alpha = np.zeros((8, 8))
-    alpha[:, 4:] = 1.0  # the right half
-    uv = np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
-    triangles = np.array([[0, 1, 2], [1, 3, 4]])
-    sampled = textures.sample_alpha(triangles, uv, alpha)
-    np.testing.assert_array_equal(sampled.max(axis=1), [0.0, 1.0])
-    assert sampled[1].mean() > 0.9

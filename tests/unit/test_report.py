@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +9,17 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
-from kouxing.evaluation.report import lip_tables, run
+from kouxing.evaluation.report import run
 from kouxing.evaluation.report.code_hash import code_hash
-from kouxing.evaluation.report.page import TABLES, write_page
+from kouxing.evaluation.report.page import TABLES
 from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import ROOT, STEPS, Step
-from kouxing.evaluation.system.busy import Run
 from kouxing.shared.errors import UserError
 
 SCORES = {"r_opening": 0.5, "closure_f1": 0.6, "mtm_ms": 50.0, "slcc": 0.0}
 SCORES |= {"closure_precision": 0.5, "closure_recall": 0.75}
 BETTER = {"r_opening": 0.7, "closure_f1": 0.4, "mtm_ms": 40.0, "slcc": 0.2}
 BETTER |= {"closure_precision": 1.0, "closure_recall": 0.25}
-
-
-def faces(**by_title: dict[str, float]) -> dict[str, Any]:
-    return {title: {"clean": {"all": scores}} for title, scores in by_title.items()}
-
-
-def rivals() -> dict[str, Any]:
-    return faces(real={"slcc": 0.3}) | {
-        "learnt, 60 ms": {"clean": {"all": SCORES}},
-        "wawa, fitted, 100 ms": {"clean": {"all": BETTER}},
-        "dynamic-visemes, 160 ms": {"clean": {"all": BETTER | {"r_opening": 0.9}}},
-    }
 
 
 def step_file(result: Any) -> dict[str, Any]:
@@ -118,19 +104,6 @@ def test_the_hash_of_code_changes_with_what_runs(
     assert (code_hash(("*.py", "data"), tmp_path) != before) is is_changed
 
 
-def test_a_result_has_a_line_for_each_record(tmp_path: Path) -> None:
-    write_result(tmp_path / "x.json", {"load": 1, "result": {"a": {"r": 0.5, "n": 2}, "b": [1, 2]}})
-    assert (tmp_path / "x.json").read_text("utf-8").splitlines() == [
-        "{",
-        ' "load": 1,',
-        ' "result": {',
-        '  "a": {"r": 0.5, "n": 2},',
-        '  "b": [1, 2]',
-        " }",
-        "}",
-    ]
-
-
 def test_a_failed_step_is_reported_and_leaves_the_old_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,30 +117,3 @@ def test_a_failed_step_is_reported_and_leaves_the_old_result(
 def test_an_unknown_step_is_an_error() -> None:
     with pytest.raises(UserError, match="no step 'fautls'; choose from read,"):
         CliRunner().invoke(app, ["report", "fautls"], catch_exceptions=False)
-
-
-def test_the_page_starts_with_what_others_do_better() -> None:
-    assert lip_tables.better_programs({"rivals": rivals()}) == [
-        "all clips, correlation of the opening: wawa-lipsync 0.0.2, fitted, 100 ms (0.70);"
-        " learnt, 60 ms (0.50)",
-        "all clips, precision of closures: wawa-lipsync 0.0.2, fitted, 100 ms (1.00, recall 0.25);"
-        " learnt, 60 ms (0.50, recall 0.75)",
-        "all clips, MTM: wawa-lipsync 0.0.2, fitted, 100 ms (40 ms); learnt, 60 ms (50 ms)",
-        "all clips, SLCC: wawa-lipsync 0.0.2, fitted, 100 ms (0.20); learnt, 60 ms (0.00,"
-        " real lips 0.30)",
-    ]
-
-
-def test_the_page_names_the_steps_that_were_not_measured(tmp_path: Path) -> None:
-    write_result(tmp_path / "results" / "read.json", step_file({}))
-    write_page(tmp_path / "results", tmp_path / "results.md")
-    text = (tmp_path / "results.md").read_text("utf-8")
-    assert 'make report STEPS="faults"' in text
-    assert '- Not measured yet: `make report STEPS="conversation disturbed languages"`' in text
-
-
-def test_the_lateness_of_each_frame_is_not_stored(tmp_path: Path) -> None:
-    run = Run(num_programs=2, quiet_median_s=0.1, lateness_s=[0.0, 0.2], load_s=1.0, missing=0.0)
-    write_result(tmp_path / "busy.json", step_file({"runs": [asdict(run)]}))
-    stored = json.loads((tmp_path / "busy.json").read_text("utf-8"))
-    assert [*stored["result"]["runs"][0]] == ["num_programs", "quiet_median_s", "load_s", "missing"]

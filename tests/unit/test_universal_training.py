@@ -3,19 +3,14 @@
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import soundfile
 
 from kouxing.services.recognizer.acoustic.acoustic_model import score_segment
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.errors import UserError
-from kouxing.training.blocks.network import layout
 from kouxing.training.networks import optimizer
 from kouxing.training.universal import alignment, recipe, trainer
-from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, RIGHT_CONTEXT
-from kouxing.training.universal.features import WIDTH, Features
 from kouxing.training.universal.recipe import train_universal
 from tests.unit.test_block_model import HELLO
 from tests.unit.test_block_training import interrupt
@@ -73,24 +68,3 @@ def test_trains_resumes_and_writes_model_and_card(
     card = output.with_suffix(".md").read_text()
     assert "| CC0 | 2 | 2 | 0.1 |" in card
     assert {path.name for path in tmp_path.iterdir()} == {"universal.npz", "universal.md", "corpus"}
-
-
-@pytest.mark.slow
-def test_needs_labels_made_by_hand(tmp_path: Path) -> None:
-    languages = [write_corpus(tmp_path / "corpus", with_labels=False)]
-    with pytest.raises(UserError, match="no recording has hand-made labels"):
-        train_universal([], tmp_path / "universal.npz", languages=languages)
-
-
-def test_crops_have_the_layout_of_the_network() -> None:
-    laid = layout(trainer._CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
-    num_blocks = 3
-    positions = BLOCK_LENGTH * np.arange(num_blocks)[:, None] + np.arange(LENGTH)
-    rows = np.repeat(positions[..., None], WIDTH, axis=-1).astype(np.int8)
-    stored = Features(name="a", num_frames=57, rows=rows)
-    states = np.arange(58) // 2
-    features, targets = trainer._crop(stored, states, laid, np.random.default_rng(0))
-    is_known = (targets != -1).all(axis=1) & (features[:, 0] > 0)
-    assert is_known.sum() > 40
-    np.testing.assert_array_equal(features[is_known, 0], targets[is_known, 0])
-    np.testing.assert_array_equal(features[is_known, 5], targets[is_known, 1])

@@ -11,7 +11,6 @@ import torch
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.shared.errors import UserError
 from kouxing.training.networks.network import Shape
-from kouxing.training.networks.optimizer import cross_entropy
 from kouxing.training.networks.teacher import WholeEncoder
 from kouxing.training.networks.whisper import load_whisper
 from tests.whisper_folder import encoder_arrays, write_whisper
@@ -87,13 +86,3 @@ def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
 
 
 # --- training
-
-
-def test_the_loss_is_the_cross_entropy_of_soft_targets() -> None:
-    posteriors = torch.tensor([[0.5, 0.25, 0.25], [0.125, 0.125, 0.75], [1 / 3, 1 / 3, 1 / 3]])
-    states = torch.tensor([[0, 1], [2, 0], [1, 1]])
-    probs = torch.tensor([[1.0, 0.0], [0.75, 0.25], [0.0, 0.0]])  # the last has no target
-    expected = (np.log(2) + 0.75 * np.log(4 / 3) + 0.25 * np.log(8)) / 2
-    found = cross_entropy(posteriors.log(), states, probs)
-    assert float(found) == pytest.approx(expected, rel=1e-6)
-    assert float(cross_entropy(posteriors.log(), states, 0 * probs)) == 0.0
